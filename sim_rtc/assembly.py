@@ -34,6 +34,7 @@ from sim_rtc.telescope.registration import (
     MovingOptics,
     Schedule,
     background_executor,
+    far_registration,
     random_registration,
 )
 from sim_rtc.telescope.scene import PlayedTurbulence, SceneKind
@@ -119,8 +120,9 @@ def build_telescope(
         for _, response in optics.responses if sky.played is None else ():
             sky.turbulence.prepare(response)
 
+    draw = far_registration if options.far else random_registration
     schedule = Schedule(
-        start=options.alpha or random_registration(alpha_rng, instrument.start.rotation_rad),
+        start=options.alpha or draw(alpha_rng, instrument.start.rotation_rad),
         drift=options.drift,
         flexure=options.flexure,
         walk=replace(options.walk, seed=int(alpha_rng.integers(2**63))),

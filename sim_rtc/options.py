@@ -25,6 +25,9 @@ from sim_rtc.telescope.registration import Drift, Flexure, Jump, Walk
 from sim_rtc.telescope.scene import Elevation, Scene, SceneKind, Spiders
 from sim_rtc.telescope.sky import DAYTIME_LINES, SeeingSchedule, VibrationLine
 
+USUAL_MODES, FAR_MODES = 400, 120
+"""In the loop at the start, of an instrument that has so many."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -44,6 +47,12 @@ class Options:
         "true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%)",
         lambda *boundary: Misregistration.from_vector(np.array(boundary) / BOUNDARY_SCALE),
         limits=", subapertures, degrees and a ratio > 0",
+    )
+    far: bool = option(
+        "--far",
+        "begin so far away that few modes can be controlled: a true registration at random, 0.4 "
+        "subapertures and 0.65 deg off; at most 120 modes in the loop unless --n-controlled",
+        action="store_true",
     )
     jumps: tuple[Jump, ...] = several(
         "--jump T:DX,DY,DROT_DEG,DMAG",
@@ -224,7 +233,7 @@ class Options:
     )
     given_n_controlled: int | None = option(
         "--n-controlled N",
-        "modes in the loop at the start (default: 400, or seven tenths of all if fewer)",
+        "modes in the loop at the start (default: 400, or 7 tenths of all)",
         count(1),
     )
     influence_cube: str | None = option(
@@ -350,7 +359,8 @@ class Options:
             If more were asked for than there are.
         """
         if self.given_n_controlled is None:
-            return min(400, max(1, 7 * n_modes // 10))
+            most = FAR_MODES if self.far else USUAL_MODES
+            return min(most, max(1, 7 * n_modes // 10))
         if self.given_n_controlled > n_modes:
             raise ConfigurationError(
                 f"--n-controlled: found {self.given_n_controlled}; {self.instrument} has "
@@ -467,6 +477,8 @@ class Options:
             raise ConfigurationError(
                 "--replay: plays a file as it is; found --record or --fault too"
             )
+        if self.far and self.alpha is not None:
+            raise ConfigurationError("--far: found beside --alpha; expected one of them")
         if self.influence_pitch_m is not None and self.influence_cube is None:
             raise ConfigurationError(
                 "--influence-pitch: found alone; expected --influence beside it"

@@ -180,6 +180,27 @@ def random_registration(rng: np.random.Generator, nominal_rad: float = 0.0) -> M
     )
 
 
+def far_registration(rng: np.random.Generator, nominal_rad: float = 0.0) -> Misregistration:
+    """Draw a registration at which FLAO's loop holds 120 modes and would lose 400.
+
+    On the matrix of a perfect registration, with the loop gain and optical gains of an ordinary
+    night: largest pole radius 0.83 to 0.86 for 120 modes, above 1.01 for 400.
+    """
+    radius, angle = rng.uniform(0.40, 0.42), rng.uniform(0.0, 2 * np.pi)
+    turn_deg, scale = rng.uniform(0.6, 0.7), rng.uniform(0.002, 0.004)
+    sense = rng.choice([-1.0, 1.0], 2)
+    return Misregistration.from_vector(
+        np.array(
+            [
+                radius * np.cos(angle),
+                radius * np.sin(angle),
+                nominal_rad + np.deg2rad(sense[0] * turn_deg),
+                1.0 + sense[1] * scale,
+            ]
+        )
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Segment:
     """A stretch of time between two exact optics; both are the same where nothing drifts."""

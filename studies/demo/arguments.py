@@ -9,7 +9,7 @@ from pathlib import Path
 from service.commands.arguments import OneLineParser
 
 FORWARDED = {
-    "alpha": ("X,Y,ROT_DEG,MAG", "true registration; default random"),
+    "alpha": ("X,Y,ROT_DEG,MAG", "true registration; default far away, see --near"),
     "mag": ("M", "magnitude of the star, default 8"),
     "gain": ("G", "integrator gain, default 0.4"),
     "plant": ("NAME", "simulated telescope: linear (default) or diffractive"),
@@ -47,8 +47,15 @@ def demo_parser() -> argparse.ArgumentParser:
         demo.add_argument(f"--{name}", metavar=metavar, help=text)
     for name, (metavar, text) in REPEATED.items():
         demo.add_argument(f"--{name}", action="append", metavar=metavar, help=text)
+    demo.add_argument(
+        "--near",
+        action="store_true",
+        help="begin at a registration that a loop of 400 modes holds, at random; so it is with "
+        "--plant or --scene, too. Else the RTC begins with the 120 modes that its matrix can hold",
+    )
     demo.add_argument("--seed", type=_seed, default=1, metavar="S", help="of everything random")
     demo.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+    demo.add_argument("--plot", type=Path, metavar="FILE", help="draw the wavefront error there")
     demo.add_argument("--port", type=_port, default=8080, help="of the REST API")
     demo.add_argument("--zenoh-port", type=_port, default=7447, help="of the link to the RTC")
     demo.add_argument(

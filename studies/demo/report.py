@@ -61,6 +61,9 @@ class Circumstances:
     endings: tuple[str, ...] = ()
     """Of processes that have ended, and their last words."""
 
+    wanted_ratio: float = 1.0
+    """Wavefront error at the start over that at the end which is wanted at least."""
+
     refusal: str | None = None
     """Why the last refused window was; None: not known."""
 
@@ -95,6 +98,9 @@ class Report:
     start: Stage = field(default_factory=Stage)
     first_update: Stage = field(default_factory=Stage)
     target_modes: Stage = field(default_factory=Stage)
+    wavefront_ratio: float | None = None
+    """Wavefront error at the start over that with more modes."""
+
     reconstructors_published: int = 0
     reconstructors_applied: int = 0
     reconstructors_refused_by_gate: int = 0
@@ -150,7 +156,7 @@ def make_report(
             report.failures.append(
                 f"the service has not answered for {circumstances.unanswered_s:.0f} s"
             )
-        _judge(report)
+        _judge(report, circumstances.wanted_ratio)
     if report.failures:
         report.reasons = [*circumstances.endings, *_reasons(state, circumstances)]
     return report
@@ -225,6 +231,11 @@ def _stages(report: Report, reconstructors: list[View], truth: TruthFile) -> Non
         # one applied just before the end has no wavefront error yet
         seen = [stage for stage in larger if stage.wavefront_error_nm is not None]
         report.target_modes = (seen or larger)[-1]
+        before_nm, after_nm = (
+            stage.wavefront_error_nm for stage in (report.start, report.target_modes)
+        )
+        if before_nm and after_nm:
+            report.wavefront_ratio = before_nm / after_nm
 
 
 def _stage(record: View, truth: TruthFile) -> Stage:
@@ -250,7 +261,7 @@ def _compare(report: Report, state: View, truth: TruthFile) -> None:
     report.error_in_sigma = {name: report.error[name] / known["sigma"][name] for name in PARAMETERS}
 
 
-def _judge(report: Report) -> None:
+def _judge(report: Report, wanted_ratio: float) -> None:
     """Say in words everything that is not as it should be."""
     fail = report.failures.append
     report.failures += _estimate_failures(report)
@@ -259,6 +270,11 @@ def _judge(report: Report) -> None:
         fail("the stability margin has not recovered")
     if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
         fail("the wavefront error with more modes is not below that of the start")
+    elif report.wavefront_ratio is not None and report.wavefront_ratio < wanted_ratio:
+        fail(
+            f"the wavefront error of the start is {report.wavefront_ratio:.2f} times that with "
+            f"more modes, expected {wanted_ratio:g} times"
+        )
     for swap in report.swaps:
         if swap["frames_skipped"]:
             fail(f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}")
@@ -307,6 +323,7 @@ def table(report: Report) -> str:
         ("with more modes", report.target_modes),
     ):
         lines.append(_stage_row(label, stage))
+    lines += _before_and_after(report)
     seconds = report.seconds_to_first_applied
     first = "never" if seconds is None else f"{seconds:.1f} s after it was ready"
     ready = report.seconds_to_ready
@@ -328,6 +345,29 @@ def table(report: Report) -> str:
     lines += [f"FAILED: {text}" for text in report.failures] or ["GOOD: the main job was done"]
     lines += [f"because: {text}" for text in report.reasons]
     return "\n".join(lines)
+
+
+def _before_and_after(report: Report) -> list[str]:
+    before_nm, after_nm = report.start.wavefront_error_nm, report.target_modes.wavefront_error_nm
+    if not before_nm or not after_nm:
+        return []
+    return [
+        "",
+        "wavefront error         before  "
+        f"{_bar(before_nm, before_nm)} {before_nm:4.0f} nm   Strehl ratio at 1.65 um "
+        f"{strehl_ratio(before_nm):.2f}",
+        f"                         after  {_bar(after_nm, before_nm)} {after_nm:4.0f} nm   "
+        f"{'':24}{strehl_ratio(after_nm):.2f}   {before_nm / after_nm:.2f} times less",
+    ]
+
+
+def _bar(value_nm: float, whole_nm: float) -> str:
+    return ("#" * round(30.0 * min(value_nm / whole_nm, 1.0))).ljust(30)
+
+
+def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
+    """Return the share of the light that an image keeps in its peak: Marechal's approximation."""
+    return math.exp(-((2.0 * math.pi * error_nm / wavelength_nm) ** 2))
 
 
 def _row(report: Report, name: str) -> str:

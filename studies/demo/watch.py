@@ -106,6 +106,9 @@ class Promise:
     real_time: bool
     """The simulator keeps real time on an ordinary machine."""
 
+    wanted_ratio: float = 1.0
+    """Wavefront error before over after."""
+
 
 class Watch:
     """Looks at REST and the truth file, and prints."""
@@ -157,6 +160,7 @@ class Watch:
             frameless_s=0.0 if clock is None else now_s - self._frames_grown_s,
             untold_s=0.0 if clock is None else clock.silent_s,
             endings=self._endings(),
+            wanted_ratio=self._promise.wanted_ratio,
             refusal=refusal,
         )
         return make_report(self._state, self._reconstructors, self._truth, circumstances)

@@ -1,8 +1,10 @@
 """The demo on the full instrument, as a new user would run it."""
 
 import json
+import math
 import os
 import signal
+import statistics
 import time
 from pathlib import Path
 
@@ -30,37 +32,43 @@ def demo(night, *words):
 
 
 def test_the_main_job_is_done_within_a_minute(night):
-    figures = night.directory / "figures.json"
-    given = {
-        "shift_x_subap": -0.11,
-        "shift_y_subap": 0.13,
-        "rotation_deg": 0.21,
-        "magnification": 1.004,
-    }
-    alpha = ",".join(str(value) for value in given.values())
+    """As a new user runs it: far away, few modes in the loop, then many and half of the error."""
+    figures, picture = night.directory / "figures.json", night.directory / "night.png"
     began = time.monotonic()
-    process = demo(night, "--seconds", "60", f"--alpha={alpha}", "--json", str(figures))
+    words = ["--seconds", "60", "--json", str(figures), "--plot", str(picture)]
+    process = demo(night, *words)
     assert process.ended(280.0) == 0, process.log
 
     report = json.loads(figures.read_text(encoding="utf-8"))
     assert in_time(began, report["seconds_to_ready"] + 75.0)
     assert "preparing: " in process.log
     assert report["good"]
-    assert report["true_alpha"] == pytest.approx(given)
+    true = report["true_alpha"]
+    assert 0.4 < math.hypot(true["shift_x_subap"], true["shift_y_subap"]) < 0.42
     for name, tolerance in TOLERANCE.items():
-        error = report["estimated_alpha"][name] - given[name]
+        error = report["estimated_alpha"][name] - true[name]
         assert abs(error) < min(tolerance, 4 * report["sigma"][name]), (name, error)
         assert report["sigma"][name] >= report["floor"][name]
     stages = [report[name] for name in ("start", "first_update", "target_modes")]
-    assert [stage["n_modes"] for stage in stages] == [400, 400, 500]
+    assert stages[0]["n_modes"] == 120
+    assert stages[2]["n_modes"] >= 400
     assert stages[1]["worst_pole_radius"] < stages[0]["worst_pole_radius"]
-    assert stages[2]["wavefront_error_nm"] < stages[0]["wavefront_error_nm"]
+    assert report["wavefront_ratio"] >= 1.5
     assert report["reconstructors_applied"] == report["reconstructors_published"] >= 2
     assert report["frames_lost"] == 0
     assert all(swap["frames_skipped"] == 0 for swap in report["swaps"])
     assert report["seconds_to_first_applied"] < patience(45.0)
     assert "GOOD: the main job was done" in process.log
+    assert never_worse(night.directory / "demo" / "truth.jsonl")
+    assert picture.read_bytes().startswith(b"\x89PNG")
     process.alone()
+
+
+def never_worse(truth):
+    """Whether the error was never a fifth above that of the start, once the loop was closed."""
+    lines = [json.loads(line) for line in truth.read_text(encoding="utf-8").splitlines()]
+    errors = [line["wavefront_error_nm"] for line in lines if line["kind"] == "truth"][2:]
+    return max(errors) < 1.2 * statistics.median(errors[:6])
 
 
 def test_interrupted_it_stops_both_processes_and_says_what_is_missing(night):

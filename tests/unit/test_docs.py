@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib.util import find_spec
 from itertools import groupby
 
@@ -183,6 +184,31 @@ def test_a_block_that_is_not_run_says_why():
             why for kind in ("sh", "toml", "python") for _, why in blocks_of(path, kind) if why
         ]
         assert len(marked) == path.read_text("utf-8").count("<!-- not run"), path
+
+
+def test_the_layout_in_the_readme_is_that_of_the_code():
+    """Its layers are those that the import contracts hold; its folders are those with code."""
+    (layout,) = re.findall(
+        r"^## Layout\n```\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.M | re.S
+    )
+    drawn, folders = re.split(r"\n(?=check_rtc/)", layout)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    (contract,) = [c for c in project["tool"]["importlinter"]["contracts"] if c["type"] == "layers"]
+    layers = [set(re.split(r" [:|] ", layer)) for layer in contract["layers"]]
+    assert [
+        set(layer.split(", ")) for layer in re.sub(r"service/|\s+", " ", drawn).strip().split(" > ")
+    ] == layers
+    with_code = {path.parent.name for path in ROOT.glob("*/*.py")} - {"service", "docs"}
+    assert with_code | {"docs", "deploy", "tests"} == set(re.findall(r"^(\w+)/", folders, re.M))
+
+
+def test_the_first_screen_of_the_readme_shows_pictures_and_tells_two_commands():
+    first = "\n".join((ROOT / "README.md").read_text("utf-8").splitlines()[:40])
+    pictures = re.findall(r"!\[[^]]+\]\(([^)]+)\)", first)
+    assert len(pictures) == 3
+    assert all((ROOT / picture).is_file() for picture in pictures)
+    (text,) = re.findall(r"^```sh\n(.*?)^```", first, re.M | re.S)
+    assert len(list(commands(text))) == 2
 
 
 @pytest.mark.long

@@ -12,6 +12,17 @@ def test_the_defaults_are_one_arcsecond_400_modes_and_a_secret_registration():
     assert (options.delay_frames, options.frame_rate_hz) == (2, 1000.0)
     assert [options.n_controlled(n_modes) for n_modes in (594, 90)] == [400, 63]
     assert options.alpha is None
+    assert not options.far
+
+
+def test_who_begins_far_away_begins_with_what_the_matrix_holds():
+    assert parse_options(["--far"]).n_controlled(594) == 120
+    assert parse_options(["--far"]).n_controlled(90) == 63
+    assert parse_options(["--far", "--n-controlled", "30"]).n_controlled(594) == 30
+
+
+def test_the_other_defaults_are_a_star_and_one_layer():
+    options = parse_options([])
     assert options.connect == "tcp/127.0.0.1:7447"
     (layer,) = options.layers
     assert (layer.speed_m_s, layer.direction_deg) == (12.0, 35.0)

@@ -12,6 +12,7 @@ from sim_rtc.telescope.registration import (
     MovingOptics,
     Schedule,
     Walk,
+    far_registration,
     random_registration,
 )
 
@@ -46,6 +47,21 @@ def test_random_registrations_fill_the_range_a_loop_can_hold():
     assert np.mean(shift < 0.2 * np.sqrt(0.5)) == pytest.approx(0.5, abs=0.1)
     assert 0.28 < np.abs(drawn[:, 2]).max() <= 0.3
     assert 0.0047 < np.abs(drawn[:, 3] - 1).max() <= 0.005
+
+
+def test_a_far_registration_is_beyond_what_400_modes_hold_whichever_way_it_lies():
+    rng = np.random.default_rng(1)
+    drawn = np.array([list(far_registration(rng, 0.1).to_boundary().values()) for _ in range(400)])
+    shift = np.hypot(drawn[:, 0], drawn[:, 1])
+    assert 0.40 <= shift.min() < shift.max() <= 0.42
+    turn = drawn[:, 2] - np.rad2deg(0.1)
+    assert 0.6 <= np.abs(turn).min() < np.abs(turn).max() <= 0.7
+    assert 0.002 <= np.abs(drawn[:, 3] - 1).min() < np.abs(drawn[:, 3] - 1).max() <= 0.004
+    # every quarter of the directions, both senses of the rotation, larger and smaller
+    assert {tuple(signs) for signs in np.sign(drawn[:, :2])} == {
+        (x, y) for x in (-1, 1) for y in (-1, 1)
+    }
+    assert set(np.sign(turn)) == set(np.sign(drawn[:, 3] - 1)) == {-1.0, 1.0}
 
 
 def test_a_flexure_is_a_sine_that_begins_at_zero():

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -92,6 +93,37 @@ def test_a_night_that_went_well_is_good(truth):
     assert report.first_update.wavefront_error_nm == pytest.approx(119.0)
     assert report.target_modes.wavefront_error_nm == pytest.approx(105.0)
     assert (report.reconstructors_published, report.reconstructors_applied) == (2, 2)
+
+
+def test_before_and_after_stand_side_by_side(truth):
+    report = make_report(service_state(), shelf(), truth, WELL)
+    assert report.wavefront_ratio == pytest.approx(120.0 / 105.0)
+    before, after = [line for line in table(report).splitlines() if "####" in line]
+    assert before.count("#") == 30
+    assert after.count("#") == 26
+    # Marechal: exp(-(2 pi 120/1650)^2), exp(-(2 pi 105/1650)^2)
+    assert "120 nm" in before
+    assert before.endswith("0.81")
+    assert "105 nm" in after
+    assert after.endswith("0.85   1.14 times less")
+
+
+def test_a_night_that_won_less_than_was_promised_fails(truth):
+    promised = replace(WELL, wanted_ratio=1.5)
+    report = make_report(service_state(), shelf(), truth, promised)
+    assert report.failures == [
+        "the wavefront error of the start is 1.14 times that with more modes, expected 1.5 times"
+    ]
+
+
+def test_the_picture_shows_both_stages(truth, tmp_path):
+    pytest.importorskip("matplotlib")
+    from studies.demo.figure import draw
+
+    for line in truth.lines:
+        line["n_controlled"] = 500 if line["cm_id"] == "cm-500" else 400
+    draw(make_report(service_state(), shelf(), truth, WELL), truth, tmp_path / "night.png")
+    assert (tmp_path / "night.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from service.errors import ConfigurationError
 from sim_rtc.options import parse_options
 from studies.demo.__main__ import main
 from studies.demo.arguments import demo_parser
-from studies.demo.run import _commands, _emptied, _say
+from studies.demo.run import _commands, _emptied, _promise, _say
 
 ROOT = Path(__file__).parents[4]
 
@@ -36,6 +36,25 @@ def test_both_meet_at_the_same_place_and_the_service_is_never_told_the_truth(tmp
     assert service[service.index("--listen") + 1] == simulator[simulator.index("--connect") + 1]
     assert service[service.index("--mode") + 1] == "auto"
     assert not any("0.1,0,0,1" in word or "truth" in word for word in service)
+
+
+def begins_far(*words):
+    _, simulator = _commands(options(*words))
+    return parse_options(simulator).far
+
+
+def test_the_night_begins_far_away_unless_something_else_is_asked_for():
+    assert begins_far()
+    assert begins_far("--mag", "9", "--jump", "90:0.2,0,0,0")
+    assert not begins_far("--near")
+    assert not begins_far("--alpha", "0.1,0,0,1")
+    assert not begins_far("--plant", "diffractive")
+    assert not begins_far("--scene", "daytime")
+
+
+def test_a_night_that_begins_far_away_must_end_with_much_less_wavefront_error():
+    assert _promise(options()).wanted_ratio == 1.5
+    assert _promise(options("--near")).wanted_ratio == 1.0
 
 
 def test_the_leftovers_of_an_earlier_demo_are_removed(tmp_path):
@@ -88,6 +107,7 @@ def test_the_demo_refuses_a_busy_port_instead_of_watching_another_service(capsys
         ("--port", "70000"),
         ("--jump", "30"),
         ("--json", "nowhere/figures.json"),
+        ("--plot", "nowhere/figure.png"),
         ("--nonsense", "1"),
     ],
 )

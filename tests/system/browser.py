@@ -90,6 +90,17 @@ class Page:
         """Type, and send what the dialog asks for by its key."""
         self.press(f"{keys}{Keys.CONTROL}{Keys.ENTER}{Keys.NULL}")
 
+    def cut_off(self):
+        """Return what is wider than its room: tables scrolled sideways, parts of the header."""
+        found = self.js(
+            "[...document.querySelectorAll('header *, main:not([hidden]) .scrolls')]"
+            ".filter(e => e.checkVisibility() && e.scrollWidth > e.clientWidth + 1"
+            " && getComputedStyle(e).display !== 'inline')"
+            ".map(e => e.id || e.ariaLabel || e.outerHTML.slice(0, 60))"
+        )
+        width = self.js("[document.documentElement.scrollWidth, innerWidth]")
+        return found if width[0] <= width[1] else [*found, "the page"]
+
     def faults_of_access(self):
         """Return what axe-core finds, all of its rules."""
         self.driver.execute_script(AXE.read_text(encoding="utf-8"))

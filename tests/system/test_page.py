@@ -170,6 +170,8 @@ def test_a_file_is_fitted_and_what_was_found_is_drawn(page):
     page.until("document.querySelectorAll('#found .maps canvas').length >= 3")
     assert page.js("document.querySelector('.left canvas').width") == 24
     assert page.faults_of_access() == []
+    page.resize(LAPTOP)
+    assert page.cut_off() == []
     page.resize(NARROW)
     assert page.js("document.documentElement.scrollWidth") <= NARROW[0]
 
@@ -183,6 +185,8 @@ def test_this_night_is_seen_with_what_was_in_use_and_who_ordered_what(page):
     page.says("#trail", "the image was better before")
     page.says("#trail", "another operator")
     assert page.js("document.querySelectorAll('#past .plot canvas').length") == 4
+    page.resize(LAPTOP)
+    assert page.cut_off() == []
     assert page.faults_of_access() == []
 
 
@@ -251,6 +255,19 @@ def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order
     keys.path.unlink()
     page.open()
     assert page.js("document.querySelector('#who').hidden")
+
+
+def test_two_rtcs_at_once_are_a_banner_that_says_what_to_do_until_one_is_gone(page):
+    page.open(LAPTOP)
+    other = page.night.rtc(seed=4)
+    page.until("document.querySelector('#critical').checkVisibility()", 20.0)
+    page.says("#critical", "second-rtc")
+    page.says("#critical .remedy", "stop one of them")
+    assert page.js("parseFloat(getComputedStyle(document.querySelector('.cause')).fontSize)") > 36
+    page.says("#operation", "■ ERROR")
+    other.kill()
+    page.until("!document.querySelector('#critical').checkVisibility()", 20.0)
+    page.says("#alarms", "◇ second-rtc")
 
 
 def test_an_rtc_that_is_gone_is_seen_with_what_to_do(page):

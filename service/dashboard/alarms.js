@@ -75,7 +75,8 @@ export class CriticalBanner {
 
   show() {
     const { state, fresh, now } = this.#service;
-    const [alarm, ...others] = fresh ? lasting(state).filter(({ severity }) => severity === "critical") : [];
+    // one that was there when the connection was lost is not over for that
+    const [alarm, ...others] = this.#service.locked ? [] : lasting(state).filter(({ severity }) => severity === "critical");
     this.#root.hidden = !alarm;
     document.body.dataset.alarm = alarm ? (alarm.acknowledged ? "known" : "critical") : "";
     if (!alarm) return;
@@ -88,7 +89,7 @@ export class CriticalBanner {
     put(part(".remedy span"), firstClause(alarm.do));
     part(".remedy").hidden = !alarm.do;
     put(part(".found"), alarm.text);
-    put(part(".since"), `since ${clock(since)} UTC, ${ago(since, now, true)}${seen ? `; ${seen.by} knows` : ""}`);
+    put(part(".since"), `since ${clock(since)} UTC, ${ago(since, now, true)}${seen ? `; ${seen.by} knows` : ""}${fresh ? "" : "; as last heard"}`);
     const runbook = runbookOf(alarm.name);
     part("a").hidden = !runbook;
     if (runbook) part("a").href = runbook;

@@ -57,6 +57,13 @@ class Page:
         metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
 
+    def offline(self, is_so):
+        """Cut the browser off from the service, or end that."""
+        self.driver.execute_cdp_cmd("Network.enable", {})
+        conditions = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+        conditions["offline"] = is_so
+        self.driver.execute_cdp_cmd("Network.emulateNetworkConditions", conditions)
+
     def js(self, script):
         return self.driver.execute_script(f"return {script}")
 

@@ -130,6 +130,20 @@ def test_once_somebody_knows_it_gives_way_but_stays(page):
     page.until("!document.querySelector('#critical').checkVisibility()")
 
 
+def test_a_lost_connection_does_not_end_it(page):
+    page.service.alarm("loop-diverging", "found")
+    page.until("document.querySelector('#critical').checkVisibility()")
+    page.offline(True)
+    try:
+        page.until("!document.querySelector('#lost').hidden", 20.0)
+        page.says("#critical", "as last heard")
+        page.says("#operation", "✕ NOT KNOWN")
+    finally:
+        page.offline(False)
+    page.until("document.querySelector('#lost').hidden", 20.0)
+    assert "as last heard" not in page.text("#critical")
+
+
 def test_the_state_is_read_from_afar_by_one_key(page):
     page.service.alarm("margin", "0.97 of 0.95 anywhere within 3 sigma")
     for size in (LAPTOP, FULL, NARROW):

@@ -8,6 +8,7 @@ is the tracker's business.
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Self, TypeVar
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import LinkError, UnknownIdError, WireError
+from service.files.last_telemetry import Arrived, LastTelemetry
 from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind
 from service.link import session as link
@@ -43,8 +45,10 @@ class Bridge:
     Every method may be called from any thread. The asynchronous ones wait off the event loop.
     """
 
-    def __init__(self, endpoint: Endpoint) -> None:
+    def __init__(self, endpoint: Endpoint, last: LastTelemetry | None = None) -> None:
         self._endpoint = endpoint
+        self._last = last or LastTelemetry(0.0, 0)
+        self._handing_over = threading.Lock()
         self._keys = wire.Keys(endpoint.system)
         self._log = structlog.get_logger().bind(system=endpoint.system)
         self._intake = Intake(endpoint)
@@ -153,15 +157,27 @@ class Bridge:
         """Return all counters of the link."""
         return self._intake.statistics()
 
-    def keep(self, recorder: RecordingWriter | None) -> None:
+    def keep(self, recorder: RecordingWriter | None, before_s: float = 0.0) -> float:
         """Have all that the RTC sends put into a recorder from now on; None: no more.
 
-        It begins with the reconstructor in use, as far as this service has it.
+        It begins with the reconstructor in use, as far as this service has it, and with what came
+        in the last seconds, as far as that is held; returns how many of them are.
         """
-        self._recorder = recorder
-        if self._intake.statistics().rtc_alive:
-            self._record(RecordedKind.LIVELINESS, b"\x01")
-        self._record_matrix()
+        offer, alive = self._outbox.current, self._intake.statistics().rtc_alive
+        with self._handing_over:
+            self._recorder = recorder
+            if recorder is None:
+                return 0.0
+            now_s = time.monotonic()
+            past = self._last.since(before_s) if before_s > 0.0 else []
+            since_s = past[0].at_s if past else now_s
+            if offer is not None:
+                matrix = b"".join(offer.parts)
+                past.insert(0, Arrived(since_s, RecordedKind.MATRIX, matrix, offer.commit))
+            if alive:
+                past.insert(0, Arrived(since_s, RecordedKind.LIVELINESS, b"\x01"))
+            recorder.begin_with(past)
+            return now_s - since_s
 
     def _record_matrix(self) -> None:
         offer = self._outbox.current
@@ -169,9 +185,10 @@ class Bridge:
             self._record(RecordedKind.MATRIX, b"".join(offer.parts), offer.commit)
 
     def _record(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
-        recorder = self._recorder
-        if recorder is not None:
-            recorder.put(kind, payload, attachment)
+        with self._handing_over:
+            self._last.put(kind, payload, attachment)
+            if self._recorder is not None:
+                self._recorder.put(kind, payload, attachment)
 
     def offer(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
         """Let an RTC ask for a reconstructor without sending it.

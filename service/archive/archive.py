@@ -10,6 +10,7 @@ from typing import IO, Any, Self
 
 from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
 from service.archive.nights import Nights
+from service.archive.notes import Annotations
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.recordings import Recordings
 from service.archive.records import TrackingFile
@@ -60,6 +61,8 @@ class Archive:
         """Every estimate of α, and what happened beside it."""
         self.trends = Trends(self.index.asked)
         """What was known at every moment, a sample every few seconds."""
+        self.annotations = Annotations(self.index.asked, self.index.add_row)
+        """What operators have noted about a moment."""
         self._lock: IO[str] | None = None
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""

@@ -10,7 +10,7 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
-from service.archive import nights, trends
+from service.archive import nights, notes, trends
 from service.archive.nights import Values
 from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
 from service.archive.trends import TrendSample
@@ -55,6 +55,7 @@ CREATE TABLE IF NOT EXISTS audit (
 CREATE INDEX IF NOT EXISTS audit_by_time ON audit (t_ns_utc);
 {nights.SCHEMA}
 {trends.SCHEMA}
+{notes.SCHEMA}
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_words BEFORE UPDATE ON audit
@@ -228,6 +229,12 @@ class Index:
             connection.executemany(nights.INSERT, nights.rows_of(estimates))
             connection.executemany(trends.INSERT, trends.rows_of(samples))
             connection.execute("COMMIT")
+
+    def add_row(self, insertion: str, values: tuple[str | int, ...]) -> int:
+        """Carry out an insertion, and return the number of its row."""
+        with self._use() as connection:
+            done = connection.execute(insertion, tuple(map(_storable, values)))
+        return done.lastrowid or 0
 
     def asked(self, question: str, values: Values) -> list[Any]:
         """Return the rows there are, on a connection that only reads: nobody who writes waits."""

@@ -63,6 +63,9 @@ class MarkKind(StrEnum):
     OVER = "over"
     """An alarm was over."""
 
+    NOTE = "note"
+    """An operator has noted something."""
+
     START = "start"
     """The service started: alarms of the run before ended with it, untold."""
 
@@ -75,6 +78,7 @@ _KINDS = {
     "service.ready": MarkKind.START,
     **dict.fromkeys(ALARMS, MarkKind.ALARM),
 }
+_NOTE = "note by "
 _OF_KINDS = f"who = 'service' AND name IN ({', '.join(map(repr, _KINDS))})"
 
 
@@ -184,14 +188,19 @@ class Nights:
         return tuple(map(_entry, rows))
 
     def marks(self, first_ns: int, last_ns: int, n_most: int) -> tuple[Mark, ...]:
-        """Return the newest marks of a time, which has both ends; oldest first."""
+        """Return the newest marks of a time, which has both ends; oldest first.
+
+        A note's name is who has written it.
+        """
         rows = self._asked(
             f"SELECT t_ns_utc, name, text FROM audit WHERE {_OF_KINDS}"
-            " AND t_ns_utc BETWEEN ? AND ? ORDER BY t_ns_utc DESC LIMIT ?",
-            (first_ns, last_ns, n_most),
+            f" AND t_ns_utc BETWEEN :first AND :last UNION ALL SELECT t_ns_utc, '{_NOTE}' || who,"
+            " note FROM annotation WHERE t_ns_utc BETWEEN :first AND :last"
+            " ORDER BY t_ns_utc DESC LIMIT :most",
+            {"first": first_ns, "last": last_ns, "most": n_most},
         )
         return tuple(
-            Mark(t_ns_utc=t_ns, kind=_kind(name, text), name=name, text=text)
+            Mark(t_ns_utc=t_ns, kind=_kind(name, text), name=name.removeprefix(_NOTE), text=text)
             for t_ns, name, text in reversed(rows)
         )
 
@@ -277,4 +286,6 @@ def _entry(row: tuple[Any, ...]) -> HistoryEntry:
 
 
 def _kind(name: str, text: str) -> MarkKind:
+    if name.startswith(_NOTE):
+        return MarkKind.NOTE
     return MarkKind.OVER if text == f"{name}: over" else _KINDS[name]

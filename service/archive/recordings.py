@@ -33,6 +33,9 @@ class RecordingRecord:
 
     who: str
     why: str
+    before_s: float = 0.0
+    """Of what had come before it began that is in it, seconds."""
+
     reason: str = ""
     """Why it ended before its time; empty: it did not."""
 

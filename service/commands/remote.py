@@ -298,8 +298,8 @@ REQUESTS = (
         "record",
         "keep the telemetry that comes from now on, byte for byte; a minute if not told otherwise",
         "POST /v1/recordings",
-        *(_LASTS, _NO_WAIT),
-        body="duration_s",
+        *(_LASTS, words("--before-s S", "of what came before, 60 at most", type=float), _NO_WAIT),
+        body="duration_s before_s",
         follows="/v1/recordings/{id}",
     ),
     _orders(

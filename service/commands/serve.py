@@ -25,6 +25,7 @@ from service.commands.running import announced
 from service.config import Settings, load_instrument, packaged_instrument
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
+from service.files.last_telemetry import LastTelemetry
 from service.files.uploads import UploadFitter
 from service.keys import KeyFile
 from service.model.instrument import Instrument
@@ -74,7 +75,10 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
         where = "http://{}:{}".format(*listener.getsockname()[:2])
-        with archive, announced(archive.directory, where), Bridge(endpoint) as bridge:
+        last = LastTelemetry(
+            settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
+        )
+        with archive, announced(archive.directory, where), Bridge(endpoint, last) as bridge:
             bridge.expect(instrument.basis_id, instrument.config_id)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)

@@ -318,6 +318,12 @@ class ArchiveTable(Table):
     noon_utc_h: int = Field(default=12, ge=0, le=23)
     """UTC hour of local noon, where one night ends and the next begins."""
 
+    last_telemetry_s: float = Field(default=60.0, ge=0.0, le=3600.0)
+    """So much of the last telemetry is held in memory, to be kept when somebody asks; 0: none."""
+
+    last_telemetry_mb: int = Field(default=640, ge=1, le=1_000_000)
+    """It takes no more than this, megabytes: a minute of FLAO's at 1 kHz."""
+
 
 Scalar = bool | float | str
 

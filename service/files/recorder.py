@@ -6,9 +6,11 @@ file is written in HDF5's single-writer mode and flushed twice a second.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -17,6 +19,7 @@ import numpy as np
 import structlog
 
 from service.errors import ConfigurationError
+from service.files.last_telemetry import Arrived
 from service.files.recording import FORMAT, VERSION, Message, RecordedKind
 
 _log = structlog.get_logger()
@@ -26,6 +29,9 @@ FLUSH_S: Final = 0.5
 
 BACKLOG_BYTES: Final = 64_000_000
 """What may wait for the disk; beyond it messages are dropped and counted."""
+
+PART_BYTES: Final = 16_000_000
+"""Of what was there before that is written at once."""
 
 _ROW: Final = np.dtype(
     [
@@ -47,6 +53,7 @@ class RecordingWriter:
         self._path = path
         self._system = system
         self._backlog_bytes = backlog_bytes
+        self._past: deque[Arrived] = deque()
         self._waiting: deque[Message] = deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
@@ -90,6 +97,13 @@ class RecordingWriter:
         self._file.close()
         _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
 
+    def begin_with(self, past: Sequence[Arrived]) -> None:
+        """Write these first; call it before anything is put. They need no room in the backlog."""
+        with self._lock:
+            self._past.extend(past)
+            self._start_s = min(self._start_s, *(one.at_s for one in past[:1]), math.inf)
+            self.n_bytes += sum(len(one.payload) + len(one.attachment) for one in past)
+
     def put(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
         """Hand over a message that has just been sent, from any thread."""
         time_s = time.monotonic() - self._start_s
@@ -116,15 +130,31 @@ class RecordingWriter:
                 self.trouble = str(error)
 
     def _write(self) -> None:
-        """Append what waits: bytes before the rows that point to them, and both to the disk."""
+        """Append what waits: first of what was there before the recording, bit by bit."""
+        while self._past:
+            part, size = [], 0
+            while self._past and size < PART_BYTES:
+                kind, payload, attachment = (one := self._past.popleft())[1:]
+                size += len(payload) + len(attachment)
+                time_s = max(0.0, one.at_s - self._start_s)
+                part.append(
+                    Message(time_s=time_s, kind=kind, payload=payload, attachment=attachment)
+                )
+            self._append(part)
         with self._lock:
             messages, self._waiting = list(self._waiting), deque()
             n_dropped = self.n_dropped
         if n_dropped != self._dropped[0]:
             self._dropped[0] = n_dropped
             self._dropped.flush()
+        n_bytes = self._append(messages)
+        with self._lock:
+            self._waiting_bytes -= n_bytes
+
+    def _append(self, messages: list[Message]) -> int:
+        """Write bytes before the rows that point to them, both to the disk; return how many."""
         if not messages:
-            return
+            return 0
         data = np.frombuffer(b"".join(m.payload + m.attachment for m in messages), dtype="u1")
         sizes = np.array([(len(m.payload), len(m.attachment)) for m in messages])
         rows = np.empty(len(messages), dtype=_ROW)
@@ -138,8 +168,7 @@ class RecordingWriter:
             dataset.resize(before + len(new), axis=0)
             dataset[before:] = new
             dataset.flush()
-        with self._lock:
-            self._waiting_bytes -= len(data)
+        return len(data)
 
 
 def _growing(file: Any, name: str, kind: np.dtype[Any], chunk: int) -> Any:  # noqa: ANN401 - h5py

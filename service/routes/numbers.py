@@ -20,7 +20,7 @@ from service.files.figures import as_maps
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import slopes_of, to_conventions, turned_mask
-from service.routes.problems import INVALID, UNKNOWN, problem_response
+from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
 from service.routes.unchanged import not_modified, tag_of
 from service.routes.views import ServiceDep, answer, shows, view
 from service.runtime.supervisor import Supervisor
@@ -68,6 +68,17 @@ async def _named(
 
 MatrixId = Annotated[str, Depends(_named)]
 """Of a reconstructor that a path names."""
+
+
+async def _other(
+    service: ServiceDep,
+    other: Annotated[str, Path(description="Id of another, or in-use, previous, candidate")],
+) -> str:
+    return await _named(service, other)
+
+
+OtherId = Annotated[str, Depends(_other)]
+"""Of another one in the same path."""
 
 
 class MatrixFormat(StrEnum):
@@ -213,11 +224,31 @@ class SlopeMaps:
     """Over these frames, about zero, in the slopes' own unit."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixComparison:
+    """How two reconstructors differ, mode by mode: of as many modes as both have."""
+
+    id: str
+    other: str
+    modes: list[int]
+    """Basis indices."""
+
+    gain: list[float]
+    """By how much stronger the first one answers: norm of its row over that of the other's."""
+
+    cosine: list[float]
+    """Of the angle between both rows: 1: they answer to the same slopes, -1: of opposite sign."""
+
+    difference: float
+    """Norm of what they differ by over that of the other, all of these modes together."""
+
+
 SHOWN_S = 0.5
 """So long a picture of the slopes serves whoever asks."""
 
 SINGULAR = view("SingularValuesView", SingularValues)
 SLOPES = view("SlopeMapsView", SlopeMaps)
+COMPARISON = view("MatrixComparisonView", MatrixComparison)
 
 
 @router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
@@ -252,6 +283,53 @@ def _singular_values(
 
 def _rounded(values: NDArray[np.float64]) -> list[float]:
     return [float(f"{value:.4g}") for value in values]
+
+
+@router.get(
+    "/reconstructors/{id}/compared-with/{other}",
+    responses={200: shows(COMPARISON), **UNKNOWN, **COMMAND},
+)
+async def compare(
+    request: Request, service: ServiceDep, matrix_id: MatrixId, other: OtherId
+) -> Response:
+    """Return how a reconstructor differs from another one, mode by mode."""
+    tag = tag_of(matrix_id, other)
+    if (same := not_modified(request, tag)) is not None:
+        return same
+    found = answer(await run_in_threadpool(_compared, service, matrix_id, other))
+    found.headers["ETag"] = tag
+    return found
+
+
+def _compared(service: Supervisor, matrix_id: str, other: str) -> MatrixComparison:
+    """Compare two reconstructors; waits for the disk.
+
+    Raises
+    ------
+    CommandError
+        If they are of different slopes.
+    """
+    first, second = (service.matrix(name).astype(np.float64) for name in (matrix_id, other))
+    if first.shape[1] != second.shape[1]:
+        raise CommandError(
+            f"found {first.shape[1]} slopes in {matrix_id} and {second.shape[1]} in {other}, "
+            "expected as many in both"
+        )
+    n_modes = min(len(first), len(second))
+    first, second = first[:n_modes], second[:n_modes]
+    sizes, others = (np.linalg.norm(rows, axis=1) for rows in (first, second))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = sizes / others
+        cosine = np.sum(first * second, axis=1) / (sizes * others)
+        difference = np.linalg.norm(first - second) / np.linalg.norm(second)
+    return MatrixComparison(
+        id=matrix_id,
+        other=other,
+        modes=list(range(n_modes)),
+        gain=_rounded(gain),
+        cosine=_rounded(cosine),
+        difference=float(difference),
+    )
 
 
 @router.get(

@@ -62,14 +62,18 @@ async def _tried(client: Client, name: str, said: Instruction, order: Awaitable[
 async def begin(
     client: ClientDep, choice: Annotated[RecordingChoice, body(RecordingChoice)]
 ) -> RecordingAcceptedView:
-    """Keep the telemetry that comes from now on, for a time; what came before is gone.
+    """Keep the telemetry that comes from now on, for a time, and what came just before.
 
+    The service holds the last seconds in memory: with ``before_s`` they are in it, and with a
+    ``duration_s`` of 0 nothing else.
     The file is what ``pyrcal sim --replay`` plays and ``pyrcal archive aot`` reads.
     """
     who = client.caller.entry("", by=choice.by).who
-    begun = client.service.recordings.begin(choice.duration_s, who, choice.reason)
+    recordings = client.service.recordings
+    begun = recordings.begin(choice.duration_s, who, choice.reason, choice.before_s)
     made = await _tried(client, "recording.begin", choice, begun)
-    text = f"{made.id} keeps telemetry for {made.duration_s:g} s"
+    past = f"the last {made.before_s:.1f} s, and " if choice.before_s else ""
+    text = f"{made.id} keeps {past}telemetry for {made.duration_s:g} s"
     accepted = client.accepted(text, recording=f"/v1/recordings/{made.id}")
     return RecordingAcceptedView(id=made.id, **accepted.model_dump())
 

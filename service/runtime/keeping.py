@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 import structlog
-from annotated_types import Gt, Le
+from annotated_types import Ge, Le, MaxLen, MinLen
 
 from service.archive import Archive, AuditEntry
 from service.archive.recordings import RUNNING, STORED, RecordingRecord
@@ -38,8 +38,23 @@ LOOK_S = 0.5
 class RecordingChoice(Instruction):
     """For how long telemetry is to be kept."""
 
-    duration_s: Annotated[float, Gt(0.0), Le(LONGEST_S)] = 60.0
-    """From now on; what came before is gone."""
+    duration_s: Annotated[float, Ge(0.0), Le(LONGEST_S)] = 60.0
+    """From now on; 0: nothing of what comes."""
+
+    before_s: Annotated[float, Ge(0.0), Le(LONGEST_S)] = 0.0
+    """Of what came before, as far as the service still holds it: 60 s, unless the settings say
+    otherwise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnnotationChoice(Instruction):
+    """What somebody notes about a moment."""
+
+    note: Annotated[str, MinLen(1), MaxLen(2000)]
+    """What is to be kept."""
+
+    t_ns_utc: Annotated[int, Ge(0), Le((1 << 63) - 1)] | None = None
+    """Of what time it is, nanoseconds since the Unix epoch; None: of now."""
 
 
 class TelemetryKeeper:
@@ -54,7 +69,8 @@ class TelemetryKeeper:
     system
         Whose telemetry it is.
     tap
-        Has everything that the RTC sends put into a recorder; None: no more.
+        Has everything that the RTC sends put into a recorder, and what came in so many seconds
+        before; returns how many of them it still had. None: no more.
     audit
         Takes a line when one has ended.
     """
@@ -65,7 +81,7 @@ class TelemetryKeeper:
         archive: Archive,
         keeping: Keeping,
         system: str,
-        tap: Callable[[RecordingWriter | None], None],
+        tap: Callable[[RecordingWriter | None, float], float],
         audit: Callable[[AuditEntry], None],
     ) -> None:
         self._archive = archive
@@ -78,19 +94,23 @@ class TelemetryKeeper:
         self._record: RecordingRecord | None = None
         self._ends_s = 0.0
 
-    async def begin(self, duration_s: float, who: str, why: str) -> RecordingRecord:
-        """Begin a recording.
+    async def begin(
+        self, duration_s: float, who: str, why: str, before_s: float = 0.0
+    ) -> RecordingRecord:
+        """Begin a recording, with what came in the last seconds as far as it is still held.
 
         Raises
         ------
         CommandError
-            If one is under way, or the disk is almost full.
+            If one is under way, there would be nothing in it, or the disk is almost full.
         StorageError
             If the disk refuses.
         """
         async with self._guard:
             if self._record is not None:
                 raise CommandError(f"{self._record.id} is under way; end it first")
+            if not duration_s and not before_s:
+                raise CommandError("found 0 s before and 0 s from now on, expected some of them")
             full = await asyncio.to_thread(self._full)
             if full is not None:
                 raise CommandError(f"nothing is recorded: {full}")
@@ -108,7 +128,8 @@ class TelemetryKeeper:
                 self._archive.recordings.path_of(record.id), system=self._system
             )
             await asyncio.to_thread(self._open, recorder, record)
-            self._tap(recorder)
+            held_s = self._tap(recorder, before_s)
+            record = replace(record, before_s=round(held_s, 3))
             self._recorder, self._record = recorder, record
             self._ends_s = time.monotonic() + duration_s
             return record
@@ -144,7 +165,7 @@ class TelemetryKeeper:
             if recorder is None or record is None or recording_id not in {None, record.id}:
                 raise CommandError(f"{recording_id or 'no recording'} is not under way")
             self._recorder = self._record = None
-            self._tap(None)
+            self._tap(None, 0.0)
             await asyncio.to_thread(recorder.__exit__)
             record = replace(
                 record,

@@ -21,9 +21,11 @@ class Tap:
     """What the link does: hands on what the RTC sends."""
 
     recorder = None
+    held_s = 0.0
 
-    def __call__(self, recorder):
+    def __call__(self, recorder, before_s):
         self.recorder = recorder
+        return min(before_s, self.held_s)
 
 
 @pytest.fixture
@@ -81,6 +83,21 @@ async def test_what_comes_is_kept_byte_for_byte_with_who_and_why(client, service
     ]  # fmt: skip
     twice = await client.post(f"/v1/recordings/{name}/end", json={})
     assert_problem(twice, 409, "not-now", "is not under way")
+
+
+async def test_what_came_before_is_in_it_as_far_as_it_is_held(client, keeper):
+    keeper.tap.held_s = 31.5
+    response = await client.post("/v1/recordings", json={"before_s": 60, "duration_s": 0})
+    assert "the last 31.5 s" in response.json()["text"]
+    name = response.json()["id"]
+    running = asyncio.create_task(keeper.run())
+    await ended_by_itself(client, name)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    told = await of(client, name)
+    assert (told["before_s"], told["duration_s"], told["reason"]) == (31.5, 0.0, "")
+    nothing = await client.post("/v1/recordings", json={"before_s": 0, "duration_s": 0})
+    assert_problem(nothing, 409, "not-now", "expected some of them")
 
 
 async def test_it_ends_in_its_time_and_with_the_service(client, service, keeper):

@@ -66,8 +66,9 @@ class HandmadeBridge:
     def set_current(self, matrix_id):
         self.current = matrix_id
 
-    def keep(self, recorder):
+    def keep(self, recorder, before_s=0.0):
         self.recorder = recorder
+        return before_s
 
 
 class Clock:

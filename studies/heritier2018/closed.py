@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from studies.heritier2018 import page, paper, table2
 from studies.heritier2018.closed_remarks import noise_remark, shaken_remark
+from studies.heritier2018.closing import RAMP_GAINS
 from studies.heritier2018.loops import SETTLING_FRAMES, wavefront_error_nm
 from studies.heritier2018.plan import (
+    CLOSED_GAIN,
     Budget,
     Variant,
     closed_run,
@@ -54,15 +56,13 @@ def section(budget: Budget, store: Store) -> page.Section:
     n_frames, n_seeds = budget.closed_frames, len(budget.seeds)
     body = page.paragraph(
         "By day: a turbulence of 1 arcsec is played on the mirror, which also corrects it, the "
-        "light meets it twice, fibre of magnitude 7. Gains are tuned by the paper's ramp: tip and "
-        "tilt, modes to 100, the rest, each by its own residual slopes, every reconstructor by "
-        "itself. Errors are at the sensor, after both passes. "
+        f"light meets it twice, gain {CLOSED_GAIN:g} of every mode, fibre of magnitude 7. Errors "
+        "are at the sensor, after both passes. "
         f"{n_frames} frames a loop after {SETTLING_FRAMES} of settling, {n_seeds} "
         f"telescope{'s' * (n_seeds > 1)}, each with imperfections, measured matrix, fit and "
         "turbulence of its own; ± is their scatter."
     )
-    body += _gains_table(budget, store)
-    body += table2.body(budget, store)
+    body += table2.body(budget, store) + _gains_table(budget, store)
     body += page.heading("All of the wavefront, with and without vibrations")
     body += _errors_table(budget, store)
     body += shaken_remark(*_all_modes_nm(budget, store))
@@ -121,7 +121,12 @@ def _gains_table(budget: Budget, store: Store) -> str:
         for seed in budget.seeds:
             gains = store.read(gain_tuning(budget, seed, variant))["by_group"]
             rows.append([str(variant), str(seed), *(f"{gain:g}" for gain in gains)])
-    return page.heading("Gains that the ramp finds") + page.table(head, rows)
+    told = (
+        "The paper tunes gains by groups: tip and tilt, modes to 100, the rest, each by its own "
+        f"residual slopes. The ramp tries {', '.join(f'{gain:g}' for gain in RAMP_GAINS)}; the "
+        f"service's own goes no higher than {CLOSED_GAIN:g}, which is the gain of the loops here."
+    )
+    return page.heading("Gains that the ramp finds") + page.paragraph(told) + page.table(head, rows)
 
 
 def _pairs_remark(budget: Budget, store: Store) -> str:

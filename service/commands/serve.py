@@ -31,6 +31,7 @@ from service.keys import KeyFile
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
+from service.runtime.clock import ServiceClock
 from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
@@ -186,6 +187,7 @@ def _supervisor(
     workers: WorkerPool,
     archive: Archive,
 ) -> Supervisor:
+    clock = ServiceClock()
     actions = Actions(
         bridge=bridge,
         workers=workers,
@@ -196,7 +198,7 @@ def _supervisor(
             chunk_bytes=settings.zenoh.chunk_bytes,
             pole_radius_bound=settings.control.pole_radius_bound,
         ),
-        clock_ns=time.time_ns,
+        clock_ns=clock.now_ns,
     )
     policy = policy_of(settings)
     state = TrackerState(
@@ -208,13 +210,14 @@ def _supervisor(
         config_id=instrument.config_id,
     )
     return Supervisor(
-        state=taken_up(archive, state, policy, time.time_ns()),
+        state=taken_up(archive, state, policy, clock.now_ns()),
         policy=policy,
         bridge=bridge,
         workers=workers,
         archive=archive,
         actions=actions,
         keeping=keeping_of(settings),
+        clock=clock,
     )
 
 

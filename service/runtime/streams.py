@@ -373,7 +373,8 @@ def taken(streams: Streams, *, told: bool = False) -> tuple[Streams, Passive | s
     a jump says so. Beside a dither some telemetry is left out, more where windows have ``told`` of
     α just now; None: that is why. A rest ends early when they no longer do.
     """
-    streams = streams if told and streams.cutter is not None else _awake(streams)
+    rests = told and streams.cutter is not None and not _oversleeps(streams)
+    streams = streams if rests else _awake(streams)
     rtc, sums = streams.rtc, streams.passive
     since_ns = 0 if streams.cutter is None or sums is None else sums.since_ns_utc
     if streams.heard_ns_utc - since_ns < LEAST_LOOK_S * 1e9 and since_ns:
@@ -409,6 +410,13 @@ def taken(streams: Streams, *, told: bool = False) -> tuple[Streams, Passive | s
     # a window that is under way is of the gains with which it began
     loop = rtc if streams.cutter is None else streams.loop
     return replace(streams, passive=begun, loop=loop), sums
+
+
+def _oversleeps(streams: Streams) -> bool:
+    """Return whether the rest after a look would be longer than any: the RTC's clock went back."""
+    sums = streams.passive
+    left_ns = 0 if sums is None else sums.since_ns_utc - streams.heard_ns_utc
+    return left_ns > 2 * LONG_RESTS * WATCH_INTERVAL_S * 1e9
 
 
 def _awake(streams: Streams) -> Streams:

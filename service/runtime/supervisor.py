@@ -23,6 +23,7 @@ from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
 from service.runtime.answers import Given
+from service.runtime.clock import ServiceClock
 from service.runtime.engine import Engine, looked_at
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.keeping import TelemetryKeeper
@@ -46,6 +47,7 @@ from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST
 from service.tracking.attention import is_news
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
@@ -86,7 +88,9 @@ class Supervisor:
         archive: Archive,
         actions: Actions,
         keeping: Keeping = EVERYTHING,
+        clock: ServiceClock | None = None,
     ) -> None:
+        self._clock = clock or ServiceClock()
         self._engine = Engine(state, policy, self)
         self._bridge = bridge
         self._workers = workers
@@ -125,7 +129,7 @@ class Supervisor:
         self._broken = ""
         """The last fault that nobody foresaw."""
 
-        self._started_ns = time.time_ns()
+        self._started_ns = self._clock.now_ns()
         self._log = structlog.get_logger().bind(system=state.system)
 
     @property
@@ -145,7 +149,7 @@ class Supervisor:
         return Snapshot(
             tracker=self._engine.state,
             link=link,
-            now_ns=time.time_ns(),
+            now_ns=self._clock.now_ns(),
             started_ns=self._started_ns,
             ready=not any(wait.hinders for wait in waiting),
             ready_reason="; ".join(f"{wait.party}: {wait.text}" for wait in waiting) or "ready",
@@ -184,7 +188,7 @@ class Supervisor:
             If it cannot be recorded; nothing has been done.
         """
         told = isinstance(command, cmd.SetValue) and not is_news(
-            self._engine.state, command, time.time_ns()
+            self._engine.state, command, self._clock.now_ns()
         )
         if told or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
             return await self._carried_out(command)
@@ -210,7 +214,7 @@ class Supervisor:
         before, running = self._engine.state, set(self._running)
         for effect in self._post(command):
             if isinstance(command, cmd.Refit) and isinstance(effect, ev.MakeMatrix):
-                self.refits.begin(effect, time.time_ns())
+                self.refits.begin(effect, self._clock.now_ns())
         given = Given(command, before, self._engine.state)
         asked = self._running - running
         if asked and isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
@@ -347,9 +351,10 @@ class Supervisor:
             self._meter.look()
             for trouble in self._meter.news(self._engine.state):
                 self._post(trouble)
-            now_ns = time.time_ns()
+            now_ns = self._clock.now_ns()
             lost = losses.complaint(link, time.monotonic())
-            for event in news_of_link(link, self._engine.state, now_ns, lost):
+            also = {FRAMES_LOST: lost, CLOCK_LEAPT: self._clock.complaint()}
+            for event in news_of_link(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting(link)
             for text in told.news(waiting, self._engine.state.alarms, now_ns):
@@ -411,7 +416,7 @@ class Supervisor:
 
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
-        return time.time_ns()
+        return self._clock.now_ns()
 
     def stepped(self, before: TrackerState, event: Event) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -61,6 +61,7 @@ LOST_SHARE: Final = 0.01
 """Of the frames: more of them lost are an alarm, which half as many do not end."""
 
 COMPLAINTS: Final = (
+    alarms.CLOCK_LEAPT,
     alarms.FRAMES_LOST,
     alarms.FRAMES_UNUSED,
     alarms.MESSAGES_REFUSED,
@@ -68,6 +69,8 @@ COMPLAINTS: Final = (
 )
 """Names of the alarms that are made here."""
 
+
+NOTHING_ELSE: Final[Mapping[str, str]] = {}
 
 _NUMBER: Final = re.compile(r"[0-9]+")
 
@@ -184,16 +187,15 @@ class Losses:
 
 
 def news_of_link(
-    link: LinkStatistics, state: TrackerState, now_ns: int, lost: str = ""
+    link: LinkStatistics, state: TrackerState, now_ns: int, also: Mapping[str, str] = NOTHING_ELSE
 ) -> list[ev.Event]:
     """Return which complaints are made, again or anew, and which are over.
 
-    ``lost`` is what ``Losses`` complains of.
+    ``also`` are those of others, by name; empty: none.
     One that differs in its numbers alone keeps its text: that is no news.
     """
     made, found = complaints(link), []
-    if lost:
-        made[alarms.FRAMES_LOST] = lost
+    made |= {name: text for name, text in also.items() if text}
     raised = {alarm.name: alarm for alarm in state.alarms if alarm.name in COMPLAINTS}
     for name, text in made.items():
         before = raised.get(name)

@@ -736,3 +736,13 @@ class TestModesThatComeIntoTheLoop:
     def test_what_no_loop_makes_of_it_is_named_by_one(self, streams):
         _, found = self.heard(streams, 0, 10, by=4.0)
         assert "mode 6 carries 20 nm instead of 5 nm" in found[9]
+
+
+def test_an_rtc_whose_clock_goes_back_an_hour_is_looked_at_again_at_once(streams):
+    streams, _ = play(streams, 0, 45)
+    streams, sums = taken(streams, told=True)
+    assert not isinstance(sums, str)
+    back = replace(streams, heard_ns_utc=streams.heard_ns_utc - 3600 * 10**9)
+    assert back.passive.since_ns_utc > back.heard_ns_utc + 3000 * 10**9
+    back, _ = taken(back, told=True)
+    assert back.passive.since_ns_utc <= back.heard_ns_utc

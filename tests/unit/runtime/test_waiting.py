@@ -354,7 +354,7 @@ def test_a_complaint_of_losses_ends_only_with_half_as_many():
 def test_lost_frames_are_an_alarm_that_ends_by_itself():
     state = TrackerState(system="small")
     text = Counting().pass_(10, lost=50)
-    (made,) = news_of_link(link(*WELL), state, START_NS, text)
+    (made,) = news_of_link(link(*WELL), state, START_NS, {"frames-lost": text})
     assert made.name == "frames-lost"
     alarm = Alarm(name=made.name, since_ns_utc=0, text=made.text, seen_ns_utc=START_NS)
     state = replace(state, alarms=(alarm,))

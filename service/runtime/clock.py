@@ -45,8 +45,8 @@ class ServiceClock:
             return ""
         return (
             f"this machine's clock has leapt by {ahead_ns / 1e9:+.0f} s: the service goes on by "
-            "the time that has passed, and tells log and estimates by that; if the new time is right, "
-            "restart the service when it may be"
+            "the time that has passed, and tells log and estimates by that; if the new time is "
+            "right, restart the service when it may be"
         )
 
     def _ahead_ns(self) -> int:

@@ -46,7 +46,11 @@ def desk(tmp_path_factory):
     return folder
 
 
-def pyrcal(words, folder, data):
+ASKED = {"status", "reconstructors", "export", "audit", "dither", "stop", "resume"}
+"""Commands to a running service that end at once and leave the night as it was."""
+
+
+def pyrcal(words, folder, data, **environment):
     return subprocess.run(
         [sys.executable, "-m", "service", *words],
         cwd=folder,
@@ -58,6 +62,7 @@ def pyrcal(words, folder, data):
             **os.environ,
             "PYTHONPATH": str(ROOT),
             "PYRCAL_SERVICE__DATA_DIR": str(data),
+            **environment,
         },
     )
 
@@ -89,6 +94,18 @@ def test_the_bench_of_the_manual_is_fitted_where_it_was_measured(desk, tmp_path)
     assert '"verdict": "accepted' in done.stdout
 
 
+def asked_for_real(night, folder):
+    """What docs/operating.md types at a running service, in its order: each is answered."""
+    done = []
+    for words in typed(ROOT / "docs" / "operating.md"):
+        if words[0] in ASKED and not {"ID", "measurement", "recording"} & set(words):
+            answer = pyrcal(words, folder, folder, PYRCAL_URL=f"http://127.0.0.1:{night.port}")
+            told = {0, 1} if words[0] == "status" else {0}  # 1: there is an alarm
+            assert answer.returncode in told, (words, answer.stdout, answer.stderr)
+            done.append(words[0])
+    assert set(done) == ASKED
+
+
 def test_a_night_is_rehearsed_with_the_bench_of_the_manual(desk, tmp_path):
     """Run, sim and check-rtc of docs/howto.md, each as it is written there."""
     written = [words for words in typed(ROOT / "docs" / "howto.md") if "bench.toml" in words]
@@ -107,6 +124,7 @@ def test_a_night_is_rehearsed_with_the_bench_of_the_manual(desk, tmp_path):
         known = wait_for(lambda: night.state["registration"], 60.0, lambda: night.state)
         assert max(known["sigma"].values()) < 0.2
         wait_for(lambda: night.ids("proposed"), 60.0, lambda: night.state)
+        asked_for_real(night, tmp_path)
         passive = start(["check-rtc", "--connect", night.zenoh, "--passive", "--seconds", "3"])
         assert passive.ended(60.0) == 0, passive.log
         assert "the RTC there is that of system bench" in passive.log

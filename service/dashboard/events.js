@@ -18,7 +18,7 @@ function lineOf(alarm) {
     make("strong", { text: `${over ? SYMBOLS.over : SYMBOLS[alarm.severity]} ${name}` }),
     make("span", { text: `${word}${been}` }),
     make("span", { className: "since", data_since: String(milliseconds(alarm.since_ns_utc)) }),
-    make("span", { className: "buttons" }, ...(runbook ? [make("a", { href: runbook, text: "Runbook", aria_label: `Runbook: ${name}` })] : []), ...(seen ? [] : [about("acknowledge", name, "Acknowledge")]), about("mute", name, "Mute")),
+    make("span", { className: "buttons" }, ...(runbook ? [make("a", { href: runbook, target: "_blank", rel: "noopener", text: "Runbook", aria_label: `Runbook: ${name}` })] : []), ...(seen ? [] : [about("acknowledge", name, "Acknowledge")]), about("mute", name, "Mute")),
     make("span", { className: "says", text: alarm.text }),
     ...(known ? [make("span", { className: "says", text: known })] : []));
 }

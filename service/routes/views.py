@@ -38,7 +38,7 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.supervisor import Supervisor
 from service.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
-from service.telemetry.probation import ProbationFinding
+from service.telemetry.comparison import ProbationFinding
 from service.tracking.activity import Operating
 from service.tracking.alarms import Alarm, Note, Remark
 from service.tracking.commands import GainGroup

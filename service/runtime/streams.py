@@ -319,13 +319,18 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     if vibrations is not None and sums is not None and len(streams.in_loop):
         vibrations = vibrations.update(block, lines)
         sums = passive.accumulate(sums, _moving(streams, block))
-    health = observe(streams.health, block, streams.description.mode_variance_m2, streams.in_loop)
+    health = streams.health
+    if block.cm_id != streams.comparison.cm_id:
+        # what another matrix has made of the loop says nothing of this one
+        health = replace(health, ratio=0.0)
+    health = observe(health, block, streams.description.mode_variance_m2, streams.in_loop)
     if streams.edge_watch is not None and not health.absurd:
         edge = observe_edge(edge, block, streams.edge_watch)
     comparison = streams.comparison
     if len(streams.in_loop) and not health.absurd:
+        matrix = None if terms is None else terms.reconstructor
         comparison = probation.observe(
-            comparison, block, streams.in_loop, lines, streams.edge_watch
+            comparison, block, streams.in_loop, lines, streams.edge_watch, matrix
         )
     streams = replace(
         streams,

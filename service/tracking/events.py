@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
+from service.telemetry.comparison import ProbationFinding
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.openloop import FarEstimate
 from service.telemetry.passive import PassiveEstimate
-from service.telemetry.probation import ProbationFinding
 from service.telemetry.random_dither import RandomEstimate
 from service.telemetry.windows import WindowRefused
 from service.tracking.commands import Command

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.telemetry.probation import WITHIN_S, Verdict
+from service.telemetry.comparison import Verdict
+from service.telemetry.probation import WITHIN_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors
@@ -149,12 +150,12 @@ def go_back(turn: Turn, made: ev.MatrixMade) -> None:
 def _go_back(turn: Turn, trial: Probation, found: str) -> None:
     """Have the matrix before sent again; where that cannot be say why."""
     hold(turn, f"{trial.id} made the loop worse")
-    trial = replace(trial, text=found)
+    trial = replace(trial, worse=f"made the loop worse: {found}")
     why = _why_no_way_back(turn, trial)
     if why is not None:
         _keep(turn, trial, why)
         return
-    text = f"made the loop worse: {found}: going back to {trial.before}"
+    text = f"{trial.worse}: going back to {trial.before}"
     _set(turn, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
     turn.alarm(PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
@@ -207,10 +208,10 @@ def _await_copy(turn: Turn, trial: Probation) -> None:
 
 def _begin_watch(turn: Turn, trial: Probation, in_use: str) -> None:
     """Look whether the loop is as it was, now that the matrix before is in use again."""
-    text = f"{_numbers(trial)}: the service went back to {trial.before}, as {in_use}"
+    text = f"{trial.worse}: the service went back to {trial.before}, as {in_use}"
     # an operator's rollback would go back to it
     reconstructors.change_state(
-        turn, trial.id, MatrixState.FAILED, f"rolled back, it {_numbers(trial)}"
+        turn, trial.id, MatrixState.FAILED, f"rolled back, it {trial.worse}"
     )
     watched = replace(
         trial,
@@ -339,17 +340,9 @@ def _why_no_way_back(turn: Turn, trial: Probation) -> str | None:
     return why_unsendable(state, record, trial.since_ns_utc)
 
 
-def _numbers(trial: Probation) -> str:
-    """Return what was found of a matrix that is worse."""
-    found = trial.finding
-    if found is None:
-        return f"made the loop worse: {trial.text.removeprefix('made the loop worse: ')}"
-    return f"made the loop worse: {found.text}"
-
-
 def _keep(turn: Turn, trial: Probation, why: str) -> None:
     """Say that a matrix that is worse stays in use; open the loop that is lost with it."""
-    text = f"{_numbers(trial)}; the service did not go back to {trial.before}: {why}"
+    text = f"{trial.worse}; the service did not go back to {trial.before}: {why}"
     out_of_hand = turn.forbidden(Act.HOLD) is not None
     lost = out_of_hand or (trial.finding is not None and trial.finding.lost)
     if lost and trial.opens and turn.rtc is not None and not turn.state.stopped_because:

@@ -12,7 +12,7 @@ from service.control.expected_gain import ExpectedGain
 from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration, at_boundary
-from service.telemetry.probation import ProbationFinding
+from service.telemetry.comparison import ProbationFinding
 from service.wire import (
     ControlLaw,
     Manifest,
@@ -276,6 +276,9 @@ class Probation:
 
     finding: ProbationFinding | None = None
     """The numbers that were compared; None: not yet, or there are none."""
+
+    worse: str = ""
+    """What it did to the loop, where it made that worse; empty: it did not."""
 
     rollback: str | None = None
     """Id under which the matrix before was sent again; None: it was not."""

@@ -27,7 +27,8 @@ from typing_extensions import override
 from service.control.loop import pole_radius
 from service.control.reconstructor import Recipe, reconstruct
 from service.model.misregistration import Misregistration
-from service.telemetry.probation import Comparison, ProbationFinding, Verdict, observe
+from service.telemetry.comparison import ProbationFinding, Verdict
+from service.telemetry.probation import Comparison, observe
 from service.wire import DitherKind, DitherRequest, DitherStop, LoopRequest
 from sim_rtc.computer.telemetry import Batch
 from sim_rtc.telescope.diffractive import DiffractiveOptics

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import scipy
 
+from service.telemetry.comparison import Verdict
 from service.telemetry.frames import FrameBlock
-from service.telemetry.probation import WITHIN_S, Comparison, Verdict, begun_anew, observe
+from service.telemetry.probation import WITHIN_S, Comparison, begun_anew, observe
 
 N_MODES, BLOCK, DT_NS = 60, 50, 1_000_000
 BEFORE_S, AFTER_S = 2.0, 3.5

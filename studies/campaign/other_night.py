@@ -19,7 +19,6 @@ from service.tracking.state import Mode, TrackerState
 from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Observatory
 from studies.campaign.other_truth import OtherDome, OtherLink, Truth
-from studies.campaign.small import bench_of
 
 INSTRUMENT = "tests/system/middle.toml"
 GAINS = {"linear": 0.4, "diffractive": 0.5}
@@ -186,8 +185,7 @@ def _opened(folder: Path) -> Archive:
 
 
 def _bench(plan: Plan, working_point_modes: int | None) -> OpticsWorker:
-    """Return the worker; a diffractive telescope is fitted at its working point."""
-    if plan.plant == "linear":
-        return bench_of(plan.instrument)
-    sampling = Sampling(working_point_modes=working_point_modes)
+    """Return a worker that has learnt nothing yet; at its working point if that matters."""
+    modes = None if plan.plant == "linear" else working_point_modes
+    sampling = Sampling(working_point_modes=modes)
     return OpticsWorker(load_instrument(plan.instrument), Compute(threads=1, sampling=sampling))

@@ -19,7 +19,7 @@ from typing_extensions import override
 from service.errors import LinkError
 from service.model.misregistration import Misregistration
 from service.telemetry.frames import FrameBlock
-from service.wire import Manifest, layout_of
+from service.wire import Manifest, checksum, layout_of
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import Block
 from sim_rtc.computer.loop import LoopBlock, LoopTerms, ModalLoop
@@ -265,7 +265,7 @@ class OtherDome(Dome):
         n_controlled = options.n_controlled(self.instrument.modes.n_modes)
         matrix = truncated_inverse(true_response(optics, n_controlled))
         own = Reconstructor.own(
-            f"own-{n_controlled}",
+            f"own-{n_controlled}-{checksum(matrix)[:8]}",
             matrix,
             telescope.identity,
             created_ns=telescope.reconstructor.manifest.created_ns,

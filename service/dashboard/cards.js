@@ -93,7 +93,7 @@ export function showLoop(service, mirror) {
   const gains = (state?.registration?.optical_gains ?? []).map((g) => g.gain);
   const delay = rtc ? number(rtc.delay_frames, 1).replace(/\.0$/, "") : DASH;
   put($("#loop-state"), rtc ? `${rtc.loop}, ${rtc.n_controlled} of ${rtc.n_modes} modes, ${delay} frames delay` : DASH);
-  put($("#wavefront"), expected ? `${nanometres(expected.wavefront_m)}, and ${nanometres(expected.loss_m)} lost by the matrix in use` : DASH);
+  put($("#wavefront"), expected ? `${nanometres(expected.wavefront_m)}, and ${nanometres(expected.loss_m)} lost by the matrix in use${before(state, expected)}` : DASH);
   put($("#optical-gain"), gains.length ? `${number(Math.min(...gains))} to ${number(Math.max(...gains))}, ${gains.length} modes` : DASH);
   const judged = margin(state?.margin);
   gauge($("#margin"), judged && judged.radius / judged.bound, judged ? judged.text : DASH);
@@ -104,6 +104,16 @@ export function showLoop(service, mirror) {
   put($("#dither"), !rtc && dither ? `${dither.phase}: ${dither.reason}` : dither ? `${dither.phase}, ${nanometres(dither.mean_cost_m)} of ${nanometres(dither.budget_m)}: ${dither.reason}` : DASH);
   const link = state?.link;
   put($("#frames"), link ? `${link.frames_received} received, ${link.frames_lost} lost, last ${present(link.frame_age_s) ? `${span(link.frame_age_s)} ago` : DASH}` : DASH);
+}
+
+// What the matrix before left, by the same model: a swap shows what it was for.
+const foreseen = []; // under each matrix in use since the page was opened, oldest first
+function before(state, { wavefront_m: best, loss_m: loss }) {
+  if (foreseen.at(-1)?.id !== state.in_use) foreseen.push({ id: state.in_use });
+  Object.assign(foreseen.at(-1), { total: best + (loss ?? Infinity), modes: state.rtc?.n_controlled });
+  if (foreseen.length > 2) foreseen.shift();
+  const last = foreseen.length > 1 ? foreseen[0] : null;
+  return last ? `; before the swap ${Number.isFinite(last.total) ? nanometres(last.total) : "unstable"} with ${last.modes} modes` : "";
 }
 
 // A bar with its limit; the words beside it say the same.

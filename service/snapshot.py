@@ -13,12 +13,12 @@ from service.control.gains import ModeGain
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
 from service.tracking.activity import Operating, operating
-from service.tracking.alarms import ALARMS, Kind, Note, Severity
+from service.tracking.alarms import ALARMS, Kind, Note, Severity, Waiting
 from service.tracking.attention import muted, note_of, stale, worst
 from service.tracking.commands import GainGroup
 from service.tracking.registration import Registration
 from service.tracking.sending import why_no_return
-from service.tracking.state import LogEntry, TrackerState, Waiting
+from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
 
 WINDOW_REFUSED = "window.refused"

@@ -16,6 +16,7 @@ from service.tracking import (
     dither,
     evidence,
     measuring,
+    mode_proof,
     offload,
     operator,
     probation,
@@ -112,6 +113,7 @@ def _on_window(turn: Turn, event: ev.WindowFitted) -> None:
     if turn.state.measuring is not None:
         evidence.refuse_window(turn, measuring.MEASURING)
         return
+    mode_proof.learn(turn, event.estimate)
     evidence.on_window(turn, event)
     dither.learn(turn, event.estimate)
 
@@ -177,6 +179,7 @@ REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
     ev.Unwatched: lambda turn, unwatched: evidence.cannot_watch(turn, unwatched.text),
     ev.MatrixMade: _on_made,
     ev.MatrixFetched: reconstructors.on_fetched,
+    ev.ModesRecognised: mode_proof.recognise,
     ev.MarginJudged: reconstructors.on_margin,
     ev.ProposalJudged: reconstructors.on_proposal_judged,
     Acknowledgement: reconstructors.on_acknowledgement,

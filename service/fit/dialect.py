@@ -73,6 +73,9 @@ class Dialect:
     adopted: bool = False
     """Whether the model lists its slopes like that from now on: the file says "auto"."""
 
+    rotation_rad: float | None = None
+    """Rough rotation of the mirror by the same witness; None: it does not tell."""
+
 
 def of_reconstructor(
     reconstructor: NDArray[np.float32],
@@ -158,9 +161,9 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dial
         return Dialect(wrong="" if stated else text)
     alike = [pose for pose in poses if pose.correlation > best.correlation - LEAST_LEAD]
     near = [pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= REACH_RAD]
-    settings = [pose.slopes for pose in near]
+    settings = {pose.slopes: pose.rotation_rad for pose in near}
     if told in settings:
-        return Dialect(found=told)
+        return Dialect(found=told, rotation_rad=settings[told])
     if not near:
         turned_deg = np.rad2deg(
             min(alike, key=lambda pose: _n_changes(pose.slopes, told)).rotation_rad
@@ -171,7 +174,7 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dial
         )
     found = min(settings, key=lambda setting: _n_changes(setting, told))
     if not stated:
-        return Dialect(found=found)
+        return Dialect(found=found, rotation_rad=settings[found])
     return Dialect(wrong=_axes_named("the RTC's own matrix", found, told), found=found)
 
 

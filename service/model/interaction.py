@@ -371,21 +371,39 @@ class RtcInteractionModel(InteractionModel):
     only the model speaks two languages.
     """
 
+    def __init__(
+        self,
+        instrument: Instrument,
+        basis: Basis,
+        *,
+        mode_response: Array | None = None,
+        **settings: Any,  # noqa: ANN401 - those of every interaction model
+    ) -> None:
+        super().__init__(instrument, basis, **settings)
+        self._mode_response = mode_response
+        """``(n_modes,)`` slopes per unit of command over the drawing's; None: as drawn."""
+
     @override
     def interaction_matrix(self, alpha: Misregistration) -> Array:
-        """Return D(α), ``(n_slopes, n_modes)``, rows in the RTC's order and signs."""
-        return self._listed(super().interaction_matrix(alpha))
+        """Return D(α), ``(n_slopes, n_modes)``, as the RTC lists slopes and its modes answer."""
+        return self._answered(self._listed(super().interaction_matrix(alpha)))
 
     @override
     def derivatives(self, alpha: Misregistration) -> Array:
-        """Return dD/dα ``(4, n_slopes, n_modes)``, rows in the RTC's order and signs."""
-        return np.stack([self._listed(matrix) for matrix in super().derivatives(alpha)])
+        """Return dD/dα ``(4, n_slopes, n_modes)``, as the RTC lists and its modes answer."""
+        every = np.stack([self._listed(matrix) for matrix in super().derivatives(alpha)])
+        return self._answered(every)
 
     @override
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
         """Return which of the RTC's slopes lie near unknown surface, ``(n_slopes,)``."""
         marks = self._listed(super().unknown_rows(alpha).astype(np.float32))
         return np.asarray(marks != 0.0)
+
+    def _answered(self, columns: Array) -> Array:
+        if self._mode_response is None:
+            return columns
+        return np.asarray(columns * self._mode_response.astype(columns.dtype))
 
     def _listed(self, rows: Array) -> Array:
         recipe = self.instrument.slopes

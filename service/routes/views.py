@@ -40,19 +40,14 @@ from service.runtime.supervisor import Supervisor
 from service.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
 from service.telemetry.comparison import ProbationFinding
 from service.tracking.activity import Operating
-from service.tracking.alarms import Alarm, Note, Remark
+from service.tracking.alarms import Alarm, Note, Remark, Waiting
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
 from service.tracking.loop import LoopCommand
-from service.tracking.products import (
-    Assessment,
-    MeasurementRecord,
-    ModeLimit,
-    Probation,
-    ReconstructorRecord,
-)
+from service.tracking.mode_limits import ModeLimit, ModeProof
+from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
 from service.tracking.registration import HistoryEntry, Move, Watchdog
-from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState, Waiting
+from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState
 from service.wire import Pointing
 
 Record = TypeVar("Record")
@@ -378,6 +373,7 @@ view("AssessmentView", Assessment)
 view("ProbationFindingView", ProbationFinding)
 view("ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback")
 view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
+view("ModeProofView", ModeProof, "n_proven contrary_modes own_response_ratio")
 ALPHA = view(
     "AlphaView",
     Alpha,
@@ -482,8 +478,9 @@ STATE = view(
     Snapshot,
     "tracker.system tracker.mode tracker.stopped_because ready ready_reason now_ns uptime_s "
     "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit "
-    "tracker.probation rtc tracker.pointing tracker.basis_id tracker.config_id tracker.dither "
-    "tracker.dithering tracker.vibrations_hz tracker.measuring tracker.gathering "
+    "tracker.mode_proof tracker.probation rtc tracker.pointing tracker.basis_id "
+    "tracker.config_id tracker.dither tracker.dithering tracker.vibrations_hz tracker.measuring "
+    "tracker.gathering "
     "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
     "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating no_return "
     "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "

@@ -188,27 +188,46 @@ async def listened(
     state: TrackerState,
     workers: WorkerPort,
 ) -> list[Event]:
-    """Return what a matrix that the RTC brought tells of its slopes and commands.
+    """Return what the matrix in use tells of the RTC's slopes, commands and modes.
 
-    One that the service has made and judged says nothing that it did not know.
+    One that the service has made and judged says nothing that it did not know, but for the first
+    that it meets: what the RTC's own said in another run went into it.
     """
-    if record.judged is not None:
+    if record.judged is not None and workers.first is not None:
         return []
     known = state.registration
+    near = None if known is None else known.alpha
     try:
-        dialect = await workers.call(
-            OpticsWorker.listen, matrix, None if known is None else known.alpha
-        )
+        dialect = await workers.call(OpticsWorker.listen, matrix, near)
+        own, response = None, None
+        if not dialect.wrong:
+            own, response = await workers.call(
+                OpticsWorker.recognise, matrix, near, dialect.rotation_rad
+            )
     except PyrcalError as error:
         return [ev.Noted(name="slopes.unknown", text=str(error), level=Level.WARNING)]
     events: list[Event] = []
-    if dialect.found is not None and dialect.adopted:
-        workers.first = partial(run_job, OpticsWorker.adopt, dialect.found)
-        text = f'orientation "auto": found {setting_written(dialect.found)} by {record.id}'
+    slopes = dialect.found if dialect.adopted else None
+    if slopes is not None:
+        text = f'orientation "auto": found {setting_written(slopes)} by {record.id}'
         events.append(ev.Noted(name="slopes.adopted", text=text))
-    if dialect.wrong or state.alarm(WRONG_MATRIX) is not None:
-        text = f"{record.id}: {dialect.wrong}" if dialect.wrong else f"{record.id} is as told"
-        events.append(ev.Trouble(name=WRONG_MATRIX, text=text, over=not dialect.wrong))
+    if not dialect.wrong:
+        workers.first = partial(run_job, OpticsWorker.adopt, slopes, response)
+    wrong = dialect.wrong or (own.wrong if own is not None else "")
+    if wrong or state.alarm(WRONG_MATRIX) is not None:
+        text = f"{record.id}: {wrong}" if wrong else f"{record.id} is as told"
+        events.append(ev.Trouble(name=WRONG_MATRIX, text=text, over=not wrong))
+    if own is not None:
+        strange = tuple(own.columns[~own.known].tolist())
+        events.append(
+            ev.ModesRecognised(
+                id=record.id,
+                strange=strange,
+                text=own.text,
+                response=own.typical_response,
+                uneven="" if wrong else own.uneven,
+            )
+        )
     return events
 
 

@@ -47,13 +47,13 @@ from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST
+from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Waiting
 from service.tracking.attention import is_news
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
-from service.tracking.state import Level, TrackerState, Waiting
+from service.tracking.state import Level, TrackerState
 from service.tracking.turn import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
 from service.worker import Description, OpticsWorker

@@ -14,11 +14,11 @@ from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.activity import operating
-from service.tracking.alarms import Act, Alarm, Party, forbids
+from service.tracking.alarms import Act, Alarm, Party, Waiting, forbids
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
 from service.tracking.sending import why_no_return, why_unread
-from service.tracking.state import AcquisitionStage, Mode, TrackerState, Waiting
+from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0

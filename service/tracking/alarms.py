@@ -39,6 +39,8 @@ MIRROR_SILENT = "mirror-silent"
 OFF_LOOP = "commands-off-loop"
 WRONG_MATRIX = "matrix-mismatch"
 WRONG_ANSWER = "response-mismatch"
+MODES_UNEVEN = "modes-uneven"
+MODES_CONTRARY = "modes-contrary"
 WRONG_LOOP = "loop-law"
 WRONG_UNIT = "command-unit"
 ARCHIVE_FAILED = "archive-failed"
@@ -107,6 +109,23 @@ class Party(StrEnum):
 
     SERVICE = "service"
     """Another one, of the same system."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waiting:
+    """Something the service waits for."""
+
+    name: str
+    """Machine-readable."""
+
+    party: Party
+    """Who can end it."""
+
+    text: str
+    """What is missing, and what to do."""
+
+    hinders: bool = False
+    """Whether the service can do nothing of its work meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,10 +13,11 @@ import numpy as np
 from service.control.dither import forgetting_mean, measured_ratio
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
-from service.tracking import alarms, dither_plan
+from service.tracking import alarms, dither_plan, mode_proof
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import GONE_WITHIN_S
+from service.tracking.dither_modes import N_LINES
 from service.tracking.dither_plan import Wish
 from service.tracking.dither_request import (
     NOISY_DITHER,
@@ -27,6 +28,7 @@ from service.tracking.dither_request import (
     on_vibrations,
     own_sine,
     plan_dither,
+    proves,
     total_m,
     why_unusable,
 )
@@ -76,6 +78,7 @@ def choose_dither(turn: Turn, rtc: Status) -> None:
     if forbidden is not None:
         _show(turn, DitherPhase.OFF, forbidden)
         return
+    mode_proof.give_up(turn, rtc)
     wish, plan = dither_plan.wanted(turn, rtc)
     turn.dithering = replace(
         turn.dithering,
@@ -219,6 +222,8 @@ def learn(turn: Turn, estimate: WindowEstimate | RandomEstimate) -> None:
     accepted = turn.state.windows_accepted > turn.before.windows_accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return
+    if len(estimate.modes) > N_LINES:
+        return  # not the modes that tell most of α
     if estimate.dither_m > 0.0:
         ratio = measured_ratio(
             estimate.covariance, estimate.dither_m, estimate.window_s, rtc.magnitude
@@ -327,9 +332,11 @@ def _ask(turn: Turn, rtc: Status, wish: Wish) -> None:
     if shaken and dither.frequency_hz != turn.dithering.lines_hz:
         text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"
         turn.warn("dither.on-vibrations", text)
+    if wish.phase is DitherPhase.PROVE:
+        mode_proof.begin(turn, wish.choice.modes)
     turn.dithering = replace(
         turn.dithering,
-        lines_hz=dither.frequency_hz,
+        lines_hz=wish.choice.last_hz if wish.choice.modes else dither.frequency_hz,
         results_due=turn.state.windows_accepted + wish.choice.n_windows,
         ended_ns_utc=None,
         next_ns_utc=None,
@@ -348,6 +355,8 @@ def _end_when_done(turn: Turn, rtc: Status, dither: Dither, wish: Wish) -> None:
     done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
     weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither.request) < wish.choice.total_m
     moved = dither_plan.why_moved(dither, rtc, turn.policy)
+    if wish.phase is DitherPhase.PROVE and not proves(dither.request):
+        moved = wish.reason
     if done or weak or moved:
         # the next one must not overtake the command to stop
         turn.put_off(dither_s=1.0)

@@ -45,14 +45,15 @@ def controlled(modes: tuple[int, ...], rtc: Status) -> tuple[int, ...]:
     return tuple(mode for mode in modes if mode < rtc.n_controlled and rtc.gains[mode])
 
 
-def expected_amplification(rtc: Status, policy: Policy) -> float:
+def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) -> float:
     """Return how much more than was asked for a dither puts on the mirror; 1: on free modes.
 
     The loop sees a dither of its own modes and answers it: at 0.2 to 0.35 of the frame rate with
-    a delay of two frames it adds to it. The most that it makes of any line, on any sky.
+    a delay of two frames it adds to it. The most that it makes of any line, on any sky. Without
+    ``chosen`` modes it is of those that are dithered to follow α.
     """
-    fixed = _without_choice(rtc, policy)
-    modes = () if fixed is None else controlled(fixed, rtc)
+    dithered = chosen or _without_choice(rtc, policy) or ()
+    modes = controlled(dithered, rtc)
     if not modes:
         return 1.0
     gains = np.outer([rtc.gains[mode] for mode in modes], _OPTICAL_GAINS).ravel()

@@ -14,6 +14,7 @@ from service.control.dither import (
     schedule,
     tabulated,
 )
+from service.tracking import mode_proof
 from service.tracking.alarms import Act
 from service.tracking.dither_modes import controlled, expected_amplification, why_elsewhere
 from service.tracking.dither_request import (
@@ -27,6 +28,7 @@ from service.tracking.dither_request import (
     DitherPlan,
     n_lines,
     own_sine,
+    proves,
     total_m,
 )
 from service.tracking.loop import why_open
@@ -103,10 +105,30 @@ def wanted(turn: Turn, rtc: Status) -> tuple[Wish, DitherPlan]:
     demand = sparse if phase is DitherPhase.SPARSE else demand
     found = schedule(kappa, demand)
     plan = _plan(state, found, demand, window_s, phase)
+    shown: tuple[int, ...] = ()
+    if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}:
+        shown = mode_proof.modes_to_show(turn, rtc, window_s)
+    if shown:
+        return _to_show(turn, rtc, shown, window_s), plan
     fixed = policy.dither_amplitude_m is not None
     total_m = demand.budget_m if fixed else plan.total_m
     choice = _choice(turn, total_m, window_s, max(demand.window_s, _lasting_s(phase)))
     return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
+
+
+def _to_show(turn: Turn, rtc: Status, modes: tuple[int, ...], window_s: float) -> Wish:
+    """Return the dither that shows how modes answer, before a matrix controls them."""
+    lines = mode_proof.lines_clear(turn, rtc, window_s)
+    spread = np.linspace(0, len(lines) - 1, len(modes)).round().astype(int)
+    policy = turn.policy
+    quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy, modes)
+    choice = replace(
+        _choice(turn, min(budget_m(rtc, policy), quiet_m), window_s, window_s),
+        modes=modes,
+        lines_hz=tuple(lines[k] for k in spread),
+    )
+    reason = f"modes up to {max(modes)} are shown before they are controlled"
+    return Wish(phase=DitherPhase.PROVE, reason=reason, choice=choice, next_ns_utc=turn.now_ns)
 
 
 def by_hand(turn: Turn, rtc: Status) -> Choice:
@@ -171,6 +193,8 @@ def why_moved(dither: Dither, rtc: Status, policy: Policy) -> str:
 
     It was asked for when fewer modes were controlled.
     """
+    if proves(dither.request):
+        return ""
     elsewhere = why_elsewhere(dither.request, rtc, policy)
     if elsewhere or not controlled(dither.request.modes, rtc):
         return elsewhere
@@ -296,6 +320,8 @@ def why_none(turn: Turn, rtc: Status) -> str | None:
 def awaits_a_result(turn: Turn, wish: Wish) -> bool:
     """Return whether the window of the dither that ended last may still be on its way."""
     dithering = turn.dithering
+    if wish.phase is DitherPhase.PROVE:
+        return mode_proof.awaits_result(turn, wish.choice.window_s)
     if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
         return False
     late = turn.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS

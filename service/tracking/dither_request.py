@@ -33,11 +33,12 @@ SPARE_S = 0.3
 """Of dither behind the last window, for one that begins late because frames were lost."""
 
 OWN_DITHER = "dither-"
+PROVING_DITHER = "dither-prove-"
 ASKED_DITHER = "operator-"
 NOISY_DITHER = "noisy-"
 ACQUIRING_DITHER = "acquire-"
-"""How the id of a dither begins that the service has chosen, an operator, one that measures a
-noisy interaction matrix, and one that finds α from nothing."""
+"""How the id of a dither begins that the service has chosen (the second: to see how modes answer),
+an operator, one that measures a noisy interaction matrix, and one that finds α from nothing."""
 
 OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
 
@@ -88,6 +89,12 @@ class Choice:
     last_hz: tuple[float, ...] = ()
     """Lines it need not leave without reason."""
 
+    modes: tuple[int, ...] = ()
+    """Modes that are to be seen to answer; empty: those that tell most of α."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Their lines."""
+
 
 def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
     """Return why the lines of a dither cannot be told apart in its windows, or None."""
@@ -118,15 +125,17 @@ def plan_dither(
     will not control, where there are such: nothing there amplifies the dither or the noise.
     """
     asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
-    chosen = (modes or chosen_modes(rtc, policy))[: rtc.max_dither_modes]
-    lines = frequency_hz or policy.dither_frequencies_hz
+    proving = choice.modes and not asked
+    chosen = (modes or choice.modes or chosen_modes(rtc, policy))[: rtc.max_dither_modes]
+    lines = choice.lines_hz if proving else frequency_hz or policy.dither_frequencies_hz
     if lines is None:
         lines = clear_lines(rtc, len(chosen), choice)
     amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
     lasting_s = SETTLING_S + choice.n_windows * choice.window_s + SPARE_S
-    step_hz = _step_hz(rtc, choice.window_s)
+    step_hz = step_of(rtc, choice.window_s)
+    begins = ASKED_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
     request = DitherRequest(
-        id=f"{ASKED_DITHER if asked else OWN_DITHER}{now_ns}",
+        id=f"{begins}{now_ns}",
         kind=DitherKind.SINE,
         modes=chosen,
         amplitude_m=(float(min(amplitude, rtc.max_dither_m)),) * len(chosen),
@@ -139,6 +148,11 @@ def plan_dither(
 def own_sine(request: DitherRequest) -> bool:
     """Return whether a dither is one that the service has chosen by itself."""
     return request.id.startswith(OWN_DITHER) and request.kind is DitherKind.SINE
+
+
+def proves(request: DitherRequest) -> bool:
+    """Return whether a dither is there to see how its modes answer."""
+    return request.id.startswith(PROVING_DITHER)
 
 
 def total_m(request: DitherRequest) -> float:
@@ -197,7 +211,7 @@ def clear_lines(rtc: Status, n_lines: int, choice: Choice) -> tuple[float, ...]:
     near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
     if len(last) == n_lines and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
         return last
-    rate, step = rtc.frame_rate_hz, _step_hz(rtc, choice.window_s)
+    rate, step = rtc.frame_rate_hz, step_of(rtc, choice.window_s)
     fractions = LINE_FRACTIONS[:n_lines]
     if n_lines > N_LINES:
         fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
@@ -224,7 +238,7 @@ def n_lines(rtc: Status, policy: Policy) -> int:
     return min(len(policy.dither_modes or range(N_LINES)), rtc.max_dither_modes)
 
 
-def _step_hz(rtc: Status, window_s: float) -> float:
+def step_of(rtc: Status, window_s: float) -> float:
     """Return the frequency of one period in a window."""
     return rtc.frame_rate_hz / max(round(window_s * rtc.frame_rate_hz), 1)
 
@@ -356,6 +370,9 @@ class DitherPhase(StrEnum):
 
     ACQUIRE = "acquire"
     """α is not known, or something asks to see it again: the whole budget, without pause."""
+
+    PROVE = "prove"
+    """Modes that are to be controlled are shown to the sensor first, the whole budget on them."""
 
     FOLLOW = "follow"
     """Without pause, for the flexure leaves no time for one; as weak as that allows."""

@@ -249,6 +249,24 @@ class MatrixFetched:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModesRecognised:
+    """Held against the model, the matrix in use has told which modes it controls."""
+
+    id: str
+    strange: tuple[int, ...]
+    """Modes that it controls and that could not be recognised: they prove nothing."""
+
+    text: str
+    """What an operator should know of it."""
+
+    response: float | None = None
+    """Median response of its modes over the drawing's; None: none was recognised."""
+
+    uneven: str = ""
+    """Which modes answer by far stronger or weaker than their neighbours; empty: none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MarginJudged:
     """The gate's verdict on the matrix in use, at the current α."""
 
@@ -351,6 +369,7 @@ Event = (
     | Unwatched
     | MatrixMade
     | MatrixFetched
+    | ModesRecognised
     | MarginJudged
     | ProposalJudged
     | Acknowledgement

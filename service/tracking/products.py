@@ -193,24 +193,6 @@ class Assessment:
     """When it came, by the service's clock."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModeLimit:
-    """More modes than these gate, RTC or operator would not have; they are tried again later."""
-
-    n_modes: int
-    """As many as may be controlled for now."""
-
-    since_ns_utc: int
-    until_ns_utc: int
-    """More are not tried before."""
-
-    wait_s: float
-    """From one to the other; doubled each time the limit is found again."""
-
-    reason: str
-    """What was said of more: the words of the gate, the RTC or the operator."""
-
-
 class ProbationState(StrEnum):
     """How far the probation of a matrix is that has been applied."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from service.tracking import alarms, worth
 from service.tracking.alarms import Act, Alarm, forbidding, forbids
+from service.tracking.mode_proof import why_unproven
 from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
 
@@ -34,7 +35,10 @@ def why_unsendable(
     act = Act.SEND_KNOWN if known else Act.SEND_NEW
     before = state.alarms if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
     alarm = next((alarm for alarm in before if forbids(alarm, act)), None)
-    return why_unread(state, state.rtc.cm_id) if alarm is None else alarm.text
+    if alarm is not None:
+        return alarm.text
+    unread = why_unread(state, state.rtc.cm_id)
+    return unread if unread or known else why_unproven(state, record)
 
 
 def why_no_return(state: TrackerState) -> str | None:

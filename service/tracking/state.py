@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.tracking.alarms import Alarm, Note, Party
+from service.tracking.alarms import Alarm, Note
 from service.tracking.dither_request import Dither, Dithering
 from service.tracking.loop import LoopCommand
+from service.tracking.mode_limits import ModeLimit, ModeProof
 from service.tracking.products import (
     Assessment,
     MatrixState,
     MeasurementRecord,
-    ModeLimit,
     Probation,
     ReconstructorRecord,
 )
@@ -34,23 +34,6 @@ class Level(StrEnum):
     INFO = "info"
     WARNING = "warning"
     ALARM = "alarm"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Waiting:
-    """Something the service waits for."""
-
-    name: str
-    """Machine-readable."""
-
-    party: Party
-    """Who can end it."""
-
-    text: str
-    """What is missing, and what to do."""
-
-    hinders: bool = False
-    """Whether the service can do nothing of its work meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -297,6 +280,9 @@ class TrackerState:
 
     probation: Probation | None = None
     """Of the matrix applied last; None: none has been, in this run of the service."""
+
+    mode_proof: ModeProof = field(default_factory=ModeProof)
+    """Which modes have shown how they answer."""
 
     mode_limit: ModeLimit | None = None
     """How many modes the gate lets be controlled; None: as many as are wanted."""

@@ -6,6 +6,7 @@ from service.tracking.activity import ramping
 from service.tracking.alarms import Act
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
+from service.tracking.mode_proof import awaits_proof, most_modes
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make
@@ -104,11 +105,14 @@ def _choose_update(turn: Turn, rtc: Status) -> None:
     if _busy(state) or now_ns < first_ns or in_use is None:
         return
     why, n_now = why_worthwhile(state, in_use, turn.policy, now_ns), rtc.n_controlled
+    n_safe = most_modes(state, rtc.n_modes)
+    if n_safe < n_now:
+        return
     if why is not None:
         make(turn, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now)))
         return
-    more = more_to_try(state, rtc, turn.policy, now_ns)
-    if more:
+    more = tuple(n for n in more_to_try(state, rtc, turn.policy, now_ns) if n <= n_safe)
+    if more and not awaits_proof(turn, rtc):
         why = f"{n_now} of {more[0]} modes controlled"
         make(turn, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
 

@@ -12,14 +12,9 @@ from service.model.misregistration import Misregistration, step_text
 from service.tracking.commands import Reject
 from service.tracking.events import Event
 from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
+from service.tracking.mode_limits import ModeLimit
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import (
-    Assessment,
-    Judged,
-    MatrixState,
-    ModeLimit,
-    ReconstructorRecord,
-)
+from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 from service.tracking.turn import Turn

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from service.control.dither import information
 from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
+from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.fit.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.fit.light import far_starts
+from service.fit.own_matrix import OwnMatrix, recognise_modes
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
@@ -50,6 +52,10 @@ CONTRACTION = 0.5
 FAR_SAMPLING = 1
 """The same of the model that leads from afar: biased by some per cent of a subaperture."""
 
+AS_DRAWN = 0.15
+"""A mode's response that differs by less, of the drawing's, is the drawing's: noise and the model's
+own error come to as much."""
+
 COARSE_SAMPLING = 2
 """Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,
 four times as fast."""
@@ -75,6 +81,7 @@ class OpticsWorker:
         self._basis = self._prepared.basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
         self._compute = compute
+        self._mode_response: NDArray[np.float64] | None = None
         self._equip(instrument)
 
     def _equip(self, instrument: Instrument) -> None:
@@ -89,6 +96,7 @@ class OpticsWorker:
                 detector_nodes=nodes,
                 halo=halo,
                 mapper=self._threads.map,
+                mode_response=self._mode_response,
             )
 
         sampling, nodes, working_point_modes = compute.sampling
@@ -192,11 +200,46 @@ class OpticsWorker:
         self.adopt(dialect.found)
         return replace(dialect, adopted=True)
 
-    def adopt(self, slopes: SlopeRecipe) -> None:
-        """List slopes in this order and orientation from now on."""
-        now = self._model.instrument.slopes
-        if replace(now, orientation=now.assumed_orientation) != slopes:
-            self._equip(replace(self._model.instrument, slopes=slopes))
+    def adopt(
+        self, slopes: SlopeRecipe | None, mode_response: NDArray[np.float64] | None = None
+    ) -> None:
+        """List slopes in this order from now on, and expect this response ``(n_modes,)`` of modes.
+
+        None leaves what it stands for as it is.
+        """
+        instrument, now = self._model.instrument, self._model.instrument.slopes
+        if slopes is not None and replace(now, orientation=now.assumed_orientation) != slopes:
+            instrument = replace(instrument, slopes=slopes)
+        elif mode_response is None:
+            return
+        if mode_response is not None:
+            self._mode_response = mode_response
+        self._equip(instrument)
+
+    def recognise(
+        self, own: NDArray[np.float32], near: Misregistration | None, rotation_rad: float | None
+    ) -> tuple[OwnMatrix | None, NDArray[np.float64] | None]:
+        """Return which modes the RTC's own matrix controls, and the response the model expects.
+
+        None: it controls none; the modes answer as drawn.
+
+        ``rotation_rad`` is where a coarser look has found the mirror, None: nobody looked. Where a
+        mode answers otherwise than was drawn, though with its own sign and in its own place, the
+        model takes its response over: matrices made from now on allow for it.
+        """
+        start = near or self._start
+        if near is None and rotation_rad is not None:
+            start = replace(start, rotation_rad=rotation_rad)
+        found = recognise_modes(own, self._coarse.linearise, start)
+        if found is None or found.wrong or not found.known.any():
+            return found, self._mode_response
+        response = found.response[found.known]
+        if np.any(np.abs(response - 1.0) > AS_DRAWN):
+            n_modes = self._basis.n_modes
+            gains = CalibrationGains.of_modes(response, found.columns[found.known], n_modes).values
+            now = 1.0 if self._mode_response is None else self._mode_response
+            self.adopt(None, now * gains)
+        return found, self._mode_response
 
     def _settled_fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
@@ -222,7 +265,7 @@ class OpticsWorker:
         """
         modes = spectra.plan.modes
         if modes not in self._far:
-            basis = self._model.basis.subset(np.array(modes))
+            basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
             self._far[modes] = tuple(
                 RtcInteractionModel(
                     self._model.instrument,
@@ -230,6 +273,7 @@ class OpticsWorker:
                     pupil_sampling=sampling,
                     detector_nodes=sampling,
                     mapper=self._threads.map,
+                    mode_response=None if every is None else every[list(modes)],
                 )
                 for sampling in (FAR_SAMPLING, COARSE_SAMPLING)
             )

@@ -17,9 +17,9 @@ from service.runtime.waiting import (
     state_message,
     waiting_for,
 )
-from service.tracking.alarms import Alarm, Party
+from service.tracking.alarms import Alarm, Party, Waiting
 from service.tracking.products import MatrixState
-from service.tracking.state import Mode, TrackerState, Waiting
+from service.tracking.state import Mode, TrackerState
 from tests.unit.tracking.situations import ALPHA, START_NS, Story, record, rtc
 
 SECOND = 1_000_000_000

@@ -149,6 +149,6 @@ def test_too_little_light_says_neither():
     assert answered(1.0, 0.5) is None
 
 
-def test_frozen_slopes_and_an_unknown_response_tell_nothing_of_the_mirror():
+def test_frozen_slopes_and_an_unknown_response_ratio_tell_nothing_of_the_mirror():
     assert answered(0.0, 0.0) is None
     assert answered(0.0, 1e-3, asked=ASKED) is None

@@ -13,6 +13,7 @@ from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.dither_request import Dither
 from service.tracking.loop import commanded_gains
+from service.tracking.mode_limits import ModeProof
 from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
@@ -183,6 +184,10 @@ def turned(state, act, *args, now_ns=START_NS, **kwargs):
     return turn.state
 
 
+ALL_SHOWN = ModeProof(proven=frozenset(range(N_MODES)))
+"""Each mode has been seen to answer: what is told is of other things."""
+
+
 class Story:
     """Tells events to the tracker one after another and keeps everything it wanted done.
 
@@ -192,7 +197,7 @@ class Story:
     shows = True
 
     def __init__(self, mode=Mode.AUTO, policy=POLICY, state=None):
-        self.state = state or TrackerState(system="flao", mode=mode)
+        self.state = state or TrackerState(system="flao", mode=mode, mode_proof=ALL_SHOWN)
         self.policy = policy
         self.now_ns = START_NS
         self.effects = []

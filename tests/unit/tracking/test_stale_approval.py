@@ -12,7 +12,16 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
-from tests.unit.tracking.situations import ALPHA, POLICY, START_NS, judged, moved, record, rtc
+from tests.unit.tracking.situations import (
+    ALL_SHOWN,
+    ALPHA,
+    POLICY,
+    START_NS,
+    judged,
+    moved,
+    record,
+    rtc,
+)
 
 
 def proposed(alpha):
@@ -32,6 +41,7 @@ def proposed(alpha):
         proven=frozenset({"initial"}),
         reconstructors=(record("cm-1", judged=then),),
         registration=known,
+        mode_proof=ALL_SHOWN,
     )
 
 

@@ -1,0 +1,76 @@
+"""What the RTC's own matrix tells of its modes goes into every matrix that is made from then on."""
+
+import numpy as np
+import pytest
+
+from service.model.misregistration import Misregistration
+from service.worker import OpticsWorker
+from tests.unit.runtime.small import (
+    COMPUTE,
+    N_CONTROLLED,
+    SIGMA,
+    conditions,
+    loop_settings,
+    small_instrument,
+)
+from tests.unit.runtime.test_workbench import ALPHA, dithered_window, open_loop
+
+
+@pytest.fixture
+def bench():
+    return OpticsWorker(small_instrument(), COMPUTE)
+
+
+def made_by(bench):
+    return bench.make(conditions(ALPHA, np.diag(SIGMA**2), loop_settings(), 0.95))
+
+
+def own(bench, scale):
+    """The RTC's matrix by day, elsewhere, for modes that answer so many times as drawn."""
+    response = bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    return np.linalg.pinv(response * scale).astype(np.float32)
+
+
+@pytest.mark.parametrize("scale", [0.5, np.where(np.arange(N_CONTROLLED) == 10, 3.0, 1.0)])
+def test_a_matrix_acts_as_strongly_as_the_rtcs_own(bench, scale):
+    theirs, plain = own(bench, scale), made_by(bench)
+    truth = bench.response(ALPHA)[:, :N_CONTROLLED] * scale
+    found, response = bench.recognise(theirs, None, None)
+    assert found.wrong == ""
+    np.testing.assert_allclose(response[:N_CONTROLLED], scale * np.ones(N_CONTROLLED), rtol=0.02)
+    made = made_by(bench)
+    np.testing.assert_allclose(np.diag(made.matrix @ truth), 1.0, atol=0.02)
+    # judged with the response it has, the loop is the one of before
+    assert made.gate.worst_pole_radius == pytest.approx(plain.gate.worst_pole_radius, abs=5e-3)
+
+
+def test_telemetry_is_then_compared_with_that_response(bench):
+    window = dithered_window(bench, ALPHA, gain=0.5)
+    reconstructor = own(bench, 0.5)
+    bench.recognise(reconstructor, None, None)
+    estimate = bench.fit(window, open_loop(reconstructor), None)
+    np.testing.assert_allclose(np.abs(estimate.optical_gain), 1.0, atol=0.05)
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    assert np.all(np.abs(estimate.alpha.vector - ALPHA.vector) < 4 * sigma + 2e-4)
+
+
+def test_a_matrix_that_answers_as_drawn_changes_nothing(bench):
+    before = bench.response(ALPHA)
+    found, response = bench.recognise(own(bench, 1.05), None, None)
+    assert response is None
+    assert found.known.all()
+    np.testing.assert_array_equal(bench.response(ALPHA), before)
+
+
+def test_nothing_is_taken_over_from_a_matrix_of_other_modes(bench):
+    turned = np.where(np.arange(N_CONTROLLED) == 10, -0.5, 0.5)
+    found, response = bench.recognise(own(bench, turned), None, None)
+    assert "mode 10 has the other sign" in found.wrong
+    assert response is None
+
+
+def test_a_new_worker_is_told_what_the_last_one_found(bench):
+    _, response = bench.recognise(own(bench, 0.5), None, None)
+    another = OpticsWorker(small_instrument(), COMPUTE)
+    another.adopt(None, response)
+    np.testing.assert_allclose(another.response(ALPHA), bench.response(ALPHA), rtol=1e-5)

@@ -1,0 +1,201 @@
+"""No mode is controlled that nobody has seen to answer as the instrument file says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import CommandError
+from service.tracking import alarms
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.mode_limits import ModeProof
+from service.tracking.mode_proof import MOST_AT_ONCE, TRIES, most_modes, proven_modes
+from service.tracking.products import MatrixState
+from service.tracking.state import Mode
+from service.wire import DitherRequest
+from tests.unit.tracking.situations import POLICY, estimate, foreign, of_kind
+from tests.unit.tracking.world import STEP_S, WINDOW_S, World
+
+TARGET = replace(POLICY, n_modes_target=450)
+
+
+class Shown(World):
+    """A world in which every mode answers with 0.6 of the model but those in ``answers``."""
+
+    def __init__(self, answers=None, mode=Mode.AUTO, offered=True, **changes):
+        self.answers_of, self.offered = answers or {}, offered
+        super().__init__(mode, TARGET, **changes)
+
+    def tell(self, event, after_s=0.0):
+        if isinstance(event, ev.SessionStarted):
+            self.state = replace(self.state, mode_proof=ModeProof())
+        return super().tell(event, after_s)
+
+    def of_matrices(self, effect):
+        if isinstance(effect, ev.FetchMatrix) and not self.offered:
+            yield ev.JobFailed(effect=effect, text="no answer from the RTC on rtc/cm/applied")
+            return
+        yield from super().of_matrices(effect)
+
+    def windows(self):
+        playing = self.playing
+        self.since_window_s = 0.0 if playing is None else self.since_window_s + STEP_S
+        if self.since_window_s < WINDOW_S + STEP_S or self.state.dither is None:
+            return
+        self.since_window_s = STEP_S
+        modes = playing.request.modes
+        gains = np.array([self.answers_of.get(mode, 0.6) for mode in modes], dtype=complex)
+        fitted = estimate(
+            t_ns=self.now_ns,
+            session=f"s{self.session}",
+            modes=modes,
+            optical_gain=gains,
+            gain_sigma=np.full(len(modes), 0.02),
+            lag_frames=np.zeros(len(modes)),
+        )
+        self.tell(ev.WindowFitted(estimate=fitted))
+
+    @property
+    def shown(self):
+        """Modes of each dither that was there to see them answer."""
+        asked = self.asked(DitherRequest)
+        return [request.modes for request in asked if request.id.startswith("dither-prove-")]
+
+    @property
+    def made(self):
+        return [effect.n_modes for effect in self.asked(ev.MakeMatrix)]
+
+
+def test_modes_of_the_rtcs_own_matrix_are_known_and_all_others_are_shown_first():
+    world = Shown().pass_(60.0)
+    assert {mode for modes in world.shown for mode in modes} >= set(range(400, 450))
+    assert not {mode for modes in world.shown for mode in modes} & set(range(400))
+    first_of_more = next(
+        k
+        for k, effect in enumerate(world.effects)
+        if isinstance(effect, ev.MakeMatrix) and effect.n_modes > 400
+    )
+    before = of_kind(world.effects[:first_of_more], DitherRequest)
+    assert set(range(400, 450)) <= {mode for request in before for mode in request.modes}
+    assert world.state.rtc.n_controlled == 450
+    assert world.alarms == set()
+
+
+def test_many_are_shown_at_once_each_on_a_line_of_its_own_and_within_the_budget():
+    world = Shown().pass_(30.0)
+    first = of_kind(world.effects, DitherRequest)
+    proving = next(request for request in first if request.id.startswith("dither-prove-"))
+    assert len(proving.modes) == MOST_AT_ONCE
+    lines = np.sort(proving.frequency_hz)
+    assert np.diff(lines).min() * WINDOW_S >= 4
+    assert 0.2 * 1000 <= lines[0] < lines[-1] <= 0.35 * 1000
+    assert np.sqrt(np.sum(np.square(proving.amplitude_m))) <= POLICY.dither_budget_m * 1.001
+
+
+@pytest.mark.parametrize("answer", [-0.6, 0.0, 1.9, 0.06])
+def test_a_mode_that_answers_otherwise_is_named_and_no_matrix_controls_it(answer):
+    """Another sign, another mode's place, three times or a tenth of its size."""
+    world = Shown({430: answer}).pass_(60.0)
+    alarm = world.state.alarm(alarms.MODES_CONTRARY)
+    assert alarm.text.startswith("mode 430 has not answered the dither")
+    assert max(world.made) <= 430
+    assert world.state.rtc.n_controlled <= 430
+
+
+def test_it_is_shown_again_after_a_wait_and_the_alarm_goes_once_it_answers():
+    world = Shown({430: -0.6}).pass_(40.0)
+    n_shown = len(world.shown)
+    world.answers_of = {}
+    world.pass_(120.0)
+    assert len(world.shown) > n_shown
+    assert world.alarms == set()
+    assert world.state.rtc.n_controlled == 450
+
+
+def test_where_the_rtc_does_not_offer_its_matrix_every_mode_is_shown():
+    world = Shown({10: -0.6}, offered=False).pass_(30.0)
+    assert {mode for modes in world.shown for mode in modes} >= set(range(24))
+    told = world.state.alarm(alarms.MODES_CONTRARY).text
+    assert "mode 10 has" in told
+    assert "(-0.60 times the model)" in told
+    assert world.made == []
+
+
+def test_modes_of_the_rtcs_matrix_that_were_not_recognised_are_shown_too():
+    world = Shown()
+    strange = ev.ModesRecognised(id="initial", strange=(7, 8), text="two are not recognised")
+    world.tell(strange)
+    assert most_modes(world.state, 450) == 7
+    world.pass_(30.0)
+    assert {7, 8} <= {mode for modes in world.shown for mode in modes}
+    assert 400 in world.made
+
+
+def test_an_operator_cannot_send_what_is_not_proven_and_is_told_what_to_do():
+    world = Shown(mode=Mode.PROPOSE).pass_(12.0)
+    world.tell(cmd.StopDither())
+    world.make("cm-large", n_modes=560)
+    with pytest.raises(CommandError, match="to 559 have not been seen to answer yet"):
+        world.tell(cmd.Approve(id="cm-large"))
+    assert world.matrix_state("cm-large") is MatrixState.PROPOSED
+
+
+def test_what_has_been_in_use_can_be_sent_again_whatever_is_proven():
+    world = Shown().pass_(60.0)
+    world.state = replace(world.state, mode_proof=ModeProof())
+    world.tell(cmd.Rollback())
+    assert of_kind(world.effects[-3:], ev.CopyMatrix)
+
+
+def test_dithers_that_show_nothing_are_given_up_for_a_while():
+    world = Shown().pass_(12.0)
+    quiet = replace(world.state, mode_proof=ModeProof(proven=frozenset(range(400))))
+    world.state = quiet
+    world.answers_of = dict.fromkeys(range(400, 450), 0.01 + 0.0j)
+    world.windows = lambda: None
+    world.pass_(120.0)
+    assert 1 <= len(world.shown) <= 2 * TRIES + 2
+    assert "have not been seen to answer in 3 dithers" in world.state.mode_limit.reason
+
+
+def test_an_answer_too_noisy_to_tell_proves_nothing_and_accuses_nobody():
+    world = Shown().pass_(8.0)
+    session = f"s{world.session}"
+    world.tell(
+        ev.WindowFitted(
+            estimate=estimate(
+                t_ns=world.now_ns,
+                session=session,
+                modes=(500, 501, 502, 503),
+                optical_gain=np.array([0.6, 0.6, 0.6, -0.3], dtype=complex),
+                gain_sigma=np.array([0.02, 0.02, 0.3, 0.3]),
+            )
+        )
+    )
+    assert {500, 501} <= proven_modes(world.state)
+    assert not {502, 503} & (world.state.mode_proof.proven | world.state.mode_proof.contrary)
+
+
+def test_a_matrix_in_use_proves_its_modes():
+    world = Shown().pass_(6.0)
+    assert proven_modes(world.state) >= set(range(400))
+    assert foreign().parent is None
+
+
+def test_one_window_that_says_otherwise_accuses_nobody():
+    """A loop that slips for a moment answers anyhow: the next window decides."""
+    world = Shown().pass_(8.0)
+    for gain in (-0.6, 0.6):
+        gains = np.array([0.6, 0.6, 0.6, gain], dtype=complex)
+        seen = estimate(
+            t_ns=world.now_ns,
+            session=f"s{world.session}",
+            modes=(500, 501, 502, 410),
+            optical_gain=gains,
+            gain_sigma=np.full(4, 0.02),
+        )
+        world.tell(ev.WindowFitted(estimate=seen))
+        assert not world.state.mode_proof.contrary
+        assert (410 in proven_modes(world.state)) is (gain > 0.0)
+    assert world.alarms == set()

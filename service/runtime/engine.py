@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.slopes import likely_kind
+from service.runtime.looks import taken
 from service.runtime.streams import (
     VERDICTS,
     Streams,
     Window,
     fed,
-    taken,
     with_dither,
     with_matrix,
     with_rtc,
@@ -343,6 +343,7 @@ def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
     )
     n_verdicts = len(streams.unlawful)
     return [
+        (alarms.SLOPES_STAND, streams.standstill.text, "the slopes change again"),
         (
             alarms.WRONG_UNIT,
             absurd if health.absurd else None,

@@ -26,6 +26,7 @@ from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, asked_anew, measured
 from service.telemetry.probation import Comparison
 from service.telemetry.random_dither import Correlated, RandomDither
+from service.telemetry.standstill import Standstill
 from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import (
@@ -34,23 +35,11 @@ from service.tracking.loop import (
     same_but_for_modes,
     same_loop,
     same_rate,
-    why_open,
 )
 from service.wire import DitherKind, Status
 from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
-
-WATCH_INTERVAL_S = 4.0
-"""Between two looks of the passive watchdog, and of telemetry in each: a jump is to be seen within
-5 s."""
-
-LEAST_LOOK_S = 3.0
-"""Of telemetry, beside a dither."""
-
-RESTS, LONG_RESTS = 1, 3
-"""Intervals left out after a look beside a dither, and while its windows are accepted: they show a
-jump sooner than a look does."""
 
 WINDOW_SAMPLES = 5
 """Frames of a window that must have been looked at before it can be said to be off the loop."""
@@ -128,6 +117,7 @@ class Streams:
     unlawful: tuple[str, ...] = ()
     """What the last verdicts on the loop's law found to be otherwise than told, without a break."""
 
+    standstill: Standstill = field(default_factory=Standstill)
     comparison: Comparison = field(default_factory=Comparison)
     """Of telemetry with the matrix in use and with the one before."""
 
@@ -176,12 +166,7 @@ def with_rtc(streams: Streams, rtc: Status | None) -> Streams:
     streams = _watching_the_edge(streams, rtc)
     # frames that are on their way may have been made by the loop as it was
     streams = replace(streams, check=LoopCheck(from_seq=last_seq(rtc) + 1), off=None, obeyed_seq=0)
-    memory = Passive(
-        n_modes=rtc.n_controlled,
-        memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
-        delay_frames=rtc.delay_frames,
-        since_ns_utc=streams.heard_ns_utc,
-    )
+    memory = _no_sums(rtc, streams.heard_ns_utc)
     if before is None or not same_rate(before.frame_rate_hz, rtc.frame_rate_hz):
         streams = replace(streams, cutter=None, dither=None)
         monitor = VibrationMonitor.begin(rtc.n_slopes, streams.description.kind)
@@ -311,15 +296,43 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
     rtc = streams.rtc
     if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return streams, []
+    standstill = streams.standstill.follow(block) if len(streams.in_loop) else Standstill()
+    streams = replace(streams, standstill=standstill)
+    if standstill.stands:
+        return _standing(streams, rtc, block), []
+    return _measured(streams, rtc, block)
+
+
+def _measured(streams: Streams, rtc: Status, block: FrameBlock) -> tuple[Streams, list[Window]]:
+    """Return the same of slopes that are a measurement."""
     terms, check, law = _terms(streams, block.cm_id), streams.check, streams.law
     if terms is not None:
         check, law = loopcheck.observe(check, block, terms), looplaw.follow(law, block, terms)
-    vibrations, sums, edge = streams.vibrations, streams.passive, streams.edge
+    vibrations, sums = streams.vibrations, streams.passive
     lines = () if streams.dither is None else streams.dither.frequency_hz
     if vibrations is not None and sums is not None and len(streams.in_loop):
         vibrations = vibrations.update(block, lines)
         sums = passive.accumulate(sums, _moving(streams, block))
-    health = streams.health
+    streams = replace(
+        streams,
+        heard_ns_utc=block.next_t_ns - block.dt_ns,
+        check=check,
+        law=law,
+        vibrations=vibrations,
+        passive=sums,
+    )
+    streams = _holding(streams, block, terms, lines)
+    streams, ended = _dithered(_listening(streams, rtc, block), rtc, block)
+    if ended:
+        streams = replace(streams, loop=rtc)  # the next one begins with the gains of now
+    return _obeying(streams, ended)
+
+
+def _holding(
+    streams: Streams, block: FrameBlock, terms: ClosedLoop | None, lines: tuple[float, ...]
+) -> Streams:
+    """Return streams that know whether the loop holds, and as well as with the matrix before."""
+    health, edge = streams.health, streams.edge
     if block.cm_id != streams.comparison.cm_id:
         # what another matrix has made of the loop says nothing of this one
         health = replace(health, ratio=0.0)
@@ -332,21 +345,36 @@ def fed(streams: Streams, block: FrameBlock) -> tuple[Streams, list[Window]]:
         comparison = probation.observe(
             comparison, block, streams.in_loop, lines, streams.edge_watch, matrix
         )
-    streams = replace(
+    return replace(streams, health=health, edge=edge, comparison=comparison)
+
+
+def _standing(streams: Streams, rtc: Status, block: FrameBlock) -> Streams:
+    """Return streams that measure nothing on slopes that stand, nor on what came just before."""
+    streams = replace(streams, heard_ns_utc=block.next_t_ns - block.dt_ns)
+    streams = _listening(streams, rtc, block)
+    settled_seq = block.next_seq + round(SETTLING_S * rtc.frame_rate_hz)
+    cutter = None if streams.cutter is None else streams.cutter.begun_anew(settled_seq)
+    return replace(
         streams,
-        heard_ns_utc=block.next_t_ns - block.dt_ns,
-        check=check,
-        law=law,
-        vibrations=vibrations,
-        passive=sums,
-        health=health,
-        edge=edge,
-        comparison=comparison,
+        cutter=cutter,
+        played=None,
+        check=LoopCheck(from_seq=settled_seq),
+        off=None,
+        law=LoopLaw(from_seq=settled_seq),
+        unlawful=(),
+        passive=_no_sums(rtc, streams.heard_ns_utc, settled_seq),
     )
-    streams, ended = _dithered(_listening(streams, rtc, block), rtc, block)
-    if ended:
-        streams = replace(streams, loop=rtc)  # the next one begins with the gains of now
-    return _obeying(streams, ended)
+
+
+def _no_sums(rtc: Status, since_ns_utc: int, from_seq: int = 0) -> Passive:
+    """Return sums of ordinary telemetry that have begun with nothing."""
+    return Passive(
+        n_modes=rtc.n_controlled,
+        memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
+        delay_frames=rtc.delay_frames,
+        since_ns_utc=since_ns_utc,
+        from_seq=from_seq,
+    )
 
 
 def _moving(streams: Streams, block: FrameBlock) -> FrameBlock:
@@ -369,67 +397,6 @@ def _dithered(streams: Streams, rtc: Status, block: FrameBlock) -> tuple[Streams
     cutter, ended = streams.cutter.accumulate(block)
     over = _beyond_the_dither(streams, rtc, cutter)
     return replace(streams, cutter=None if over else cutter), ended
-
-
-def taken(streams: Streams, *, told: bool = False) -> tuple[Streams, Passive | str | None]:
-    """Return streams that begin new passive sums, and the old ones, or why there is no look yet.
-
-    No two looks then share telemetry: their errors are independent, and one that lies wholly after
-    a jump says so. Beside a dither some telemetry is left out, more where windows have ``told`` of
-    α just now; None: that is why. A rest ends early when they no longer do.
-    """
-    rests = told and streams.cutter is not None and not _oversleeps(streams)
-    streams = streams if rests else _awake(streams)
-    rtc, sums = streams.rtc, streams.passive
-    since_ns = 0 if streams.cutter is None or sums is None else sums.since_ns_utc
-    if streams.heard_ns_utc - since_ns < LEAST_LOOK_S * 1e9 and since_ns:
-        return streams, None
-    if rtc is None or sums is None:
-        return streams, "no passive estimate: there is no telemetry that could be used"
-    if not rtc.in_loop:
-        return streams, f"no passive estimate: {why_open(rtc)}"
-    if sums.why_unusable is not None:
-        return streams, sums.why_unusable
-    least = passive.MIN_FRAMES_PER_MODE * sums.n_modes
-    if sums.n_effective < least:
-        return streams, (
-            f"no passive estimate yet: {sums.n_effective:.0f} frames in runs without gaps, "
-            f"{least} are needed for {sums.n_modes} modes"
-        )
-    waiting_ns = round(sums.n_waiting * 1e9 / rtc.frame_rate_hz)
-    begun = replace(
-        sums,
-        sums=(),
-        n_effective=0.0,
-        since_ns_utc=streams.heard_ns_utc - waiting_ns,
-    )
-    if streams.cutter is not None and sums.tail is not None:
-        rest_s = WATCH_INTERVAL_S * (LONG_RESTS if told else RESTS)
-        begun = replace(
-            begun,
-            waiting=(),
-            begun=False,
-            from_seq=sums.tail.next_seq + round(rest_s * rtc.frame_rate_hz),
-            since_ns_utc=streams.heard_ns_utc + round(rest_s * 1e9),
-        )
-    # a window that is under way is of the gains with which it began
-    loop = rtc if streams.cutter is None else streams.loop
-    return replace(streams, passive=begun, loop=loop), sums
-
-
-def _oversleeps(streams: Streams) -> bool:
-    """Return whether the rest after a look would be longer than any: the RTC's clock went back."""
-    sums = streams.passive
-    left_ns = 0 if sums is None else sums.since_ns_utc - streams.heard_ns_utc
-    return left_ns > 2 * LONG_RESTS * WATCH_INTERVAL_S * 1e9
-
-
-def _awake(streams: Streams) -> Streams:
-    """Return streams whose passive sums, where they rest, begin with what comes."""
-    sums, heard_ns = streams.passive, streams.heard_ns_utc
-    if sums is None or sums.since_ns_utc <= heard_ns:
-        return streams
-    return replace(streams, passive=replace(sums, from_seq=0, since_ns_utc=heard_ns))
 
 
 def _beyond_the_dither(streams: Streams, rtc: Status, reading: LockIn | RandomDither) -> bool:

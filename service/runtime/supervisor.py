@@ -27,9 +27,10 @@ from service.runtime.clock import ServiceClock
 from service.runtime.engine import Engine, looked_at
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.keeping import TelemetryKeeper
+from service.runtime.looks import WATCH_INTERVAL_S
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.refits import Refits
-from service.runtime.streams import WATCH_INTERVAL_S, Streams, Window
+from service.runtime.streams import Streams, Window
 from service.runtime.trends import TrendSampler
 from service.runtime.waiting import (
     Facts,
@@ -396,9 +397,8 @@ class Supervisor:
                     continue
                 if isinstance(window, Spectra):
                     self._meter.fitted(window.window_s)
-                event = await fitted(
-                    window, self._engine.state, self._workers, self._actions.matrix
-                )
+                state, matrix = self._engine.state, self._actions.matrix
+                event = await fitted(window, state, self._workers, matrix)
             self._post(event)
 
     async def _watch(self) -> None:

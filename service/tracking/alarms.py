@@ -57,6 +57,7 @@ STATUS_FLOOD = "status-flood"
 WORKER_LOST = "worker-lost"
 WORKER_BEHIND = "worker-behind"
 LOOP_OPENED = "loop-opened"
+SLOPES_STAND = "slopes-stand"
 
 
 class Act(StrEnum):

@@ -22,8 +22,8 @@ from service.errors import PyrcalError
 from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
+from service.runtime.looks import WATCH_INTERVAL_S
 from service.runtime.ports import StorePort
-from service.runtime.streams import WATCH_INTERVAL_S
 from service.runtime.workers import PATIENCE_S
 from service.telemetry.lockin import Spectra
 from service.telemetry.random_dither import Correlated

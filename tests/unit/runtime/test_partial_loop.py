@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.runtime.engine import shape_mismatch
-from service.runtime.streams import Streams, fed, taken, with_rtc
+from service.runtime.looks import taken
+from service.runtime.streams import Streams, fed, with_rtc
 from service.telemetry.health import LOW_MODES
 from service.tracking import commands as cmd
 from service.tracking.registration import Source

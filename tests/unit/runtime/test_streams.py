@@ -5,14 +5,8 @@ import pytest
 
 from service.errors import ModelError
 from service.runtime.engine import STEADY_GATHER_S, Engine, news, shape_mismatch, troubles
-from service.runtime.streams import (
-    Streams,
-    fed,
-    taken,
-    with_dither,
-    with_matrix,
-    with_rtc,
-)
+from service.runtime.looks import taken
+from service.runtime.streams import Streams, fed, with_dither, with_matrix, with_rtc
 from service.telemetry.frames import FrameBlock
 from service.telemetry.health import LOW_MODES, Actuators
 from service.telemetry.lockin import Spectra

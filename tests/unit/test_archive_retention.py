@@ -20,8 +20,9 @@ from service.archive.nights import DAY_NS
 from service.archive.retention import Keeping, due, items
 from service.errors import UnknownIdError
 from service.runtime import recording
+from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
-from service.tracking.state import Alarm, TrackerState
+from service.tracking.state import TrackerState
 from tests.unit.test_archive import product, record_of
 
 NOW = 20_000 * DAY_NS

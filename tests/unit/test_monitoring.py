@@ -11,9 +11,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.commands.serve import log_to_the_terminal
 from service.runtime.recording import ids_of
-from service.tracking.alarms import ALARMS, ARCHIVE_FAILED, WORKER_BEHIND, Waiting
+from service.tracking.alarms import ALARMS, ARCHIVE_FAILED, WORKER_BEHIND, Alarm, Party, Waiting
 from service.tracking.registration import Validity
-from service.tracking.state import Alarm, Party
 from tests.unit.test_api import LINK, SECOND, STATE, assert_problem, service
 from tests.unit.test_house import ROOT
 

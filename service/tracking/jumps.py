@@ -39,9 +39,10 @@ LOOK_LIMIT = 26.9
 that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
 half of that)."""
 
-LOOK_BIAS = np.array([0.0, 0.0, 0.0, 4.0])
+LOOK_BIAS = np.array([0.0, 0.0, 2.0, 4.0])
 """By how many times its own scatter a look may be off, beside what is known of its bias: where 60
-modes look through bad seeing its magnification is 2 to 5 times that too large, every time."""
+modes look through bad seeing its magnification is 2 to 5 times that too large, every time, and on
+a bright star its rotation up to 2.5 times off."""
 
 SCATTERED = 1.5
 """How much more windows scatter than they say, in variance, that is no chance: twenty windows that

@@ -869,6 +869,7 @@ UNITS = ("_s", "_m", "_hz", "_ns", "_ns_utc", "_deg", "_subap", "_frames", "_seq
 DIMENSIONLESS = {
     "bound",
     "condition_number",
+    "difference",  # of two rows, over the size of one
     "effective_gain",
     "first",
     "flux",  # in whatever the RTC counts light in

@@ -11,9 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.fit.instrument_checks import (
+    FoundOptic,
+    as_told,
+    doubt_of_width,
+    found_optics,
+    rivals,
+)
 from service.fit.methods import (
     Landing,
     ScanStep,
+    Settled,
     land,
     project_on_sensitivities,
     scan,
@@ -21,11 +29,17 @@ from service.fit.methods import (
     settle_at,
 )
 from service.fit.models import FitModels
-from service.fit.orientation import LEAST_CORRELATION, find_orientation
+from service.fit.orientation import (
+    DOUBTFUL,
+    LEAST_CORRELATION,
+    find_orientation,
+    overruled,
+)
 from service.fit.reference import Reference, Target, checked, target_of
-from service.fit.solver import Nuisances, Solution, nuisances_of
+from service.fit.remarks import remarks
+from service.fit.solver import nuisances_of
 from service.fit.uncertainty import pupil_regions, uncertainty
-from service.fit.verdict import SUSPICIOUS, Evidence, alternatives, judged, remarks
+from service.fit.verdict import Evidence, judged
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import SlopeOrder
@@ -146,6 +160,9 @@ class Fit(Determination):
     anamorphosis: NDArray[np.float64] | None = None
     """``(2,)`` half the stretch along x over that along y, and along 45 deg over 135 deg."""
 
+    optics: tuple[FoundOptic, ...] = ()
+    """What of the instrument was fitted, too: coupling or width, modulation."""
+
     paper_table: tuple[ScanStep, ...] | None = None
     """The scans, in their order; None for the other methods."""
 
@@ -197,7 +214,10 @@ def fit_matrix(
     )
     used = basis.subset(usable.columns)
     tell("orientation")
-    instrument, told = _masked(instrument), instrument.slopes.order
+    instrument = _masked(instrument)
+    told = replace(
+        instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
+    )
     slopes, rotation_rad, untold = _axes(instrument, usable, used, options, mapper)
     instrument = replace(instrument, slopes=slopes)
     target = target_of(usable, instrument)
@@ -262,18 +282,20 @@ def _axes(
     best = search.best
     sure = best.correlation >= LEAST_CORRELATION
     rotation_rad = best.rotation_rad if sure else None
-    return best.slopes, rotation_rad, search.refusal if stated is None else ""
+    if stated is None:
+        return best.slopes, rotation_rad, search.refusal
+    if best.correlation >= DOUBTFUL:
+        return best.slopes, rotation_rad, ""
+    free = replace(instrument, slopes=replace(slopes, orientation=None))
+    other = find_orientation(free, usable, basis, mapper=mapper).best
+    return best.slopes, rotation_rad, overruled(best, other)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
     """What one of the methods came to."""
 
-    solution: Solution
-    target: Target
-    """Without the slopes of unknown surface."""
-
-    nuisances: Nuisances
+    settled: Settled
     landing: Landing | None = None
     table: tuple[ScanStep, ...] | None = None
 
@@ -284,48 +306,49 @@ def _found(models: FitModels, target: Target, start: Array, options: FitOptions)
         models.instrument.slopes.kind,
         gain_map=options.gain_map,
         anamorphosis=options.anamorphosis,
+        optics=models.optics,
     )
     match options.method:
         case Method.JOINT:
             landing = land(models, target, start)
-            solution, seen = settle(models, target, landing.best.vector, nuisances)
-            return _Found(solution=solution, target=seen, nuisances=nuisances, landing=landing)
+            settled = settle(models, target, landing.best.vector, nuisances)
+            return _Found(settled=settled, landing=landing)
         case Method.SENSITIVITY:
-            solution, seen = project_on_sensitivities(models, target, start, nuisances)
-            return _Found(solution=solution, target=seen, nuisances=nuisances)
+            return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
         case Method.PAPER:
             vector, table = scan(models, target, start)
-            solution, seen = settle_at(models, target, vector, nuisances)
-            return _Found(solution=solution, target=seen, nuisances=nuisances, table=table)
+            return _Found(settled=settle_at(models, target, vector, nuisances), table=table)
 
 
 def _answer(
-    models: FitModels, found: _Found, usable: Reference, untold: str, told: SlopeOrder
+    as_in_file: FitModels, found: _Found, usable: Reference, untold: str, told: SlopeRecipe
 ) -> Fit:
-    solution, target, slopes = found.solution, found.target, models.instrument.slopes
+    settled = found.settled
+    solution, target, models = settled.solution, settled.target, settled.models
+    nuisances, slopes = settled.nuisances, models.instrument.slopes
     seen = solution.projection
-    values = np.concatenate([np.zeros(4), solution.nuisances])
+    values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
-    by_mode = np.sqrt(
-        np.sum(seen.residual**2, axis=0) / np.sum(target.matrix[target.rows] ** 2, axis=0)
-    )
-    residual_fraction = float(np.sqrt(np.mean(by_mode**2)))
+    residual_fraction = settled.share
+    others = rivals(settled)
     sure = uncertainty(
         seen,
         values,
-        found.nuisances.prior,
+        nuisances.prior,
         regions,
         shift_subap=float(np.hypot(*solution.vector[:2])),
         residual_fraction=residual_fraction,
+        doubt=np.array([doubt_of_width(settled), *(rival.moved for rival in others)]),
     )
+    optics = found_optics(as_in_file, settled, sure)
     evidence = Evidence(
         solution=solution,
         residual_fraction=residual_fraction,
         uncertainty=sure,
         landing=found.landing,
-        others=alternatives(models, target, solution, found.nuisances)
-        if residual_fraction > SUSPICIOUS
-        else (),
+        rivals=others,
+        optics=optics,
+        as_told=as_told(as_in_file, settled) if any(one.notable for one in optics) else None,
         axes=untold,
         passes=usable.passes,
         stroke_known=models.instrument.mirror.stroke_known,
@@ -337,7 +360,7 @@ def _answer(
         gains=seen.gains,
         residual_fraction=residual_fraction,
         residual_map=_residual_map(found),
-        residual_by_mode=by_mode,
+        residual_by_mode=settled.by_mode,
         condition_number=_condition_number(solution.matrix),
         modes=target.modes,
         orientation=slopes.assumed_orientation,
@@ -346,14 +369,21 @@ def _answer(
         accepted=accepted,
         converged=solution.converged,
         verdict=verdict,
-        remarks=remarks(evidence, target, told=told, found=slopes.order),
+        remarks=remarks(
+            evidence,
+            target,
+            told=told,
+            found=slopes,
+            wavelength_m=models.instrument.wfs.wavelength_m,
+        ),
         left_out=usable.left_out + _rows_left_out(target),
         n_evaluations=models.counter.n,
         synthetic=solution.matrix,
         measured=target.matrix,
         valid=target.valid,
-        gain_map=found.nuisances.gain_map(solution.nuisances, target.valid),
-        anamorphosis=found.nuisances.stretches(solution.nuisances),
+        gain_map=nuisances.gain_map(solution.nuisances, target.valid),
+        anamorphosis=nuisances.stretches(solution.nuisances),
+        optics=optics,
         paper_table=found.table,
     )
 
@@ -367,7 +397,7 @@ def _rows_left_out(target: Target) -> tuple[str, ...]:
 
 def _residual_map(found: _Found) -> Array:
     """Return the RMS residual of every slope over the RMS of all, modes counted alike."""
-    target, seen = found.target, found.solution.projection
+    target, seen = found.settled.target, found.settled.solution.projection
     scale = np.sqrt(target.weights)
     typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
     by_slope = np.full(len(target.rows), np.nan)

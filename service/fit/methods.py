@@ -29,10 +29,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.models import FitModels
+from service.fit.models import FitModels, Optic
 from service.fit.reference import Target
 from service.fit.solver import (
     LIMIT,
+    LONGEST_OPTIC_STEP,
     SETTLED,
     Approach,
     Columns,
@@ -57,7 +58,10 @@ SAME = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
 NEARLY_AS_GOOD = 1.3
 """A minimum with less than this times the least misfit is a rival."""
 
-MOST_REPEATS = 4
+MOST_REPEATS = 6
+LINEAR = 0.01
+"""A logarithm of the instrument's that differs by less is as good as linear."""
+
 REACH = 20.0
 """Derivatives within so many settling lengths of where they were taken are as good as new."""
 
@@ -79,6 +83,18 @@ MOST_EXTENSIONS = 2
 
 N_LEFT_OUT = 10
 """First modes that have no part in χ², where there are enough others."""
+
+MOST_MODES = 60
+"""Modes, spread over those fitted, that are compared where a few will do."""
+
+MODULATIONS = np.arange(-4, 5) * 0.3
+"""Logarithms of the factors that a modulation is looked for at, from a third to three."""
+
+STRANGE = 0.05
+"""RMS share of the signal left over beyond which the modulation is looked for from afar, ..."""
+
+FAR_OFF = 0.03
+"""... as it is where its logarithm seems off by this."""
 
 _SHIFTS = (-1.3, 1.3)
 _TURNS_RAD = np.deg2rad([-6.0, 6.0])
@@ -136,41 +152,130 @@ def land(models: FitModels, target: Target, start: Array) -> Landing:
     return Landing(best=best, rivals=tuple(rivals))
 
 
-def settle(
-    models: FitModels, target: Target, start: Array, nuisances: Nuisances
-) -> tuple[Solution, Target]:
-    """Return the minimum on the fine grid, and the target without slopes of unknown surface.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Settled:
+    """Where the fine grid came to rest, and with which models."""
 
-    A table of modes ends somewhere, and where depends on the registration: the slopes near its
-    edge are left out, and the fit is done again if that changed anything.
+    solution: Solution
+    target: Target
+    """Without the slopes of unknown surface."""
+
+    models: FitModels
+    """Of the instrument that was found; its basis may have another coupling."""
+
+    nuisances: Nuisances
+    """About these models."""
+
+    @property
+    def by_mode(self) -> Array:
+        """``(n_modes,)`` RMS of what is left over, over the RMS of the measurement."""
+        left = np.sum(self.solution.projection.residual**2, axis=0)
+        power = np.sum(self.target.matrix[self.target.rows] ** 2, axis=0)
+        return np.asarray(np.sqrt(left / power))
+
+    @property
+    def share(self) -> float:
+        """RMS of what is left over, each mode counted alike."""
+        return float(np.sqrt(np.mean(self.by_mode**2)))
+
+
+def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances) -> Settled:
+    """Return the minimum on the fine grid.
+
+    What is found of the instrument is linear only close by, so the fit is done again about it. A
+    table of modes ends somewhere, and where depends on the registration: the slopes near its edge
+    are left out, and the fit is done again if that changed anything.
     """
     seen = _known(models, target, start)
     solution = refine(models, seen, start, nuisances)
-    there = _known(models, target, solution.vector)
-    if np.array_equal(there.rows, seen.rows):
-        return solution, seen
-    return refine(models, there, solution.vector, nuisances), there
+    settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+    models, nuisances = _with_nearest_modulation(settled)
+    for _ in range(MOST_REPEATS):
+        if models is settled.models:
+            models, nuisances = _adjusted(settled)
+        there = _known(models, target, settled.solution.vector)
+        if models is settled.models and np.array_equal(there.rows, settled.target.rows):
+            break
+        solution = refine(models, there, settled.solution.vector, nuisances)
+        settled = Settled(solution=solution, target=there, models=models, nuisances=nuisances)
+    return settled
 
 
-def settle_at(
-    models: FitModels, target: Target, vector: Array, nuisances: Nuisances
-) -> tuple[Solution, Target]:
+def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models of the modulation that explains the matrix best, where it seems far off.
+
+    Steps lead slowly there: gains hide much of what a modulation does. So a few modes are looked at
+    on the cheap grid; each modulation is allowed its own registration, to first order.
+    """
+    models, nuisances, solution = settled.models, settled.nuisances, settled.solution
+    places = [k for k, (o, _) in enumerate(nuisances.optics) if o is Optic.MODULATION]
+    if not places:
+        return models, nuisances
+    step = solution.nuisances[nuisances.first_optic + places[0]]
+    if settled.share < STRANGE and abs(step) < FAR_OFF:
+        return models, nuisances
+    modes = spread(settled.target.n_modes)
+    few = settled.target.column_subset(modes)
+    subset = replace(models, basis=models.basis.subset(modes))
+    here = Misregistration.from_vector(solution.vector)
+    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
+
+    def left(change: float) -> float:
+        models.counter.n += 1
+        changed = subset.adjusted(Optic.MODULATION, change) if change else subset
+        return few.project(changed.cheap.interaction_matrix(here), every).chi_at_best
+
+    found = [left(change) for change in MODULATIONS]
+    best = int(np.argmin(found))
+    change = MODULATIONS[best]
+    if 0 < best < len(found) - 1:
+        change += vertex(*found[best - 1 : best + 2]) * (MODULATIONS[1] - MODULATIONS[0])
+    if abs(change) < LINEAR:
+        return models, nuisances
+    optics = [
+        (optic, offset + change * (optic is Optic.MODULATION)) for optic, offset in nuisances.optics
+    ]
+    moved = models.adjusted(Optic.MODULATION, float(change))
+    return moved, replace(nuisances, optics=tuple(optics))
+
+
+def spread(n_modes: int) -> NDArray[np.intp]:
+    """Return the columns that are compared where a few will do, spread over all."""
+    return np.unique(np.linspace(0, n_modes - 1, min(MOST_MODES, n_modes)).astype(np.intp))
+
+
+def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models of the instrument that was found, and the unknowns about it."""
+    models, nuisances = settled.models, settled.nuisances
+    optics = []
+    for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
+        change = float(settled.solution.nuisances[k])
+        if abs(change) > LINEAR and models.exact(optic):
+            change = float(np.clip(change, -LONGEST_OPTIC_STEP, LONGEST_OPTIC_STEP))
+            models, offset = models.adjusted(optic, change), offset + change
+        optics.append((optic, offset))
+    return models, replace(nuisances, optics=tuple(optics))
+
+
+def settle_at(models: FitModels, target: Target, vector: Array, nuisances: Nuisances) -> Settled:
     """Return the model as it stands at a registration that another method has found."""
     seen = _known(models, target, vector)
     there = refine(models, seen, vector, nuisances, most_steps=0)
-    return replace(there, converged=within_limits(vector)), seen
+    solution = replace(there, converged=within_limits(vector))
+    return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
 
 
 def project_on_sensitivities(
     models: FitModels, target: Target, start: Array, nuisances: Nuisances
-) -> tuple[Solution, Target]:
+) -> Settled:
     """Return where the sensitivities lead from a start, without any search for a better one."""
     for _ in range(MOST_REPEATS):
-        solution, seen = settle(models, target, start, nuisances)
-        if not solution.converged or np.all(np.abs(solution.vector - start) < REACH * SETTLED):
+        settled = settle(models, target, start, nuisances)
+        vector = settled.solution.vector
+        if not settled.solution.converged or np.all(np.abs(vector - start) < REACH * SETTLED):
             break
-        start = solution.vector
-    return solution, seen
+        start = vector
+    return settled
 
 
 def scan(models: FitModels, target: Target, start: Array) -> tuple[Array, tuple[ScanStep, ...]]:

@@ -19,7 +19,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.models import LowOrder, low_order_of
+from service.fit.models import LowOrder, coarse_sampling, low_order_of
 from service.fit.reference import Reference, Target, target_of
 from service.fit.solver import vertex
 from service.model.instrument import Instrument
@@ -32,9 +32,6 @@ from service.model.slopes import FLIPS, Orientation, SlopeRecipe, turned_mask
 
 Array = NDArray[np.float64]
 
-SAMPLING = 1
-"""Pupil points per subaperture: enough for shapes this smooth."""
-
 ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
 """Rotations tried; shapes of degree 5 have lost a tenth half-way between two of them."""
 
@@ -43,6 +40,10 @@ LEAST_LEAD = 0.08
 
 LEAST_CORRELATION = 0.4
 """Below, no orientation explains the lowest orders."""
+
+
+DOUBTFUL = 0.8
+"""Below, others than a stated orientation are looked at as well."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +59,12 @@ class Pose:
     def turned_class(self) -> tuple[SlopeOrder, int, int, bool]:
         """What remains of it when quarter turns of everything do not count."""
         axes = self.slopes.assumed_orientation
-        mirrored = axes.flip_x ^ axes.flip_y ^ axes.swap_xy
-        return self.slopes.order, axes.sign_x, axes.sign_y, mirrored
+        return self.slopes.order, axes.sign_x, axes.sign_y, self.mirrored
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the grid of the slopes is seen as in a looking-glass."""
+        return self.n_changes % 2 == 1
 
     @property
     def n_changes(self) -> int:
@@ -112,6 +117,22 @@ class Search:
         return ""
 
 
+def overruled(stated: Pose, found: Pose) -> str:
+    """Return why a stated orientation cannot be the RTC's; empty: it may be."""
+    if found.correlation < stated.correlation + 2.0 * LEAST_LEAD:
+        return ""
+    told = (
+        f"with {setting_written(stated.slopes)} the lowest orders correlate with the model by "
+        f"{stated.correlation:.2f}, with {found.told()} by {found.correlation:.2f}"
+    )
+    if found.mirrored is not stated.mirrored:
+        return (
+            f"{told}: the slopes' grid is mirrored, or the actuators' coordinates are (parity = "
+            "-1) or are exchanged"
+        )
+    return f"{told}: correct [slopes]"
+
+
 def find_orientation(
     instrument: Instrument, reference: Reference, basis: Basis, *, mapper: Mapper = map
 ) -> Search:
@@ -160,8 +181,9 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
     order = instrument.slopes.kind.orders[0]
     plain = replace(instrument.slopes, order=order, orientation=Orientation())
     seen = replace(instrument, wfs=every, slopes=plain)
+    sampling = coarse_sampling(instrument)
     return InteractionModel(
-        seen, basis, pupil_sampling=SAMPLING, detector_nodes=SAMPLING, mapper=mapper
+        seen, basis, pupil_sampling=sampling, detector_nodes=sampling, mapper=mapper
     )
 
 

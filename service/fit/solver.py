@@ -21,14 +21,14 @@ Kaufman 1975, BIT 15, 49; Golub & Pereyra 2003, Inverse Problems 19, R1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.models import FitModels
+from service.fit.models import FitModels, Optic
 from service.model.interaction import InteractionModel
 from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration
@@ -63,6 +63,13 @@ GAIN_MAP_SIGMA = 0.3
 
 ANAMORPHOSIS_SIGMA = 0.02
 """Half the stretch of the mirror's image along one axis over the other."""
+
+OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.MODULATION: 0.5}
+"""How far what a file says of an instrument may be off, as a logarithm: a coupling of 0.35 might be
+0.18 or 0.53."""
+
+LONGEST_OPTIC_STEP = 0.4
+"""A step of such a logarithm beyond this trusts the derivatives too far."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,6 +145,17 @@ class Projection:
     def chi(self) -> float:
         """Weighted sum of squares of the residual."""
         return float(np.sum(self.residual**2, axis=0) @ self.weights)
+
+    @property
+    def chi_at_best(self) -> float:
+        """What is left of it at the best step to first order."""
+        return self.chi - float(self.scores.sum(axis=1) @ self.best_step)
+
+    @property
+    def best_step(self) -> Array:
+        """``(n_unknowns,)`` the step to where least is left, to first order."""
+        held = self.normal + 1e-9 * np.diag(np.diag(self.normal))
+        return np.linalg.solve(held, self.scores.sum(axis=1))
 
     @property
     def scores(self) -> Array:
@@ -230,27 +248,51 @@ class Nuisances:
     anamorphosis: bool
     """Whether the two stretches are unknown."""
 
+    optics: tuple[tuple[Optic, float], ...] = ()
+    """What of the instrument is unknown, and how far the models are already from what the file
+    says, as a logarithm: the prior is about the file."""
+
     @property
     def sigma(self) -> Array:
         """``(n_nuisances,)`` how large each may be, 1 σ."""
         stretches = [ANAMORPHOSIS_SIGMA] * (2 if self.anamorphosis else 0)
+        optics = [OPTIC_SIGMA[optic] for optic, _ in self.optics]
         maps = [GAIN_MAP_SIGMA] * len(self.maps)
-        return np.array([SLOPE_TURN_SIGMA_RAD, *stretches, *maps])
+        return np.array([SLOPE_TURN_SIGMA_RAD, *stretches, *optics, *maps])
+
+    @property
+    def first_optic(self) -> int:
+        """Index of the first unknown of the instrument among the nuisances."""
+        return 3 if self.anamorphosis else 1
+
+    def from_prior(self, values: Array) -> Array:
+        """Return values ``(n_nuisances,)`` as distances from what is expected of them."""
+        distance = values.astype(float)
+        for k, (_, offset) in enumerate(self.optics, self.first_optic):
+            distance[k] += offset
+        return distance
+
+    def changes(self, values: Array) -> dict[Optic, float]:
+        """Return by how much each of the instrument's unknowns differs from the file, as ln."""
+        distance = self.from_prior(values)
+        return {
+            optic: float(distance[k]) for k, (optic, _) in enumerate(self.optics, self.first_optic)
+        }
 
     @property
     def prior(self) -> Array:
         """``(4 + n_nuisances,)`` reciprocal variances: the registration itself has no prior."""
         return np.concatenate([np.zeros(4), 1.0 / self.sigma**2])
 
-    def derivatives(
-        self, model: InteractionModel, alpha: Misregistration, matrix: NDArray[Any]
-    ) -> Array:
+    def derivatives(self, models: FitModels, alpha: Misregistration, matrix: NDArray[Any]) -> Array:
         """Return ``(n_nuisances, n_slopes, n_modes)``: change of the matrix with each of them."""
+        model = models.cheap
         kind = model.instrument.slopes.kind
         along_x, along_y = slopes_of(matrix, kind)
         found = [signals_of_slopes(np.stack([-along_y, along_x]), kind)]
         if self.anamorphosis:
             found += list(model.stretch_derivatives(alpha))
+        found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
         found += [pattern[:, None] * matrix for pattern in self.maps]
         return np.array(found)
 
@@ -274,18 +316,21 @@ def nuisances_of(
     *,
     gain_map: bool = False,
     anamorphosis: bool = False,
+    optics: Sequence[Optic] = (),
 ) -> Nuisances:
     """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
+    as_told = tuple((optic, 0.0) for optic in optics)
     n = len(valid)
     y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
     if not gain_map:
-        return Nuisances(maps=np.empty((0, kind.n_planes * len(x))), anamorphosis=anamorphosis)
+        none = np.empty((0, kind.n_planes * len(x)))
+        return Nuisances(maps=none, anamorphosis=anamorphosis, optics=as_told)
     order = GAIN_MAP_ORDER
     powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
     centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
     orthonormal, _ = np.linalg.qr(centred.T)
     maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
-    return Nuisances(maps=maps, anamorphosis=anamorphosis)
+    return Nuisances(maps=maps, anamorphosis=anamorphosis, optics=as_told)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -303,6 +348,9 @@ class Solution:
 
     derivatives: NDArray[np.float32]
     """``(4, n_slopes, n_modes)`` of the model, taken nearby."""
+
+    nuisance_derivatives: Array
+    """``(n_nuisances, n_slopes, n_modes)`` the same of the unknowns beside the registration."""
 
     projection: Projection
     converged: bool
@@ -325,7 +373,7 @@ def refine(
     models.counter.n += 4
     frozen = models.cheap.derivatives(here)
     matrix = models.matrix(models.fine, vector)
-    extra = nuisances.derivatives(models.cheap, here, matrix)
+    extra = nuisances.derivatives(models, here, matrix)
     every = np.concatenate([frozen, extra])
     seen, converged = columns.project(matrix, every), False
     for _ in range(most_steps):
@@ -343,6 +391,7 @@ def refine(
         nuisances=values,
         matrix=matrix,
         derivatives=frozen,
+        nuisance_derivatives=extra,
         projection=seen,
         converged=converged,
     )
@@ -352,9 +401,12 @@ def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Arra
     """Return the step of the registration, then of the nuisances, these held by their prior."""
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     prior = nuisances.prior * noise
-    pull = prior * np.concatenate([np.zeros(4), values])
+    pull = prior * np.concatenate([np.zeros(4), nuisances.from_prior(values)])
     step = np.linalg.solve(seen.normal + np.diag(prior), seen.scores.sum(axis=1) - pull)
-    return np.asarray(step / max(1.0, float(np.max(np.abs(step[:4]) / LONGEST_STEP))))
+    excess = np.abs(step[:4]) / LONGEST_STEP
+    first = 4 + nuisances.first_optic
+    optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP
+    return np.asarray(step / max(1.0, float(np.max(np.concatenate([excess, optics])))))
 
 
 def vertex(before: float, at: float, after: float) -> float:

@@ -42,6 +42,9 @@ FEW_MODES_EXCESS = 5.0
 FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
 """By parameter: the magnification feels it less."""
 
+OTHER_SHARE = 0.5
+"""How likely an instrument is that explains a matrix as well as the file's."""
+
 N_SECTORS, N_RINGS = 12, 3
 MOST_SETS = 8
 LEAST_PER_SET = 3
@@ -53,6 +56,9 @@ class Uncertainty:
 
     covariance: Array
     """``(4, 4)`` of the registration, everything included."""
+
+    nuisance_sigma: Array
+    """``(n_nuisances,)`` 1 σ of the unknowns beside it."""
 
     subset_steps: Array
     """``(n_sets, 4)`` where each disjoint set of modes alone would go from the common solution."""
@@ -84,6 +90,7 @@ def uncertainty(
     *,
     shift_subap: float,
     residual_fraction: float,
+    doubt: Array,
 ) -> Uncertainty:
     """Return how sure the first four unknowns of a projection at its solution are.
 
@@ -110,14 +117,17 @@ def uncertainty(
     held = np.diag(prior * noise)
     spread = np.linalg.inv(normals.sum(axis=0) + held)
     scores = projection.scores
-    from_modes = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
-    from_modes = _at_least(from_modes, (spread * noise)[:4, :4])
-    regional = _sandwich(spread, _regional_scores(projection, regions))
+    every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
+    from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
+    by_region = _sandwich(spread, _regional_scores(projection, regions))
+    regional = by_region[:4, :4]
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = strange * FAR_SHARE * shift_subap
-    from_model = np.diag(share**2 + MODEL_FLOOR**2 + far**2)
+    from_model = np.diag(
+        share**2 + MODEL_FLOOR**2 + far**2 + OTHER_SHARE * np.sum(doubt**2, axis=0)
+    )
     pull = prior * noise * values
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     scatter = np.zeros((4, 4))
@@ -125,6 +135,7 @@ def uncertainty(
         scatter = np.diag(steps.var(axis=0, ddof=1) / n_sets)
     return Uncertainty(
         covariance=_at_least(from_modes, scatter) + from_model,
+        nuisance_sigma=np.sqrt(np.diag(every + by_region + spread * noise))[4:],
         subset_steps=steps,
         subset_covariance=covariances + from_model,
     )
@@ -141,8 +152,8 @@ def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
 
 
 def _sandwich(spread: Array, scores: Array) -> Array:
-    """Return the covariance ``(4, 4)`` when columns of ``scores`` are independent."""
-    pulled = (spread @ scores)[:4]
+    """Return the covariance of all unknowns when columns of ``scores`` are independent."""
+    pulled = spread @ scores
     return np.asarray(pulled @ pulled.T)
 
 
@@ -177,7 +188,7 @@ def _subsets(
         step = spread @ (scored.sum(axis=1) - pull)
         about = scored - (own @ step).T
         n_modes = len(own)
-        covariance = _sandwich(spread, about) * n_modes / max(n_modes - 1, 1)
+        covariance = _sandwich(spread, about)[:4, :4] * n_modes / max(n_modes - 1, 1)
         steps.append(step[:4])
         covariances.append(_at_least(covariance, (spread * noise)[:4, :4]))
     return np.array(steps), np.array(covariances)

@@ -133,6 +133,14 @@ class InteractionModel:
         directions = (on_sensor * [-1.0, 1.0] @ turn, -on_sensor[:, ::-1] @ turn)
         return np.stack([self._seen(alpha, self._moved(points, way)) for way in directions])
 
+    def width_derivative(self, alpha: Misregistration) -> Array:
+        """Return how D changes with the logarithm of the influence functions' width.
+
+        ``(n_slopes, n_modes)``; the strokes of the actuators stay.
+        """
+        shapes = self._by_rows(self.basis.render_wider, self._mirror_points(alpha))
+        return self._seen(alpha, shapes.astype(self._dtype))
+
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return D(α) and its derivatives together."""
         return Linearisation(

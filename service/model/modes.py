@@ -13,7 +13,7 @@ from service.errors import ModelError
 from service.model.instrument import Instrument, Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Influence
 from service.model.pupil import PupilGrid, instrument_pupil
-from service.model.tabulated import TabulatedBasis, tabulated_basis
+from service.model.tabulated import TabulatedBasis, smoothed, tabulated_basis
 from service.model.turbulence import (
     expected_variance,
     piston_free,
@@ -87,6 +87,12 @@ class Gaussian:
         """Evaluate the Gaussians."""
         dx, dy = _offsets(points, self.positions)
         return np.asarray(np.exp(np.log(self.coupling) / self.pitch**2 * (dx**2 + dy**2)))
+
+    def wider(self, points: Array) -> Array:
+        """Differentiate the Gaussians by the logarithm of their width."""
+        dx, dy = _offsets(points, self.positions)
+        exponent = np.log(self.coupling) / self.pitch**2 * (dx**2 + dy**2)
+        return np.asarray(-2.0 * exponent * np.exp(exponent))
 
     def slope(self, points: Array, direction: Array) -> Array:
         """Differentiate the Gaussians along ``direction``."""
@@ -169,6 +175,20 @@ class ModalBasis:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
         side = np.array([1.0, self.y_sign])
         return self.surface.slope(points * side, direction * side) @ self.coefficients
+
+    def render_wider(self, points: Array) -> Array:
+        """Return how the modes change with the logarithm of the influence functions' width.
+
+        ``(n_points, n_modes)``; the strokes of the actuators stay.
+        """
+        if isinstance(self.surface, Gaussian):
+            return self.surface.wider(points * [1.0, self.y_sign]) @ self.coefficients
+        return smoothed(self.render, points)
+
+    def of_surface(self, surface: Surface) -> ModalBasis:
+        """Return the same strokes of other influence functions."""
+        coefficients = surface.coefficients(self.mode_to_actuator)
+        return replace(self, surface=surface, coefficients=coefficients)
 
     def known(self, points: Array) -> NDArray[np.bool_]:
         """Return that an analytic surface is known at every point, ``(n_points,)``."""

@@ -8,7 +8,7 @@ join smoothly.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,6 +32,9 @@ LEAST_POINTS_PER_SUBAPERTURE = 2.0
 
 ENOUGH_POINTS_PER_SUBAPERTURE = 4.0
 """0.45 % of error at mode 400; 2 points give 3 %."""
+
+_SMOOTHING_SUBAP = 0.5
+"""Step of the differences that stand for a Laplacian."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,6 +79,10 @@ class TabulatedBasis:
         weights = along_x[:, None, None] * _outer(y[0], x[1])
         weights += along_y[:, None, None] * _outer(y[1], x[0])
         return self._combined(rows, columns, weights)
+
+    def render_wider(self, points: Array) -> Array:
+        """Return how the modes change when their influence functions become wider."""
+        return smoothed(self.render, points)
 
     def known(self, points: Array) -> NDArray[np.bool_]:
         """Return whether the table knows the surface at every point, ``(n_points,)``."""
@@ -159,6 +166,17 @@ def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedB
         step_subap=step,
         y_sign=table.y_sign,
     )
+
+
+def smoothed(render: Callable[[Array], Array], points: Array) -> Array:
+    """Return how shapes ``(n_points, n_modes)`` change when they are smoothed a little.
+
+    A Gaussian of width w that becomes wider changes by ``w²/2`` times its Laplacian, per logarithm
+    of the width and but for its height; w is taken as one subaperture.
+    """
+    steps = _SMOOTHING_SUBAP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    around = sum(render(points + step) for step in steps) - 4.0 * render(points)
+    return np.asarray(around / (2.0 * _SMOOTHING_SUBAP**2))
 
 
 def _cubic(fraction: Array) -> tuple[Array, Array]:

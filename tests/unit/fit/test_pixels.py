@@ -9,6 +9,7 @@ import pytest
 
 from service.errors import MatrixError
 from service.fit.dialect import of_answer
+from service.fit.models import FitModels
 from service.fit.orientation import Pose, find_orientation
 from service.fit.reference import Reference
 from service.fit.solver import nuisances_of
@@ -59,8 +60,8 @@ def test_a_turn_of_the_pyramids_edges_is_no_rotation_of_the_mirror():
     turn = np.deg2rad(1.0)
     rows = matrix(about=PIXELS)
     alone = nuisances_of(valid_subapertures(PIXELS), SignalKind.INTENSITY)
-    model = type("Model", (), {"instrument": PIXELS})()
-    turned = rows + turn * alone.derivatives(model, ELSEWHERE, rows)[0]
+    models = FitModels(instrument=PIXELS, basis=small_basis())
+    turned = rows + turn * alone.derivatives(models, ELSEWHERE, rows)[0]
     slopes, before = (slopes_of(one, SignalKind.INTENSITY) for one in (turned, rows))
     np.testing.assert_allclose(slopes[0], before[0] - turn * before[1], rtol=1e-9)
     assert np.all(np.abs(error(fit(turned, PIXELS))) < 2 * GRID)

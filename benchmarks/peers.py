@@ -39,7 +39,7 @@ def fft_reference(model: InteractionModel) -> Measured:
         sampling=model.pupil.sampling,
         wavelength_m=wfs.wavelength_m,
         n_subapertures=wfs.n_subapertures,
-        image_separation_subap=wfs.pupil_separation_subap,
+        image_separation_subap=wfs.image_separation_subap,
         modulation_lambda_over_d=wfs.modulation_lambda_over_d,
         n_modulation=model.optics.n_modulation,
         n_nodes=model.optics.n_nodes,
@@ -59,7 +59,7 @@ def hcipy_slopes(
     import hcipy
 
     wfs, diameter_m = model.instrument.wfs, model.instrument.diameter_m
-    n_detector = round(wfs.n_subapertures + wfs.pupil_separation_subap)
+    n_detector = round(wfs.n_subapertures + wfs.image_separation_subap)
     pupil = hcipy.make_pupil_grid(len(model.pupil.coordinates), diameter_m)
     detector = hcipy.make_pupil_grid(
         n_detector * model.pupil.sampling, n_detector * model.instrument.subaperture_m
@@ -68,7 +68,7 @@ def hcipy_slopes(
         hcipy.PyramidWavefrontSensorOptics(
             pupil,
             detector,
-            separation=wfs.pupil_separation_subap * model.instrument.subaperture_m,
+            separation=wfs.image_separation_subap * model.instrument.subaperture_m,
             pupil_diameter=diameter_m,
             wavelength_0=wfs.wavelength_m,
         ),

@@ -105,7 +105,7 @@ def main() -> None:
     options = parser.parse_args()
     instrument = bench(options.diameter_px)
     modes = np.union1d(np.arange(10), np.arange(0, 80, options.every))
-    n, separation = instrument.wfs.n_subapertures, int(instrument.wfs.pupil_separation_subap)
+    n, separation = instrument.wfs.n_subapertures, int(instrument.wfs.image_separation_subap)
     with threadpool_limits(1), ThreadPoolExecutor(2) as threads:
         frames = exposed(instrument, separation, OFFSETS_PX, modes)
         direct = exposed(instrument, n, np.zeros((4, 2)), modes)

@@ -127,7 +127,7 @@ def bench(case: Case) -> Bench:
         diameter_m=shared.diameter_m,
         obscuration_ratio=shared.obscuration_ratio,
         n_subapertures=shared.wfs.n_subapertures,
-        pupil_separation_subap=round(shared.wfs.pupil_separation_subap),
+        pupil_separation_subap=round(shared.wfs.image_separation_subap),
         wavelength_m=shared.wfs.wavelength_m,
         modulation_lambda_over_d=shared.wfs.modulation_lambda_over_d,
         n_modulation=N_MODULATION,

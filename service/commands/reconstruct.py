@@ -31,9 +31,12 @@ from service.files.report import (
     orientation_words,
     read_fit,
 )
+from service.fit.instrument_checks import FITTED_KEYS
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
-from service.model.modes import modal_basis
+from service.model.modes import Basis, Gaussian, ModalBasis, modal_basis
+
+COUPLING_KEY, MODULATION_KEY = FITTED_KEYS
 
 SAMPLING = 4
 """Pupil points per subaperture, and detector nodes: the finest of the design's table that takes
@@ -57,12 +60,12 @@ def main(options: argparse.Namespace) -> int:
     found = instrument_sha256(described)
     if known.instrument_sha256 not in {None, found}:
         say(f"note: {options.instrument} has changed since {known.origin} was fitted with it")
-    instrument = _oriented(described, known)
+    instrument = _modulated(_oriented(described, known), known)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(
             instrument,
-            modal_basis(instrument),
+            _basis(instrument, known),
             pupil_sampling=SAMPLING,
             detector_nodes=SAMPLING,
             illumination=None if light is None else light.illumination,
@@ -80,6 +83,7 @@ def main(options: argparse.Namespace) -> int:
             "instrument": instrument.name,
             "instrument_sha256": found,
             "alpha_from": known.origin,
+            **{f"found_{key}": value for key, value in known.instrument_found.items()},
             "model_pupil_sampling": SAMPLING,
             "model_detector_nodes": SAMPLING,
             "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
@@ -139,6 +143,26 @@ def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
             "slopes in the axes of docs/fitting.md"
         )
     return replace(instrument, slopes=recipe)
+
+
+def _modulated(instrument: Instrument, known: KnownFit) -> Instrument:
+    """Return the instrument with the modulation that the fit found; say what is as it found it."""
+    for key, value in known.instrument_found.items():
+        say(f"note: made with {key} = {value:.3g}, as {known.origin} found; correct the instrument")
+    radius = known.instrument_found.get(MODULATION_KEY)
+    if radius is None:
+        return instrument
+    return replace(instrument, wfs=replace(instrument.wfs, modulation_lambda_over_d=radius))
+
+
+def _basis(instrument: Instrument, known: KnownFit) -> Basis:
+    """Return the modes of the instrument, its actuators coupled as the fit found."""
+    basis, coupling = modal_basis(instrument), known.instrument_found.get(COUPLING_KEY)
+    if coupling is None or not isinstance(basis, ModalBasis):
+        return basis
+    if not isinstance(basis.surface, Gaussian):
+        return basis
+    return basis.of_surface(replace(basis.surface, coupling=coupling))
 
 
 def _inverted(

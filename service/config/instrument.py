@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 
 from service.config import packaged_file
 from service.config.instrument_schema import (
+    UNKNOWN,
     AboutTable,
     Centres,
+    InstrumentFile,
     MirrorTable,
     Section,
     SlopesTable,
@@ -21,7 +24,7 @@ from service.config.instrument_schema import (
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.sources import refuse
 from service.errors import ConfigurationError, ModelError
-from service.model.described import KarhunenLoeve, LoopFacts, PyramidNumbers
+from service.model.described import USUAL_SEPARATION, KarhunenLoeve, LoopFacts, PyramidNumbers
 from service.model.detector_windows import by_quadrant
 from service.model.instrument import (
     FrameWindows,
@@ -49,11 +52,12 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
         in contradiction to another.
     """
-    section = read_instrument_file(name_or_path).section
+    said = read_instrument_file(name_or_path)
+    section = said.section
     about, wfs = section(AboutTable).said, section(WfsTable)
     pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
     pyramid = _pyramid(wfs)
-    mirror, remarks = read_mirror(section(MirrorTable), pupil)
+    mirror, about_mirror = read_mirror(section(MirrorTable), pupil)
     modes = _modes(section(KarhunenLoeve), mirror)
     return Instrument(
         **asdict(about),
@@ -63,8 +67,32 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         slopes=_slopes(section(SlopesTable), wfs.said),
         frames=_frames(wfs),
         loop=_loop(section(LoopFacts), modes.n_modes),
-        remarks=remarks,
+        unknown=tuple(one for one in UNKNOWN if one in said.unknown),
+        remarks=(*about_mirror, *_assumed(said, pyramid, mirror)),
     )
+
+
+def _assumed(
+    said: InstrumentFile, pyramid: Pyramid, mirror: Mirror | TabulatedModes
+) -> Iterator[str]:
+    """Yield what the file does not say, and what is taken instead."""
+    wfs = said.section(WfsTable)
+    centres = wfs.said.input == "frames" and wfs.said.pupil_centres_px is not None
+    if "pupil_separation_subap" not in wfs.given and not centres:
+        yield (
+            f"{wfs.where('pupil_separation_subap')}: not told, taken as "
+            f"{pyramid.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil diameters)"
+        )
+    values = {
+        "wfs.wavelength_m": pyramid.wavelength_m,
+        "wfs.modulation_lambda_over_d": pyramid.modulation_lambda_over_d,
+        "mirror.coupling": mirror.shape.coupling if isinstance(mirror, Mirror) else None,
+    }
+    for key in sorted(said.unknown):
+        yield (
+            f"{wfs.path}: {key}: unknown; a fit of a measured matrix finds it, everything else "
+            f"takes {values[key]:g}"
+        )
 
 
 def packaged_instrument(name: str) -> Instrument:
@@ -176,7 +204,7 @@ def _pyramid(file: Section[WfsTable]) -> Pyramid:
 def _separation(file: Section[WfsTable]) -> float:
     """Return the images' distance: as given, or as the images on the frames lie."""
     table = file.said
-    stated = table.pupil_separation_subap
+    stated = table.image_separation_subap
     if table.pupil_centres_px is None or table.input == "slopes":
         return stated
     centres = _by_quadrant(table.pupil_centres_px, file)

@@ -172,6 +172,13 @@ TABLES: Mapping[str, Any] = {
 
 WHOLE = create_model("InstrumentFile", __base__=Table, **TABLES)
 
+UNKNOWN: Mapping[str, float] = {
+    "wfs.wavelength_m": 750e-9,
+    "wfs.modulation_lambda_over_d": 3.0,
+    "mirror.coupling": 0.35,
+}
+"""Keys that may be "unknown", and what is taken until a measured matrix tells."""
+
 Said = TypeVar("Said")
 
 
@@ -202,6 +209,8 @@ class InstrumentFile:
     """An instrument file by its tables."""
 
     sections: tuple[Section[Any], ...]
+    unknown: frozenset[str] = frozenset()
+    """Keys, with their tables, that are said to be unknown."""
 
     def section(self, kind: type[Said]) -> Section[Said]:
         """Return the table that is read into this."""
@@ -218,10 +227,22 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     """
     path = instrument_path(name_or_path)
     written = read_toml(path)
+    unknown = frozenset(key for key in UNKNOWN if _value(written, key) == "unknown")
+    for key in unknown:
+        table, name = key.split(".")
+        written[table] = {**written[table], name: UNKNOWN[key]}
     whole = validated(WHOLE, written, in_file(path))
     return InstrumentFile(
         tuple(
             Section(getattr(whole, name), frozenset(written.get(name, ())), path, name)
             for name in TABLES
-        )
+        ),
+        unknown,
     )
+
+
+def _value(written: Mapping[str, Any], key: str) -> object:
+    """Return what is written under a key of a table; None: nothing."""
+    table, name = key.split(".")
+    found = written.get(table)
+    return found.get(name) if isinstance(found, dict) else None

@@ -14,6 +14,7 @@ from service.errors import ConfigurationError
 from service.model.described import InfluenceShape
 from service.model.instrument import Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Influence
+from service.model.misregistration import unit_like
 from service.model.tabulated import (
     ENOUGH_POINTS_PER_SUBAPERTURE,
     LEAST_POINTS_PER_SUBAPERTURE,
@@ -40,6 +41,9 @@ _FOREIGN = {
 
 _CHUNK = 256
 """Actuators compared with all others at once."""
+
+_UNIT_DECADES = 1.0
+"""Powers of ten around a unit that are still recognised as it."""
 
 _LARGEST_TABLE = 5.0
 """Width of a table in pupil diameters, beyond which its pitch is in another unit."""
@@ -68,7 +72,9 @@ def read_mirror(
     """
     _check_keys(file)
     if file.said.layout is not None:
-        return _analytic(file), ()
+        mirror = _analytic(file)
+        _check_width(file, mirror.positions_m, pupil)
+        return mirror, ()
     return _tabulated(file, pupil)
 
 
@@ -140,6 +146,21 @@ def _analytic(file: MirrorSection) -> Mirror:
         basis=table.basis,
         mode_to_actuator=_mode_to_actuator(file, len(positions)),
         **_mount(table),
+    )
+
+
+def _check_width(file: MirrorSection, positions_m: NDArray[np.float64], pupil: Pupil) -> None:
+    """Refuse actuators that cannot be in metres of the pupil plane."""
+    width = float(np.ptp(positions_m, axis=0).max()) / pupil.diameter_m
+    if 1.0 / _LARGEST_TABLE < width < _LARGEST_TABLE:
+        return
+    unit = unit_like(width, _UNIT_DECADES)
+    hint = f": they look like {unit}" if unit else ""
+    key = "positions" if file.said.layout == "positions" else "pitch_m"
+    refuse(
+        file.where(key),
+        f"actuators over {width * pupil.diameter_m:.3g} m, {width:.3g} pupil diameters{hint}",
+        f"metres in the pupil plane: about diameter_m = {pupil.diameter_m:g}",
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from service import __version__
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError, shown
+from service.fit.instrument_checks import FITTED_KEYS, NOTABLE, NOTABLE_SIGMA
 from service.fit.matrix import Fit, Method
 from service.fit.methods import ScanStep
 from service.model.kinds import SlopeOrder
@@ -76,6 +77,15 @@ def document(report: FitReport) -> dict[str, Any]:
         "subset_scatter": _four(fit.subset_scatter),
         "converged": bool(fit.converged),
         "verdict": verdict_line(fit),
+        "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
+        "instrument_found": {
+            one.key if one.found is not None else "influence_width": {
+                "found": _plain(one.found if one.found is not None else np.exp(one.change)),
+                "sigma": _plain(one.found_sigma),
+                "told": one.told,
+            }
+            for one in fit.optics
+        },
         "notes": list(report.notes),
         "seconds": round(report.seconds, 3),
     }
@@ -168,6 +178,11 @@ def _basis(report: FitReport) -> Iterator[str]:
 
 
 def _extras(fit: Fit) -> Iterator[str]:
+    for one in fit.optics:
+        if one.found is not None:
+            told = "unknown" if one.told is None else f"{one.told:g}"
+            words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
+            yield f"{one.key[:19]:20s}{words} (the instrument file says {told})"
     if fit.anamorphosis is not None:
         along, across = 100.0 * fit.anamorphosis
         yield f"{'anamorphosis':20s}{along:+.3f} % along x, {across:+.3f} % along 45 deg"
@@ -297,6 +312,9 @@ class KnownFit:
     reference_sha256: str | None = None
     """Of the measured file; None: not in the file."""
 
+    instrument_found: Mapping[str, float] = field(default_factory=dict)
+    """What the fit found where the instrument file says otherwise or nothing, by key."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Provenance:
@@ -377,8 +395,21 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
         ),
         order=SlopeOrder(words["order"]),
         accepted=str(values["verdict"]).startswith("accepted"),
+        instrument_found=_otherwise(values.get("instrument_found", {})),
         origin=str(path),
     )
+
+
+def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
+    """Return what was found and is not what the instrument file says."""
+    otherwise = {}
+    for key, one in found.items():
+        value, told, sigma = one["found"], one["told"], one["sigma"] or 0.0
+        if value is None or key not in FITTED_KEYS:
+            continue
+        if told is None or abs(value - told) > max(NOTABLE * told, NOTABLE_SIGMA * sigma):
+            otherwise[key] = value
+    return otherwise
 
 
 def _of_product(file: h5py.File, path: Path) -> KnownFit:

@@ -19,6 +19,9 @@ from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]
 
+FITTED_KEYS = ("coupling", "modulation_lambda_over_d")
+"""Of the instrument file, for the width of influence functions and the modulation."""
+
 NOTABLE = 0.03
 """A logarithm of the instrument's that differs by less from the file's is not worth a word."""
 
@@ -66,9 +69,18 @@ class FoundOptic:
     """The same in the instrument file; None as above, or said to be unknown."""
 
     @property
+    def found_sigma(self) -> float:
+        """1 σ of what was found, in its own unit; of a width as its logarithm."""
+        if self.found is None:
+            return self.sigma
+        if self.optic is Optic.MODULATION:
+            return self.found * self.sigma
+        return -2.0 * self.found * float(np.log(self.found)) * self.sigma
+
+    @property
     def key(self) -> str:
         """Of the instrument file."""
-        return "coupling" if self.optic is Optic.WIDTH else "modulation_lambda_over_d"
+        return FITTED_KEYS[self.optic is Optic.MODULATION]
 
     @property
     def found_words(self) -> str:
@@ -89,7 +101,8 @@ class FoundOptic:
     @property
     def notable(self) -> bool:
         """Whether the file is wrong, as far as the matrix tells."""
-        return abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
+        unknown = self.found is not None and self.told is None
+        return not unknown and abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,7 +184,7 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
                 change=change,
                 sigma=float(sure.nuisance_sigma[k]),
                 found=value if known else None,
-                told=told if known else None,
+                told=told if known and optic not in nuisances.unknown else None,
             )
         )
     return tuple(found)

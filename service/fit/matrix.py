@@ -202,6 +202,23 @@ def fit_matrix(
     """
     options = options or FitOptions()
     tell = progress or (lambda _: None)
+    try:
+        return _fitted(instrument, reference, options, basis, mapper, tell)
+    except np.linalg.LinAlgError as error:
+        raise ModelError(
+            f"{instrument.name}: found modes that tell nothing of a registration ({error}); "
+            "expected actuators or tables in metres over the pupil that the sensor sees"
+        ) from error
+
+
+def _fitted(
+    instrument: Instrument,
+    reference: Reference,
+    options: FitOptions,
+    basis: Basis | None,
+    mapper: Mapper,
+    tell: Progress,
+) -> Fit:
     if basis is None:
         tell("modes")
         basis = modal_basis(instrument)
@@ -210,7 +227,7 @@ def fit_matrix(
         n_slopes=instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum()),
         n_modes=basis.n_modes,
         wavelength_m=instrument.wfs.wavelength_m,
-        stroke_known=instrument.mirror.stroke_known,
+        stroke_known=_stroke_known(instrument),
     )
     used = basis.subset(usable.columns)
     tell("orientation")
@@ -233,6 +250,11 @@ def fit_matrix(
     found = _found(models, target, start, options)
     tell("verdict")
     return _answer(models, found, usable, untold, told)
+
+
+def _stroke_known(instrument: Instrument) -> bool:
+    """Return whether the size of a column means anything: a wavelength scales them all."""
+    return instrument.mirror.stroke_known and "wfs.wavelength_m" not in instrument.unknown
 
 
 def _masked(instrument: Instrument) -> Instrument:
@@ -307,6 +329,7 @@ def _found(models: FitModels, target: Target, start: Array, options: FitOptions)
         gain_map=options.gain_map,
         anamorphosis=options.anamorphosis,
         optics=models.optics,
+        unknown=models.unknown,
     )
     match options.method:
         case Method.JOINT:
@@ -337,6 +360,7 @@ def _answer(
         nuisances.prior,
         regions,
         shift_subap=float(np.hypot(*solution.vector[:2])),
+        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
         residual_fraction=residual_fraction,
         doubt=np.array([doubt_of_width(settled), *(rival.moved for rival in others)]),
     )
@@ -351,7 +375,7 @@ def _answer(
         as_told=as_told(as_in_file, settled) if any(one.notable for one in optics) else None,
         axes=untold,
         passes=usable.passes,
-        stroke_known=models.instrument.mirror.stroke_known,
+        stroke_known=_stroke_known(models.instrument),
     )
     accepted, verdict = judged(evidence)
     return Fit(
@@ -374,7 +398,7 @@ def _answer(
             target,
             told=told,
             found=slopes,
-            wavelength_m=models.instrument.wfs.wavelength_m,
+            about=models.instrument,
         ),
         left_out=usable.left_out + _rows_left_out(target),
         n_evaluations=models.counter.n,

@@ -212,7 +212,8 @@ def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
     if not places:
         return models, nuisances
     step = solution.nuisances[nuisances.first_optic + places[0]]
-    if settled.share < STRANGE and abs(step) < FAR_OFF:
+    unknown = Optic.MODULATION in nuisances.unknown
+    if settled.share < STRANGE and abs(step) < FAR_OFF and not unknown:
         return models, nuisances
     modes = spread(settled.target.n_modes)
     few = settled.target.column_subset(modes)

@@ -42,6 +42,11 @@ FEWEST = 3
 
 MOST_SINGLE = 20
 
+UNSEEN = 1e-9
+"""Response of a mode over the largest, below which it is none."""
+
+_NAMED = 5
+
 BETTER = 0.95
 """Another instrument is believed when it leaves less than this share of χ². On the diffractive
 telescope the right stop has left 0.83 to 0.94 of what the wrong one does, noise included, from a
@@ -156,6 +161,12 @@ class FitModels:
         return tuple(found)
 
     @property
+    def unknown(self) -> frozenset[Optic]:
+        """What of it the instrument file says to be unknown."""
+        keys = {Optic.WIDTH: "mirror.coupling", Optic.MODULATION: "wfs.modulation_lambda_over_d"}
+        return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
+
+    @property
     def coupling(self) -> float | None:
         """Of the influence functions; None: they have none."""
         surface = self.basis.surface if isinstance(self.basis, ModalBasis) else None
@@ -246,11 +257,24 @@ def low_order_of(model: InteractionModel) -> LowOrder:
 
     The model may be coarse. Shapes are compared over that part of the pupil where the surface is
     known, without their mean.
+
+    Raises
+    ------
+    ModelError
+        If the sensor does not see a mode.
     """
     points = model.pupil.points
     root = np.sqrt(model.pupil.weights)[:, None]
     matrix = np.asarray(model.interaction_matrix(Misregistration()), dtype=np.float64)
     response = np.linalg.norm(matrix, axis=0)
+    unseen = np.flatnonzero(response <= UNSEEN * response.max())
+    if len(unseen):
+        named = ", ".join(str(mode) for mode in unseen[:_NAMED])
+        raise ModelError(
+            f"{model.instrument.name}: found {len(unseen)} of {len(response)} modes that move "
+            f"nothing the sensor sees (columns {named}{', ...' if len(unseen) > _NAMED else ''}); "
+            "expected actuators or tables in metres over the pupil (--modes leaves some out)"
+        )
     root = np.where(model.basis.known(points)[:, None], root, 0.0)
     modes = model.basis.render(points) / response * root
     modes -= root * (root.T @ modes) / np.sum(root**2)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from service.fit.reference import Target
 from service.fit.solver import Solution
 from service.fit.verdict import Evidence, factor_of_passes
+from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.slopes import FLIPS, SlopeRecipe
@@ -46,7 +47,7 @@ def remarks(
     *,
     told: SlopeRecipe,
     found: SlopeRecipe,
-    wavelength_m: float,
+    about: Instrument,
 ) -> tuple[str, ...]:
     """Return what should be known, one sentence each.
 
@@ -56,8 +57,8 @@ def remarks(
         Of the fit.
     told, found
         How slopes are listed, as the instrument file says it and as the matrix lists them.
-    wavelength_m
-        In the instrument file.
+    about
+        The instrument of the file.
     """
     return (
         *_order(told.order, found.order),
@@ -65,7 +66,7 @@ def remarks(
         *_optics(evidence),
         *_size(evidence),
         *_passes(evidence),
-        *_scale(evidence, wavelength_m),
+        *_scale(evidence, about),
         *_columns(evidence.solution, target),
     )
 
@@ -95,8 +96,11 @@ def _optics(evidence: Evidence) -> Iterator[str]:
     """Yield what of the instrument is another than told, or was found because it was unknown."""
     for optic in evidence.optics:
         if optic.found is not None and optic.told is None:
-            yield f"{optic.found_words} was found, {optic.found * optic.sigma:.2g} sigma"
-    wrong = [o for o in evidence.optics if o.notable and (o.told is not None or o.found is None)]
+            yield (
+                f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}: write it "
+                "into the instrument file"
+            )
+    wrong = [optic for optic in evidence.optics if optic.notable]
     if not wrong or evidence.as_told is None:
         return
     found = " and ".join(f"{optic.found_words} ({optic.told_words})" for optic in wrong)
@@ -119,15 +123,21 @@ def _size(evidence: Evidence) -> Iterator[str]:
         )
 
 
-def _scale(evidence: Evidence, wavelength_m: float) -> Iterator[str]:
+def _scale(evidence: Evidence, about: Instrument) -> Iterator[str]:
     """Yield that all gains are off together: the wavelength, or the unit."""
     gains = evidence.solution.projection.gains
     middle = float(np.median(gains))
+    wavelength_m = about.wfs.wavelength_m / middle
+    if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
+        yield (
+            f"wavelength_m = {wavelength_m:.3g} was found, if the matrix is per metre of OPD on a "
+            f"flat wavefront: gains of the modes scatter by {float(np.std(gains)) / middle:.1%}"
+        )
     together = float(np.std(gains)) < UNIFORM * abs(middle) and abs(middle - 1.0) > OFF_TOGETHER
     explained = evidence.residual_fraction < EXPLAINED
     if evidence.stroke_known and explained and together and factor_of_passes(evidence) is None:
         yield (
-            f"the gain of every mode is {middle:.3g}: a wavelength of {wavelength_m / middle:.3g} "
+            f"the gain of every mode is {middle:.3g}: a wavelength of {wavelength_m:.3g} "
             "m instead of the file's would do that, or another unit of strokes; the registration "
             "does not depend on it"
         )

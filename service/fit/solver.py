@@ -68,6 +68,9 @@ OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.MODULATION: 0.5}
 """How far what a file says of an instrument may be off, as a logarithm: a coupling of 0.35 might be
 0.18 or 0.53."""
 
+UNKNOWN_SIGMA = 1.0
+"""The same of what a file says to be unknown."""
+
 LONGEST_OPTIC_STEP = 0.4
 """A step of such a logarithm beyond this trusts the derivatives too far."""
 
@@ -252,11 +255,17 @@ class Nuisances:
     """What of the instrument is unknown, and how far the models are already from what the file
     says, as a logarithm: the prior is about the file."""
 
+    unknown: frozenset[Optic] = frozenset()
+    """What of it the file says to be unknown."""
+
     @property
     def sigma(self) -> Array:
         """``(n_nuisances,)`` how large each may be, 1 σ."""
         stretches = [ANAMORPHOSIS_SIGMA] * (2 if self.anamorphosis else 0)
-        optics = [OPTIC_SIGMA[optic] for optic, _ in self.optics]
+        optics = [
+            UNKNOWN_SIGMA if optic in self.unknown else OPTIC_SIGMA[optic]
+            for optic, _ in self.optics
+        ]
         maps = [GAIN_MAP_SIGMA] * len(self.maps)
         return np.array([SLOPE_TURN_SIGMA_RAD, *stretches, *optics, *maps])
 
@@ -317,6 +326,7 @@ def nuisances_of(
     gain_map: bool = False,
     anamorphosis: bool = False,
     optics: Sequence[Optic] = (),
+    unknown: frozenset[Optic] = frozenset(),
 ) -> Nuisances:
     """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
     as_told = tuple((optic, 0.0) for optic in optics)
@@ -324,13 +334,13 @@ def nuisances_of(
     y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
     if not gain_map:
         none = np.empty((0, kind.n_planes * len(x)))
-        return Nuisances(maps=none, anamorphosis=anamorphosis, optics=as_told)
+        return Nuisances(maps=none, anamorphosis=anamorphosis, optics=as_told, unknown=unknown)
     order = GAIN_MAP_ORDER
     powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
     centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
     orthonormal, _ = np.linalg.qr(centred.T)
     maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
-    return Nuisances(maps=maps, anamorphosis=anamorphosis, optics=as_told)
+    return Nuisances(maps=maps, anamorphosis=anamorphosis, optics=as_told, unknown=unknown)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

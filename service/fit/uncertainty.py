@@ -16,9 +16,14 @@ from service.fit.solver import Projection
 
 Array = NDArray[np.float64]
 
-MODEL_FLOOR = np.array([3e-4, 3e-4, np.deg2rad(6e-4), 1.5e-4])
-"""1 σ that no matrix is free of. Noise-free ones of other codes, of the same mirror at 0.3 to 1.1
-subapertures, were read off by 0.017 to 0.038 % of one (RMS of a shift)."""
+FLOOR_SUBAP = 3e-4
+"""1 σ of where a point of the pupil is seen, that no matrix is free of: of a shift, and at the
+pupil's edge of a rotation. Noise-free matrices of other codes, of the same mirror at 0.3 to 1.1
+subapertures, were read off by 0.017 to 0.038 % of one (RMS of a shift); modes of a sensor of 20
+subapertures, modulated by 20 points, by 0.05 % and 0.0017 deg."""
+
+MAGNIFICATION_FLOOR = 1e-4
+"""The same of the magnification: of those matrices 3e-5 with modes, 1.2e-4 with actuators."""
 
 FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
 """1 σ by parameter over the length of the shift in subapertures: far off, a mirror of another kind
@@ -89,6 +94,7 @@ def uncertainty(
     regions: NDArray[np.intp],
     *,
     shift_subap: float,
+    radius_subap: float,
     residual_fraction: float,
     doubt: Array,
 ) -> Uncertainty:
@@ -107,6 +113,8 @@ def uncertainty(
         ``(n_rows,)`` region of the pupil of each slope.
     shift_subap
         Length of the shift at the solution: part of the model's error grows with it.
+    radius_subap
+        Of the pupil.
     residual_fraction
         RMS of what is left over RMS of the measurement: so far the mirror may be another.
     """
@@ -125,9 +133,8 @@ def uncertainty(
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = strange * FAR_SHARE * shift_subap
-    from_model = np.diag(
-        share**2 + MODEL_FLOOR**2 + far**2 + OTHER_SHARE * np.sum(doubt**2, axis=0)
-    )
+    floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, MAGNIFICATION_FLOOR])
+    from_model = np.diag(share**2 + floor**2 + far**2 + OTHER_SHARE * np.sum(doubt**2, axis=0))
     pull = prior * noise * values
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     scatter = np.zeros((4, 4))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.fit.instrument_checks import AsTold, FoundOptic, Rival
 from service.fit.methods import Landing
-from service.fit.solver import OPTIC_SIGMA, Solution
+from service.fit.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
 from service.fit.uncertainty import Uncertainty
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 
@@ -144,7 +144,8 @@ def _another_instrument(evidence: Evidence) -> str:
                 f"misfit is {rival.share:.0%} of what it is now; correct the instrument file"
             )
     for optic in evidence.optics:
-        if abs(optic.change) > STRANGEST * OPTIC_SIGMA[optic.optic]:
+        usual = OPTIC_SIGMA[optic.optic] if optic.told is not None else UNKNOWN_SIGMA
+        if abs(optic.change) > STRANGEST * usual:
             return (
                 f"only {optic.found_words} would explain the matrix, {optic.told_words}: the "
                 "mirror, the sensor or the modes are not those of the instrument file"

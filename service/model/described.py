@@ -15,6 +15,9 @@ from service.model.kinds import Influence, Stop
 Positive = Annotated[float, Gt(0.0)]
 Count = Annotated[int, Ge(1)]
 
+USUAL_SEPARATION = 1.2
+"""Distance of neighbouring pupil images over their diameter, where nobody tells."""
+
 
 class Read:
     """Read strictly: no unknown keys, no guessing between types, finite numbers."""
@@ -55,13 +58,14 @@ class PyramidNumbers(Read):
     """Subapertures across the sensor grid."""
 
     wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
-    """Sensing wavelength, metres."""
+    """Sensing wavelength, metres; may be "unknown" until a matrix is fitted."""
 
     modulation_lambda_over_d: Annotated[float, Ge(0.0), Le(100.0)]
-    """Radius of the modulation circle, λ/D."""
+    """Radius of the modulation circle, λ/D; may be "unknown" until a matrix is fitted."""
 
-    pupil_separation_subap: Positive = 36.0
-    """Distance between the centres of neighbouring pupil images, subapertures."""
+    pupil_separation_subap: Positive | None = None
+    """Distance between the centres of neighbouring pupil images, subapertures; None: 1.2 diameters
+    of the pupil."""
 
     pupil_diameter_subap: Positive | None = None
     """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
@@ -74,6 +78,11 @@ class PyramidNumbers(Read):
         """Diameter of the pupil image, in subapertures."""
         return float(self.pupil_diameter_subap or self.n_subapertures)
 
+    @property
+    def image_separation_subap(self) -> float:
+        """Distance between the centres of neighbouring pupil images, in subapertures."""
+        return float(self.pupil_separation_subap or USUAL_SEPARATION * self.pupil_diameter)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InfluenceShape(Read):
@@ -83,7 +92,7 @@ class InfluenceShape(Read):
     """Shape of an influence function."""
 
     coupling: Annotated[float, Gt(0.0), Lt(1.0)] = 0.35
-    """Gaussian only: height at a distance of one pitch."""
+    """Gaussian only: height at a distance of one pitch; "unknown" until a matrix is fitted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -121,6 +121,9 @@ class Instrument(Telescope):
     loop: LoopFacts | None = None
     """What is known of the loop without an RTC."""
 
+    unknown: tuple[str, ...] = ()
+    """Keys of the file, like ``mirror.coupling``, whose values are only where a fit begins."""
+
     remarks: tuple[str, ...] = ()
     """What whoever uses this description should be told: one sentence each, with the key."""
 
@@ -186,9 +189,14 @@ def _add(digest: hashlib._Hash, value: object) -> None:
 
 
 def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
-    """Yield fields by name, of an influence function its own: so fits of before know it."""
+    """Yield fields by name, of an influence function its own: so fits of before know it.
+
+    What is unknown is told where anything is.
+    """
     for one in fields(record):
         value = getattr(record, one.name)
+        if one.name == "unknown" and not value:
+            continue
         if isinstance(value, InfluenceShape):
             yield from _parts(value)
         else:

@@ -179,7 +179,7 @@ class PyramidOptics:
 
     def _roof(self, shift: float, nodes: Nodes) -> _Roof:
         """Return the roof operator along one axis, at the nodes of every subaperture."""
-        n, half = self.wfs.n_subapertures, self.wfs.pupil_separation_subap / 2
+        n, half = self.wfs.n_subapertures, self.wfs.image_separation_subap / 2
         centres = np.arange(n) - (n - 1) / 2
         x = _SIDES[:, None, None] * half + centres[:, None] + nodes.offsets - shift
         distance = x[..., None] - self.pupil.coordinates

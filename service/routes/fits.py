@@ -160,6 +160,13 @@ class FitDocument(BaseModel):
     verdict: str
     """Begins with "accepted" or "refused"; names what was left out."""
 
+    anamorphosis: list[float] | None = None
+    """Half the stretch along x over that along y, and along 45 deg over 135 deg; null: not
+    asked for."""
+
+    instrument_found: dict[str, dict[str, float | None]] = {}
+    """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
+
     notes: list[str]
     """What was decided on the way, or overruled, and should be known."""
 

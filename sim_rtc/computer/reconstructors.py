@@ -253,7 +253,7 @@ def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
         basis.update(b"zonal" if strokes is None else np.round(strokes, 9).tobytes())
     sensor = hashlib.sha256(np.packbits(valid).tobytes())
     sensor.update(
-        repr((wfs.wavelength_m, wfs.modulation_lambda_over_d, wfs.pupil_separation_subap)).encode()
+        repr((wfs.wavelength_m, wfs.modulation_lambda_over_d, wfs.image_separation_subap)).encode()
     )
     if instrument.slopes.kind is not SignalKind.XY:
         sensor.update(instrument.slopes.kind.encode())

@@ -224,7 +224,7 @@ def binned(instrument: Instrument, binning: int) -> Instrument:
         wfs=replace(
             wfs,
             n_subapertures=wfs.n_subapertures // binning,
-            pupil_separation_subap=wfs.pupil_separation_subap / binning,
+            pupil_separation_subap=wfs.image_separation_subap / binning,
             pupil_diameter_subap=wfs.pupil_diameter / binning,
         ),
     )

@@ -296,7 +296,7 @@ class DiffractivePyramid:
         The kernel of one edge is that of a half-plane's transform, cut at the band limit of the
         pupil grid; the light of a subaperture is a Gauss-Legendre sum over its nodes.
         """
-        n, half = self._wfs.n_subapertures, self._wfs.pupil_separation_subap / 2
+        n, half = self._wfs.n_subapertures, self._wfs.image_separation_subap / 2
         offsets, weights = np.polynomial.legendre.leggauss(self._quadrature.n_nodes)
         centres = np.arange(n) - (n - 1) / 2
         x = _SIDES[:, None, None] * half + centres[:, None] + offsets / 2 - shift_subap

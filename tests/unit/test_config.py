@@ -12,6 +12,7 @@ from service.config import Settings, load_instrument, load_settings
 from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
 from service.model.described import LoopFacts
+from service.model.instrument import instrument_sha256
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.kinds import Influence, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
@@ -24,6 +25,7 @@ WFS = (
     '[wfs]\nkind = "pyramid"\nn_subapertures = 20\nwavelength_m = 750e-9\n'
     "modulation_lambda_over_d = 3.0\n"
 )
+APART = WFS + "pupil_separation_subap = 24\n"
 MIRROR = '[mirror]\nlayout = "grid"\nn_across = 11\npitch_m = 0.8\ndiameter_m = 8.8\n'
 MODES = "[modes]\nn_modes = 50\n"
 
@@ -202,7 +204,7 @@ def test_values_that_ask_for_nothing_new_are_accepted(write):
         ),
         (ABOUT + "wfs = 3\n" + MIRROR, "instrument.wfs: unknown key"),
         ("wfs = 3\n" + ABOUT + MIRROR, "wfs: found 3, expected a table [wfs]"),
-        (ABOUT + WFS.replace("20", "40") + MIRROR + MODES, "the images would overlap"),
+        (ABOUT + APART.replace("20", "40") + MIRROR + MODES, "the images would overlap"),
         (ABOUT + WFS + "[mirror]\n", "expected one of layout, modes, influence_functions"),
         (
             ABOUT + WFS + MIRROR + "first_ring = 1\n",
@@ -432,7 +434,7 @@ def test_a_cube_of_measured_modes_is_what_it_says_whatever_its_byte_order(write,
     cube, _ = measured_modes()
     save(tmp_path / "cube.h5", modes=cube.astype(">f8"))
     for kind, factor in (("opd", 1.0), ("surface", 2.0)):
-        bench = load_instrument(write(ABOUT + WFS + CUBE + f'modes_kind = "{kind}"\n'))
+        bench = load_instrument(write(ABOUT + APART + CUBE + f'modes_kind = "{kind}"\n'))
         assert bench.remarks == ()
         assert bench.modes.n_modes == 3
         points = np.array([[1.0, -2.0], [0.0, 0.0], [7.5, 3.0]])
@@ -729,3 +731,39 @@ def test_a_wrong_environment_variable_is_refused_by_its_own_name(write, name, va
 def test_a_wrong_command_line_value_is_refused_as_such():
     message = refusal(load_settings, None, {}, {"api.port": -1})
     assert message.startswith("command line: api.port: found -1")
+
+
+# --- what the file does not say
+
+
+def test_a_separation_that_is_not_told_is_that_of_no_other_telescope_and_is_said(write):
+    assert load_instrument(write(ABOUT + APART + MIRROR + MODES)).remarks == ()
+    bench = load_instrument(write(ABOUT + WFS + MIRROR + MODES))
+    assert bench.wfs.pupil_separation_subap == 24.0
+    assert "pupil_separation_subap: not told, taken as 24 (1.2 pupil diam" in bench.remarks[0]
+
+
+def test_what_is_unknown_is_where_a_fit_begins_and_is_said(write):
+    unknown = APART.replace("750e-9", '"unknown"').replace("3.0", '"unknown"')
+    mirror = MIRROR + 'influence = "gaussian"\ncoupling = "unknown"\n'
+    bench = load_instrument(write(ABOUT + unknown + mirror + MODES))
+    keys = ("wfs.wavelength_m", "wfs.modulation_lambda_over_d", "mirror.coupling")
+    assert bench.unknown == keys
+    for key in keys:
+        assert any(f"{key}: unknown; a fit" in remark for remark in bench.remarks)
+    known = load_instrument(write(ABOUT + APART + MIRROR + MODES))
+    assert instrument_sha256(known) != instrument_sha256(replace(known, unknown=keys))
+
+
+def test_only_what_a_matrix_can_tell_may_be_unknown(write):
+    words = refusal(load_instrument, write(ABOUT.replace("8.0", '"unknown"') + APART + MIRROR))
+    assert "instrument.diameter_m" in words
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "millimetres"), (1e6, "micrometres")])
+def test_positions_in_another_unit_are_named(write, tmp_path, factor, unit):
+    save(tmp_path / "dm.h5", positions=grid(11, 0.8, 8.8) * factor)
+    mirror = '[mirror]\nlayout = "positions"\npositions = "dm.h5:/positions"\n'
+    words = refusal(load_instrument, write(ABOUT + APART + mirror + MODES))
+    assert f"pupil diameters: they look like {unit}" in words
+    assert "metres in the pupil plane: about diameter_m = 8" in words

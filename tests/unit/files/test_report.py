@@ -21,6 +21,8 @@ KEYS = {
     "converged",
     "verdict",
     "notes",
+    "anamorphosis",
+    "instrument_found",
     "seconds",
 }
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from service.config.mirrors import grid
+from service.errors import ModelError
 from service.fit.matrix import FitOptions, fit_matrix
 from service.fit.models import Optic
 from service.fit.reference import Reference
@@ -170,3 +171,25 @@ def test_mirrored_actuators_are_noted_with_any_orientation_and_refused_with_one_
 def test_exchanged_coordinates_are_noted():
     found = fitted(replace(bench(positions_m=ACTUATORS_M[:, ::-1]), slopes=SlopeRecipe()))
     assert any("mirrored or exchanged" in remark for remark in found.remarks)
+
+
+def test_what_is_unknown_is_found_and_told():
+    keys = ("wfs.wavelength_m", "wfs.modulation_lambda_over_d", "mirror.coupling")
+    about = replace(modulated(5.0), unknown=keys)
+    found = fitted(replace(about, wfs=replace(about.wfs, wavelength_m=500e-9)))
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
+    for words in (
+        "modulation_lambda_over_d = 3 was found",
+        "coupling = 0.35",
+        "wavelength_m = 7.5",
+    ):
+        assert any(words in remark for remark in found.remarks), words
+    assert not any("the instrument file says" in remark for remark in found.remarks)
+
+
+def test_actuators_in_millimetres_are_an_error_that_says_what_was_expected():
+    with pytest.raises(
+        ModelError, match=r"bench: found \d+ of 13.* modes that move nothing.* metres"
+    ):
+        fitted(bench(positions_m=ACTUATORS_M * 1e3))

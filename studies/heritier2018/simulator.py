@@ -52,8 +52,9 @@ def section(budget: Budget, store: Store) -> page.Section:
     body += page.paragraph(
         "The simulator is moved away from what the fit found, one parameter at a time; the matrix "
         "stays. If the fit is right, the loop is best near 0. Where the light falls on the sensor "
-        "changes with the shift as well, whatever the matrix: the loop of a model that knows where "
-        "it lies shows that part, and what is added to its variance is what the registration costs."
+        "changes with the shift as well, and a border that the sensor does not see may slip by a "
+        "wave, whatever the matrix: the loop of a model that knows where it lies shows that part. "
+        "What the slopes show has none of it."
     )
     body += page.picture(
         _figure(budget, store),
@@ -130,14 +131,16 @@ def _order_remark(budget: Budget, store: Store) -> str:
     return page.remark(text, agrees=away < _CLOSE_NM and len(same) == len(found))
 
 
-def cost_nm2(budget: Budget, store: Store, sweep: Sweep) -> Mapping[float, tuple[float, float]]:
-    """Return by value of a sweep both errors' squares: measured matrix, and a model that knows."""
+def around_nm(budget: Budget, store: Store, sweep: Sweep) -> Mapping[float, Array]:
+    """Return three errors by value of a sweep.
+
+    That of the measured matrix, of a model that knows, and what the slopes show of the first.
+    """
     found = {}
     for value in sorted(sweep.at(budget)):
-        away, known = (
-            wavefront_error_nm(store.read(run)) ** 2 for run in around_runs(budget, sweep, value)
-        )
-        found[value] = (away, known)
+        away, known = (store.read(run) for run in around_runs(budget, sweep, value))
+        errors = [wavefront_error_nm(record) for record in (away, known)]
+        found[value] = np.array([*errors, wavefront_error_nm(away, over=Over.SLOPES)])
     return found
 
 
@@ -148,28 +151,21 @@ def optimum(values: Array, cost: Array) -> float | None:
 
 
 def _optimum_table(budget: Budget, store: Store) -> str:
-    head = ["parameter", "best by wavefront error", "best by what registration costs"]
-    head += ["cost at the ends [nm]"]
+    head = ["parameter", "best by wavefront error", "best by the slopes", "half-width of the sweep"]
     rows, good = [], True
     for sweep in AROUND:
-        found = cost_nm2(budget, store, sweep)
+        found = around_nm(budget, store, sweep)
         values = np.array(list(found))
-        away, known = np.array(list(found.values())).T
-        best = optimum(values, away - known)
+        away, _, shown = np.array(list(found.values())).T ** 2
+        best = optimum(values, shown)
         good &= best is not None and abs(best) < _COARSE * values.max()
-        ends = (np.sqrt(max(float(d), 0.0)) for d in (away - known)[[0, -1]])
-        rows.append(
-            [
-                f"{sweep.symbol} [{sweep.unit}]",
-                _shown(optimum(values, away)),
-                _shown(best),
-                " / ".join(f"{value:.0f}" for value in ends),
-            ]
-        )
-    text = "Best by what registration costs, every parameter lies " + (
-        "near what the fit found, within a quarter of the sweep's half-width."
+        name = f"{sweep.symbol} [{sweep.unit}]"
+        rows.append([name, _shown(optimum(values, away)), _shown(best), f"{values.max():g}"])
+    text = (
+        "By the slopes every parameter is best where the fit found it, within a quarter of the "
+        "sweep's half-width: a parabola through all of its points has its minimum there."
         if good
-        else "near what the fit found for some only: the others are flat or lopsided here."
+        else "By the slopes only some parameters are best where the fit found them."
     )
     return page.table(head, rows) + page.remark(text, agrees=good)
 
@@ -182,10 +178,11 @@ def _figure(budget: Budget, store: Store) -> Figure:
     figure = page.canvas(10.5, 3.2)
     panels = figure.subplots(1, len(AROUND), sharey=True)
     for axes, sweep in zip(panels, AROUND, strict=True):
-        found = cost_nm2(budget, store, sweep)
-        away, known = np.sqrt(np.array(list(found.values())).T)
+        found = around_nm(budget, store, sweep)
+        away, known, shown = np.array(list(found.values())).T
         axes.plot(list(found), away, "o-", color="#b3261e", label="measured matrix")
         axes.plot(list(found), known, ".--", color="0.5", label="a model that knows")
+        axes.plot(list(found), shown, "s:", color="#0757ae", label="measured, by its slopes")
         axes.axvline(0.0, color="0.8", linewidth=0.8)
         axes.set_xlabel(f"{sweep.symbol} less found [{sweep.unit}]")
         axes.grid(alpha=0.3)

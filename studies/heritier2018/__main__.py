@@ -19,7 +19,7 @@ def main() -> int:
         description="Heritier et al. 2018 on the simulated telescope: one HTML report. Results of "
         "every step are kept in the output folder; an interrupted run goes on where it was.",
     )
-    parser.add_argument("--quick", action="store_true", help="a rehearsal of about three minutes")
+    parser.add_argument("--quick", action="store_true", help="a rehearsal of about four minutes")
     parser.add_argument("--output", type=Path, default=Path("var/paper"), metavar="FOLDER")
     parser.add_argument(
         "--workers", type=int, default=2, metavar="N", help="processes (default: 2)"

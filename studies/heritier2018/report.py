@@ -174,7 +174,7 @@ def _conditions(budget: Budget, seconds: float) -> page.Section:
     parts = [task for task in tasks if isinstance(task, MeasuredPart)]
     measured = {(part.occasion, part.n_average) for part in parts}
     rows = [
-        ["influence of misregistrations", str(len(night)), f"{_frames(night):,}"],
+        ["loops by night", str(len(night)), f"{_frames(night):,}"],
         ["closed loops by day", str(len(day)), f"{_frames(day):,}"],
         ["measured matrices", str(len(measured)), f"{sum(part.n_frames for part in parts):,}"],
     ]

@@ -121,6 +121,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
 
 
 def _complaint(endpoint: Endpoint, text: str) -> str:
+    text = text.partition("!  at ")[0]  # where in zenoh's own source that was
     if endpoint.connect:
         return f"no zenoh router answers at {', '.join(endpoint.connect)}: {text:.160}"
     where = ", ".join(endpoint.listen)

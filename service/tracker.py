@@ -188,6 +188,7 @@ REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
     ev.DitherSilent: dither.on_silence,
     ev.DitherMeasured: _on_dither_measured,
     ev.Compared: probation.on_compared,
+    ev.LoopHeld: rtc.hear_loop,
     ev.Vibrations: rtc.hear_vibrations,
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,

@@ -265,6 +265,9 @@ def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Eve
         found.append(ev.Vibrations(lines_hz=lines))
     for name, trouble, over in troubles(streams):
         found += ev.Trouble.news(state, name, trouble, over, streams.heard_ns_utc)
+    holds = streams.rejection.holds
+    if holds is not None and holds is not state.loop_holds:
+        found.append(ev.LoopHeld(holds=holds))
     judged, trial = streams.comparison.found, state.probation
     if judged is not None and trial is not None and trial.awaits(judged.before, judged.after):
         found.append(ev.Compared(finding=judged))

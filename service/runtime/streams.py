@@ -26,6 +26,7 @@ from service.telemetry.passive import Passive
 from service.telemetry.played import Finding, Meter, asked_anew, measured
 from service.telemetry.probation import Comparison
 from service.telemetry.random_dither import Correlated, RandomDither
+from service.telemetry.rejection import Rejection
 from service.telemetry.standstill import Standstill
 from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
@@ -118,6 +119,7 @@ class Streams:
     """What the last verdicts on the loop's law found to be otherwise than told, without a break."""
 
     standstill: Standstill = field(default_factory=Standstill)
+    rejection: Rejection = field(default_factory=Rejection)
     comparison: Comparison = field(default_factory=Comparison)
     """Of telemetry with the matrix in use and with the one before."""
 
@@ -345,7 +347,11 @@ def _holding(
         comparison = probation.observe(
             comparison, block, streams.in_loop, lines, streams.edge_watch, matrix
         )
-    return replace(streams, health=health, edge=edge, comparison=comparison)
+    rejection = Rejection()
+    if streams.rtc is not None and len(streams.in_loop):
+        gains = np.array(streams.rtc.gains)[streams.in_loop]
+        rejection = streams.rejection.follow(block, streams.in_loop, gains, streams.rtc.leak)
+    return replace(streams, health=health, edge=edge, comparison=comparison, rejection=rejection)
 
 
 def _standing(streams: Streams, rtc: Status, block: FrameBlock) -> Streams:

@@ -87,6 +87,7 @@ def acquire(turn: Turn) -> None:
         if turn.state.windows_accepted > turn.before.windows_accepted:
             stages.go_on(turn, replace(acquisition, misses=0))
         _forget_when_over(turn)
+        stages.tell_of_misses(turn)
         why = stages.why_needed(turn.state, turn.policy, turn.now_ns)
         if why is not None and turn.rtc and ramping(turn.state, turn.now_ns) is None:
             _begin(turn, turn.rtc, why, commanded=False)

@@ -19,7 +19,7 @@ from service.telemetry.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
-from service.tracking.alarms import ACQUISITION, Act, forbidding, forbids
+from service.tracking.alarms import ACQUISITION, NOT_FOUND, Act, forbidding, forbids
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
 from service.tracking.operator import set_loop
@@ -178,10 +178,28 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         lasted_ns = now_ns - alarm.since_ns_utc
         if forbids(alarm, Act.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
-    known = state.registration is not None and state.registration.usable
-    if acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE):
+    if _missed_enough(state) and not state.loop_holds:
         return f"{acquisition.misses} windows in a row found no registration"
     return None
+
+
+def _missed_enough(state: TrackerState) -> bool:
+    known = state.registration is not None and state.registration.usable
+    return state.acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE)
+
+
+def tell_of_misses(turn: Turn) -> None:
+    """Say that no registration is found in a loop that holds well: it is not opened for that."""
+    if turn.state.loop_holds and _missed_enough(turn.state):
+        text = (
+            f"{turn.acquisition.misses} windows in a row found no registration, though the loop "
+            "holds well: modes or slopes are probably in another order, or of another sign, than "
+            "the instrument file tells; compare both with it, or measure an interaction matrix; "
+            "the loop is left closed (acquire opens it to look from afar)"
+        )
+        turn.alarm(NOT_FOUND, text)
+    elif not turn.acquisition.misses:
+        turn.calm(NOT_FOUND)
 
 
 def count_miss(turn: Turn, kind: RefusalKind) -> None:

@@ -58,6 +58,7 @@ WORKER_LOST = "worker-lost"
 WORKER_BEHIND = "worker-behind"
 LOOP_OPENED = "loop-opened"
 SLOPES_STAND = "slopes-stand"
+NOT_FOUND = "registration-not-found"
 
 
 class Act(StrEnum):

@@ -331,6 +331,13 @@ class Compared:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LoopHeld:
+    """Telemetry says that the loop holds well, or that it does so no longer."""
+
+    holds: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Vibrations:
     """The vibration lines in the slopes are others than before."""
 
@@ -377,6 +384,7 @@ Event = (
     | DitherSilent
     | DitherMeasured
     | Compared
+    | LoopHeld
     | Vibrations
     | MatrixMeasured
     | JobFailed

@@ -94,6 +94,11 @@ def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
         turn.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
 
 
+def hear_loop(turn: Turn, event: ev.LoopHeld) -> None:
+    """Note whether the loop holds well."""
+    turn.state = replace(turn.state, loop_holds=event.holds)
+
+
 def _tell_of_gains(turn: Turn, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
@@ -125,7 +130,7 @@ def on_new_session(turn: Turn, started: ev.SessionStarted) -> None:
     end_ramp(turn)
     validity.unconfirm(turn)
     turn.retry_all()
-    turn.state = replace(turn.state, rtc=None)
+    turn.state = replace(turn.state, rtc=None, loop_holds=False)
     dither.found_again(turn)
     turn.calm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(turn)

@@ -314,6 +314,9 @@ class TrackerState:
     vibrations_hz: tuple[float, ...] = ()
     """Vibration lines in the slopes, lowest first."""
 
+    loop_holds: bool = False
+    """Whether telemetry says that the loop leaves little of what it follows."""
+
     acquisition: Acquisition = field(default_factory=Acquisition)
     """Finding α from nothing: under way, or how the last one ended."""
 

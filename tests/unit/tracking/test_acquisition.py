@@ -225,6 +225,25 @@ class TestByItself:
         story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
         assert story.stage is AcquisitionStage.OPENING
 
+    def test_a_loop_that_holds_well_is_not_opened_for_them(self):
+        story = Acquiring()
+        story.tell(ev.LoopHeld(holds=True))
+        for _ in range(2 * MISSES_DESPITE):
+            story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
+        assert story.asked(LoopRequest) == []
+        (told,) = (a.text for a in story.state.alarms if a.name == "registration-not-found")
+        assert "another order" in told
+        story.see()
+        assert "registration-not-found" not in story.alarms
+
+    def test_one_that_holds_no_longer_is(self):
+        story = Acquiring()
+        story.tell(ev.LoopHeld(holds=True))
+        for _ in range(MISSES_BEFORE):
+            story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
+        story.tell(ev.LoopHeld(holds=False))
+        assert story.stage is AcquisitionStage.OPENING
+
     def test_with_alpha_known_bad_windows_must_go_on_for_longer(self):
         story = Acquiring()
         story.see(n_windows=3)

@@ -23,7 +23,7 @@ help:
 
 setup: $(STAMP) $(MANUAL) ## install pyrcal and its tools into .venv, build the manual
 
-demo: $(STAMP) $(MANUAL) ## service and simulated RTC together; ARGS="--seconds 60" and the like
+demo: $(STAMP) $(MANUAL) ## service and simulated RTC together; ARGS="--seconds 120" and the like
 	@.venv/bin/pyrcal demo $(ARGS)
 
 docs: $(MANUAL) ## build the manual, which the service shows at /manual/

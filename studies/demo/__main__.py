@@ -1,4 +1,4 @@
-"""Run: ``pyrcal demo --seconds 60``; ``pyrcal demo --help`` says what else there is."""
+"""Run: ``pyrcal demo --seconds 120``; ``pyrcal demo --help`` says what else there is."""
 
 from __future__ import annotations
 

@@ -66,16 +66,21 @@ export function drawMarks(u, marks, named) {
   ctx.fillStyle = colour("text");
   ctx.textAlign = "center";
   ctx.font = `${11 * devicePixelRatio}px system-ui`;
+  ctx.setLineDash([2 * devicePixelRatio, 3 * devicePixelRatio]);
   const taken = {}; // shapes of a kind that would lie on one another are drawn once, a jump never lost behind a swap
+  const lines = {}; // so are lines: a hundred alarms must not hide what is drawn behind them
   for (const mark of marks.filter((one) => MARKS.has(one.kind))) {
     const x = u.valToPos(mark.t, "x", true);
     if (x < bbox.left || x > bbox.left + bbox.width) continue;
-    ctx.globalAlpha = 0.45;
-    ctx.beginPath();
-    ctx.moveTo(x, bbox.top);
-    ctx.lineTo(x, bbox.top + bbox.height);
-    ctx.stroke();
-    ctx.globalAlpha = 1;
+    if (x - (lines[mark.kind] ?? -Infinity) > 4 * devicePixelRatio) {
+      lines[mark.kind] = x;
+      ctx.globalAlpha = mark.kind === "alarm" ? 0.25 : 0.5;
+      ctx.beginPath();
+      ctx.moveTo(x, bbox.top);
+      ctx.lineTo(x, bbox.top + bbox.height);
+      ctx.stroke();
+      ctx.globalAlpha = 1;
+    }
     if (!named || x - (taken[mark.kind] ?? -Infinity) < 12 * devicePixelRatio) continue;
     const row = Object.entries(taken).filter(([kind, at]) => kind !== mark.kind && Math.abs(x - at) < 12 * devicePixelRatio).length;
     taken[mark.kind] = x;

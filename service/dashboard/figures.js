@@ -1,8 +1,9 @@
 // Small figures: a few lines over one axis, and a grid of numbers as colours.
 
 /* global uPlot */
+import { decimals, ticks } from "./axes.js";
 import { colour } from "./scheme.js";
-import { make } from "./words.js";
+import { fixed, make } from "./words.js";
 
 const STROKES = ["accent", "tolerance", "quiet", "text"];
 
@@ -18,7 +19,8 @@ export class Lines {
     document.addEventListener("scheme", () => this.#chart?.redraw());
   }
 
-  show({ x, lines, log = false, label = "" }) {
+  // least: half of the narrowest range of y, so that what is the same looks the same.
+  show({ x, lines, log = false, label = "", least = 0 }) {
     const data = [x, ...lines.map((line) => line.values)];
     const shape = JSON.stringify([lines.map((line) => [line.name, line.dots]), log]);
     if (shape === this.#shape) return this.#chart.setData(data);
@@ -29,8 +31,11 @@ export class Lines {
       ...this.#place(),
       cursor: { drag: { x: false, y: false } },
       legend: { show: false },
-      scales: { x: { time: false }, y: log ? { distr: 3 } : {} },
-      axes: [{ ...axis, size: 20, space: 60 }, { ...axis, size: 44, space: 24 }],
+      scales: { x: { time: false }, y: log ? { distr: 3 } : least ? { range: (u, low, high) => widened(low, high, least) } : {} },
+      axes: [
+        { ...axis, size: 20, space: 60, splits: (u, of, low, high) => ticks(low, high, Math.max(2, Math.floor(u.width / 60))), values: (u, at) => at.map((x) => fixed(x, decimals(at))) },
+        { ...axis, size: 48, space: 24, ...(!log && { splits: (u, of, low, high) => ticks(low, high, Math.max(2, Math.floor(u.height / 28))), values: (u, at) => at.map((y) => fixed(y, decimals(at))) }) },
+      ],
       series: [{}, ...lines.map(({ dots }, k) => ({
         stroke: dots ? "transparent" : () => colour(STROKES[k]),
         width: 1.5,
@@ -48,6 +53,11 @@ export class Lines {
   #size() {
     if (this.#root.clientWidth) this.#chart?.setSize(this.#place());
   }
+}
+
+function widened(low, high, least) {
+  const [middle, half] = [(low + high) / 2, Math.max((high - low) * 0.55, least)];
+  return Number.isFinite(middle) ? [middle - half, middle + half] : [-least, least];
 }
 
 // What each line is drawn in, in words: colours alone say nothing.

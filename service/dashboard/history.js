@@ -2,6 +2,9 @@
 
 import { behind } from "./axes.js";
 import { Charts } from "./charts.js";
+import { Compare } from "./compare.js";
+import { HISTORY_ORDERS } from "./history_orders.js";
+import { Against, Trends } from "./trends.js";
 import { DASH, SYMBOLS, clock, day, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
 
 const LINES = 500; // of the audit trail that are read at once
@@ -9,6 +12,7 @@ const HOUR_MS = 3_600_000;
 
 export class History {
   #service;
+  #orders;
   #nights = []; // newest first
   #from = 0; // of what is shown, milliseconds
   #to = 0;
@@ -16,10 +20,18 @@ export class History {
   #reading = 0; // number of the newest reading: an older one that comes late is dropped
   #past = null; // what the charts show
 
-  constructor(service, root) {
+  constructor(service, orders, root) {
     this.#service = service;
+    this.#orders = orders;
     this.root = root;
-    this.charts = new Charts(root.querySelector(".charts"), (from, to) => this.#span(1000 * from, 1000 * to));
+    orders.learn(HISTORY_ORDERS);
+    const chosen = (from, to) => this.#span(1000 * from, 1000 * to);
+    this.charts = new Charts(root.querySelector("#past"), chosen);
+    this.trends = new Trends(root.querySelector("#trends .charts"), chosen);
+    this.against = new Against(root.querySelector("#against"));
+    this.compare = new Compare(service, orders, root.querySelector("#compare"));
+    root.querySelector("[name=note]").addEventListener("click", () => orders.open("note", Math.min(this.#to || Infinity, service.now)));
+    document.querySelector("#order").addEventListener("close", () => root.hidden || this.look());
     this.night = root.querySelector("[name=night]");
     this.times = ["from", "to"].map((name) => root.querySelector(`[name=${name}]`));
     this.night.addEventListener("change", () => this.#whole());
@@ -130,8 +142,12 @@ export class History {
     const marks = this.#past.marks.map(({ t_ns_utc: t, kind }) => ({ t: t / 1e9, kind }));
     const time = { marks, from: this.#from / 1000, to: this.#to / 1000 };
     this.charts.show({ entries, samples, interval, ahead: behind(samples), ...time });
-    const last = entries.at(-1);
-    this.charts.tell(last?.filtered, last?.filtered_sigma);
+    this.trends.show({ samples, interval, ...time });
+    this.against.show(samples);
+    const [entry, sample] = [entries.at(-1), samples.findLast((s) => s.alpha && s.telemetry_ns_utc)];
+    // between measurements 1 sigma grows
+    if (sample && sample.telemetry_ns_utc > (entry?.t_ns_utc ?? 0)) this.charts.tell(sample.alpha, sample.sigma);
+    else this.charts.tell(entry?.filtered, entry?.filtered_sigma);
     const night = this.#chosen;
     const what = night ? `${night.n_estimates} measurements that night, ${night.n_swaps} swaps, ${night.n_jumps} jumps, ${night.n_alarms} alarms` : "";
     put(this.root.querySelector(".read"), `${day(this.#from)} ${clock(this.#from)} to ${day(this.#to)} ${clock(this.#to)} UTC; ${what}; beside the charts the last of this time`);
@@ -140,7 +156,8 @@ export class History {
   // --- what lasted
 
   #lives() {
-    const lines = [...usedOf(this.#past.entries), ...lastingOf(this.#past.marks, this.#to)].sort((a, b) => a.from - b.from);
+    const { entries, marks } = this.#past;
+    const lines = [...usedOf(entries), ...lastingOf(marks, this.#to), ...notesOf(marks)].sort((a, b) => a.from - b.from);
     const rows = lines.map((line) => {
       const record = this.#service.reconstructors.find((r) => r.id === line.name);
       const bar = make("div", { className: `life ${line.kind}` });
@@ -150,12 +167,27 @@ export class History {
       const what = record ? `, ${record.n_modes} modes, ${verdict(record.gate)}` : "";
       const title = record ? registrationOf(record.alpha, record.sigma) : line.text;
       return make("tr", {},
-        make("th", { scope: "row", text: `${line.kind === "alarm" ? `${SYMBOLS.alarm} ` : ""}${line.name}${what}`, title }),
+        make("th", { scope: "row", text: `${SYMBOLS[line.kind] ? `${SYMBOLS[line.kind]} ` : ""}${line.name}${what}`, title }),
         make("td", { text: clock(line.from) }), make("td", { text: line.open ? DASH : clock(line.to) }),
-        make("td", { text: span((line.to - line.from) / 1000) }), make("td", { className: "track" }, bar));
+        make("td", { text: line.kind === "note" ? DASH : span((line.to - line.from) / 1000) }), make("td", { className: "track" }, bar),
+        make("td", { className: "acts" }, ...(record ? this.#acts(record) : [])));
     });
-    if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "5", text: "nothing in this time" })));
+    if (!rows.length) rows.push(make("tr", {}, make("td", { colspan: "6", text: "nothing in this time" })));
     this.root.querySelector("#lives tbody").replaceChildren(...rows);
+  }
+
+  // What can be done with a reconstructor of that time.
+  #acts({ id }) {
+    const act = (text, does) => {
+      const button = make("button", { type: "button", text, aria_label: `${text} ${id}` });
+      button.addEventListener("click", does);
+      return button;
+    };
+    const compare = act("Compare", () => {
+      this.compare.choose(id);
+      this.root.querySelector("#compare").scrollIntoView();
+    });
+    return id === this.#service.state?.in_use ? [compare] : [compare, act("Publish again …", () => this.#orders.open("publish", id))];
   }
 
   // --- who ordered what
@@ -212,6 +244,13 @@ function usedOf(entries) {
     }
   }
   return found;
+}
+
+function notesOf(marks) {
+  return marks.filter((mark) => mark.kind === "note").map(({ name, text, t_ns_utc: t }) => {
+    const at = milliseconds(t);
+    return { name: `${name}: ${text}`, text, kind: "note", from: at, to: at };
+  });
 }
 
 // For how long each alarm lasted; one that is not over lasts to the end, unless the service began anew.

@@ -59,6 +59,17 @@ export class Orders {
     return assessment?.id === inUse ? assessment.expected.loss_m : null;
   }
 
+  // Orders of a page of its own: how each is called, what it needs, and what its dialog says.
+  learn(orders) {
+    for (const [name, { title, needs: lacks, busy: waits = false, about, make: made }] of Object.entries(orders)) {
+      TITLES[name] = title;
+      NEEDS[name] = lacks ?? (() => "");
+      if (waits) BUSY.add(name);
+      if (about) DECIDED_ON[name] = about;
+      ORDERS[name] = made;
+    }
+  }
+
   // Why something cannot be ordered now; empty: it can. The service has the last word.
   whyNot(name, value) {
     if (this.#service.forbidden) return this.#service.forbidden;
@@ -97,7 +108,8 @@ export class Orders {
     this.#waits(false);
     put(this.#dialog.querySelector(".refused"), "");
     this.#dialog.showModal();
-    reason.focus(); // never what sends: somebody may be typing already
+    // never what sends: somebody may be typing already
+    (this.#dialog.querySelector(".choices input[type=text]:required") ?? reason).focus();
   }
 
   // Enter in a field is not an order; Ctrl+Enter is, wherever the focus is.
@@ -120,7 +132,7 @@ export class Orders {
 
   // Say what will happen, from what is there now; what is decided on is read for it, with its tag.
   async #look(name, value) {
-    const about = DECIDED_ON[name]?.(this);
+    const about = DECIDED_ON[name]?.(this, value);
     const seen = about && (await this.#service.seen(about));
     this.#order = { ...ORDERS[name](this, value, seen?.body), name, value, tag: seen?.tag };
     this.#key = newKey();
@@ -555,9 +567,13 @@ const ORDERS = {
   record() {
     return {
       title: "Keep telemetry",
-      fields: [{ name: "duration_s", label: "Seconds", needed: true, min: 1, max: 3600, step: "any", value: 60 }],
-      facts: ({ duration_s: seconds }) => [
-        `All that the RTC sends in the next ${number(seconds, 0)} s goes to the archive, byte for byte; what came before is gone.`,
+      fields: [
+        { name: "duration_s", label: "Seconds from now on", needed: true, min: 0, max: 3600, step: "any", value: 60 },
+        { name: "before_s", label: "Seconds before", needed: true, min: 0, max: 3600, step: "any", value: 60 },
+      ],
+      facts: ({ duration_s: seconds = 0, before_s: before = 0 }) => [
+        `All that the RTC sends in the next ${number(seconds, 0)} s goes to the archive, byte for byte.`,
+        before > 0 ? `What came in the last ${number(before, 0)} s is in it too, as far as the service still holds it: a minute, usually.` : "What came before is not in it.",
         "It stays until somebody removes it; it ends before its time where the disk becomes full.",
       ],
       button: "Begin",

@@ -27,7 +27,7 @@ const help = $("#help");
 // The other pages are fetched when they are looked at first.
 const PAGES = {
   measurements: async (root) => new (await import("./measurements.js")).Measurements(service, root),
-  history: async (root) => new (await import("./history.js")).History(service, root),
+  history: async (root) => new (await import("./history.js")).History(service, orders, root),
 };
 const pages = {};
 

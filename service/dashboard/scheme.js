@@ -1,6 +1,7 @@
 // Night or day: what canvases are drawn in, from the style sheet, so that each colour is written once.
 
-const KEPT = "pyrcal.scheme"; // what was chosen here, kept by this browser
+const KEPT = "pyrcal.scheme.chosen"; // kept by this browser
+const LIGHT = globalThis.matchMedia?.("(prefers-color-scheme: light)"); // what the computer is set to
 
 let known = {};
 
@@ -13,11 +14,14 @@ export function scheme() {
   return document.documentElement.dataset.scheme === "day" ? "day" : "night";
 }
 
-// Night unless somebody chose day here: that a computer prefers light is no reason to light a control room.
-export function choose(name = localStorage.getItem(KEPT) ?? "night") {
+// What was chosen here, else what the computer is set to, which may change with the hour.
+export function choose(chosen = localStorage.getItem(KEPT)) {
+  const name = chosen ?? (LIGHT?.matches ? "day" : "night");
+  if (chosen) localStorage.setItem(KEPT, chosen);
   document.documentElement.dataset.scheme = name;
   document.querySelector("meta[name=color-scheme]").content = name === "day" ? "light" : "dark";
-  localStorage.setItem(KEPT, name);
   known = {};
   document.dispatchEvent(new CustomEvent("scheme"));
 }
+
+LIGHT?.addEventListener("change", () => choose());

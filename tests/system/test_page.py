@@ -190,6 +190,53 @@ def test_this_night_is_seen_with_what_was_in_use_and_who_ordered_what(page):
     assert page.faults_of_access() == []
 
 
+def test_a_night_has_trends_and_notes_and_an_older_matrix_goes_out_again(page):
+    page.open()
+    page.turn("history")
+    page.until("document.querySelectorAll('#trends .plot canvas').length === 6", 20.0)
+    page.says("#trends", "seen in the slopes")
+    page.until("/\\d+ samples/.test(document.querySelector('#against .said').innerText)", 30.0)
+    page.click("#nights [name=note]")
+    page.dialog("kept for ever")
+    page.send("dome shutter moved")
+    page.says("#lives", "dome shutter moved")
+    page.says("#trail", "annotation: dome shutter moved")
+    (note,) = page.night.client.get("/v1/annotations").json()["annotations"]
+    assert note["note"] == "dome shutter moved"
+    page.click("#lives .acts button")
+    page.says("#compare .said", "they differ by")
+    used = page.night.state["in_use"]
+    older = next(one for one in page.night.ids("superseded") if one != used)
+    page.driver.find_element("css selector", f"#compare [name=first] [value='{older}']").click()
+    page.says("#compare ul", older)
+    page.click("#compare [name=publish]")
+    page.dialog(f"in place of {used}")
+    page.send("it was the better one")
+    page.says("#answer", f"it is {older} again", 20.0)
+    assert page.night.state["in_use"] not in {used, older}
+    assert page.faults_of_access() == []
+    page.resize(NARROW)
+    assert page.js("document.documentElement.scrollWidth") <= NARROW[0]
+
+
+def test_the_colours_are_what_the_computer_prefers_until_somebody_chooses(page):
+    def prefer(value):
+        scheme = {"name": "prefers-color-scheme", "value": value}
+        page.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
+
+    page.open()
+    prefer("dark")
+    page.until("document.documentElement.dataset.scheme === 'night'")
+    prefer("light")
+    page.until("document.documentElement.dataset.scheme === 'day'")
+    assert page.faults_of_access() == []
+    page.click("#scheme")
+    assert page.js("document.documentElement.dataset.scheme") == "night"
+    page.open()
+    assert page.js("document.documentElement.dataset.scheme") == "night", "it is kept"
+    page.js("localStorage.clear()")
+
+
 def test_a_change_is_seen_within_a_second(page):
     page.open()
     for mode in ("propose", "hold", "propose"):

@@ -1,0 +1,69 @@
+// What is ordered from History: an older reconstructor again, a new one, a note.
+
+import { clock, day, registrationOf, verdict } from "./words.js";
+
+function needed(so, otherwise) {
+  if (!so) throw new Error(otherwise);
+}
+
+export const HISTORY_ORDERS = {
+  publish: {
+    title: "Publish again",
+    busy: true,
+    needs: (orders, state, id) => (!id ? "no reconstructor is chosen" : id === state.in_use ? `${id} is in use` : ""),
+    about: (orders, id) => `v1/reconstructors/${encodeURIComponent(id)}`,
+    make(orders, id, record) {
+      const { inUse, state } = orders;
+      needed(record.id !== state.in_use, `${record.id} is in use`);
+      return {
+        title: `Publish ${record.id} again`,
+        facts: [
+          `${record.id}, ${record.n_modes} modes, goes out again under a new id${inUse ? ` in place of ${inUse.id}, ${inUse.n_modes} modes` : ""}.`,
+          `Made for ${registrationOf(record.alpha, record.sigma)}.`,
+          `When it was judged last: ${verdict(record.gate)}. The gate judges it anew, and it is not sent if it would not hold.`,
+          state.mode === "hold" ? "Mode stays hold." : `Mode becomes hold (it is ${state.mode}), so that the service does not undo it.`,
+        ],
+        button: "Publish again",
+        asked: true,
+        method: "POST",
+        path: `v1/reconstructors/${encodeURIComponent(record.id)}/publish`,
+      };
+    },
+  },
+  refit: {
+    title: "Refit",
+    busy: true,
+    needs: (orders, state) => (state.registration ? "" : "α is not known yet"),
+    make(orders) {
+      const { rtc, registration, mode } = orders.state;
+      return {
+        title: "Refit: a reconstructor for α of now",
+        fields: [{ name: "n_modes", label: "Modes", min: 1, max: rtc.n_modes, placeholder: `as many as now, ${rtc.n_controlled}` }],
+        facts: [
+          `A reconstructor is computed and judged for ${registrationOf(registration.alpha, registration.sigma)}.`,
+          mode === "auto" ? "Mode is auto: it is sent if it passes the gate." : `Mode is ${mode}: it is proposed, and sent when somebody approves it.`,
+        ],
+        button: "Refit",
+        method: "POST",
+        path: "v1/refit",
+      };
+    },
+  },
+  note: {
+    title: "Note",
+    make(orders, at) {
+      return {
+        title: "Note something",
+        fields: [
+          { name: "note", label: "Note", type: "text", maxlength: 2000, needed: true },
+          { name: "at", label: "Of, UTC", type: "text", pattern: "[0-9]{4}-[0-9]{2}-[0-9]{2} [0-9]{2}:[0-9]{2}:[0-9]{2}", value: `${day(at)} ${clock(at)}`, needed: true },
+        ],
+        facts: ["It is kept for ever, in the history of that time and in the audit trail; nobody can change it."],
+        button: "Keep the note",
+        method: "POST",
+        path: "v1/annotations",
+        body: ({ note, at: time }) => ({ note, t_ns_utc: Date.parse(`${time.replace(" ", "T")}Z`) * 1e6 }),
+      };
+    },
+  },
+};

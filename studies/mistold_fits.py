@@ -259,7 +259,11 @@ def page(found: list[dict[str, Any]]) -> str:
         "metre told: a pitch told 5 %",
         "too large, or OOPAO's metre, is a magnification smaller by as much, which no matrix tells "
         "apart; the fit says so where",
-        "the magnification is off by more than 2 %. All σ are of the fit.",
+        "the magnification is off by more than 2 %. All σ are of the fit. SPECULA's user says xy, "
+        "which is yx here, in every fit",
+        "but those with the order told wrong, which is right there. The floor of the magnification "
+        "where slopes are normalised in",
+        "each subaperture (HCIPy) was chosen on these matrices: they are no test of it.",
         "",
         f"**{len(wrong)} mistold: {len(accepted)} accepted, {len(beyond)} of them beyond "
         f"{MOST_SIGMA:g} σ; {len(wrong) - len(accepted)} refused.**",

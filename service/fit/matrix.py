@@ -38,11 +38,16 @@ from service.fit.orientation import (
 from service.fit.reference import Reference, Target, checked, target_of
 from service.fit.remarks import remarks
 from service.fit.solver import nuisances_of
-from service.fit.uncertainty import pupil_regions, uncertainty
+from service.fit.uncertainty import (
+    LOCAL_MAGNIFICATION_FLOOR,
+    MAGNIFICATION_FLOOR,
+    pupil_regions,
+    uncertainty,
+)
 from service.fit.verdict import Evidence, judged
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
-from service.model.kinds import SlopeOrder
+from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Determination, Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination
@@ -361,6 +366,9 @@ def _answer(
         regions,
         shift_subap=float(np.hypot(*solution.vector[:2])),
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
+        magnification_floor=LOCAL_MAGNIFICATION_FLOOR
+        if slopes.normalisation is Normalisation.LOCAL
+        else MAGNIFICATION_FLOOR,
         residual_fraction=residual_fraction,
         doubt=np.array([doubt_of_width(settled), *(rival.moved for rival in others)]),
     )

@@ -25,6 +25,10 @@ subapertures, modulated by 20 points, by 0.05 % and 0.0017 deg."""
 MAGNIFICATION_FLOOR = 1e-4
 """The same of the magnification: of those matrices 3e-5 with modes, 1.2e-4 with actuators."""
 
+LOCAL_MAGNIFICATION_FLOOR = 2.5e-4
+"""The same where each subaperture is divided by its own flux: those at the border then weigh as
+much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small."""
+
 FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
 """1 σ by parameter over the length of the shift in subapertures: far off, a mirror of another kind
 parts from the model at the border. Of 24 telescopes at 0.66 to 1.0 subapertures with it, 23 lie
@@ -95,6 +99,7 @@ def uncertainty(
     *,
     shift_subap: float,
     radius_subap: float,
+    magnification_floor: float,
     residual_fraction: float,
     doubt: Array,
 ) -> Uncertainty:
@@ -115,6 +120,8 @@ def uncertainty(
         Length of the shift at the solution: part of the model's error grows with it.
     radius_subap
         Of the pupil.
+    magnification_floor
+        What no magnification is surer than.
     residual_fraction
         RMS of what is left over RMS of the measurement: so far the mirror may be another.
     """
@@ -133,7 +140,7 @@ def uncertainty(
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = strange * FAR_SHARE * shift_subap
-    floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, MAGNIFICATION_FLOOR])
+    floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
     from_model = np.diag(share**2 + floor**2 + far**2 + OTHER_SHARE * np.sum(doubt**2, axis=0))
     pull = prior * noise * values
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)

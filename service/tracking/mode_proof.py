@@ -14,11 +14,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from service.telemetry.comb import SIDE_OFFSETS_HZ
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither_modes import LINE_RANGE, N_LINES, chosen_modes
+from service.tracking.dither_modes import N_LINES, chosen_modes
 from service.tracking.dither_request import CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import ModeProof
 from service.tracking.policy import SECOND_NS
@@ -37,8 +38,14 @@ LEAST_RESPONSE = 0.1
 SIGNIFICANT = 4.0
 """1 σ of a response by which it must lie on one side of a limit to be told."""
 
-MOST_AT_ONCE = 24
+MOST_AT_ONCE = 100
 """Modes that are shown together: each has a line of its own, and shares the budget."""
+
+FEWER = 4
+"""Divides that number after each dither that has told nothing: fewer modes are stronger."""
+
+BAND = (0.15, 0.45)
+"""Of the frame rate, where the lines are; what wind does to a slow one is little of its size."""
 
 CLOSEST_STEPS = 5
 """Between two lines, in periods of the window: four are needed to tell them apart."""
@@ -108,7 +115,8 @@ def modes_to_show(turn: Turn, rtc: Status, window_s: float) -> tuple[int, ...]:
     if not awaits_proof(turn, rtc):
         return ()
     missing = _missing(turn, rtc)
-    most = min(len(lines_clear(turn, rtc, window_s)), MOST_AT_ONCE, rtc.max_dither_modes)
+    at_once = max(MOST_AT_ONCE // FEWER**state.mode_proof.n_tries, N_LINES)
+    most = min(len(lines_clear(turn, rtc, window_s)), at_once, rtc.max_dither_modes)
     shown = missing[:most]
     spare = [mode for mode in chosen_modes(rtc, turn.policy) if mode not in shown]
     return tuple(sorted([*shown, *spare[: max(min(N_LINES, most) - len(shown), 0)]]))
@@ -116,11 +124,13 @@ def modes_to_show(turn: Turn, rtc: Status, window_s: float) -> tuple[int, ...]:
 
 def lines_clear(turn: Turn, rtc: Status, window_s: float) -> tuple[float, ...]:
     """Return lines for many modes at once: evenly spaced, none on a vibration, lowest first."""
-    step = step_of(rtc, window_s)
-    low, high = (share * rtc.frame_rate_hz for share in LINE_RANGE)
-    spacing = step * max(CLOSEST_STEPS, np.floor((high - low) / MOST_AT_ONCE / step))
+    step, edge_hz = step_of(rtc, window_s), float(SIDE_OFFSETS_HZ.max()) + 1.0
+    low = max(BAND[0] * rtc.frame_rate_hz, edge_hz)
+    high = min(BAND[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
+    # whole hertz apart: what is played is looked at second by second, and lines must not mix there
+    spacing = np.ceil(max(CLOSEST_STEPS * step, (high - low) / MOST_AT_ONCE))
     avoid = (*turn.policy.dither_avoid_hz, *turn.state.vibrations_hz)
-    lines = np.arange(np.ceil(low / step) * step, high, spacing)
+    lines = np.arange(np.ceil(low), high, spacing)
     return tuple(
         float(line) for line in lines if all(abs(line - v) >= CLEARANCES_HZ[-1] for v in avoid)
     )

@@ -10,7 +10,7 @@ from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.mode_limits import ModeProof
-from service.tracking.mode_proof import MOST_AT_ONCE, TRIES, most_modes, proven_modes
+from service.tracking.mode_proof import BAND, TRIES, most_modes, proven_modes
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
@@ -86,10 +86,10 @@ def test_many_are_shown_at_once_each_on_a_line_of_its_own_and_within_the_budget(
     world = Shown().pass_(30.0)
     first = of_kind(world.effects, DitherRequest)
     proving = next(request for request in first if request.id.startswith("dither-prove-"))
-    assert len(proving.modes) == MOST_AT_ONCE
+    assert len(proving.modes) == 50
     lines = np.sort(proving.frequency_hz)
     assert np.diff(lines).min() * WINDOW_S >= 4
-    assert 0.2 * 1000 <= lines[0] < lines[-1] <= 0.35 * 1000
+    assert BAND[0] * 1000 <= lines[0] < lines[-1] <= BAND[1] * 1000
     assert np.sqrt(np.sum(np.square(proving.amplitude_m))) <= POLICY.dither_budget_m * 1.001
 
 
@@ -149,7 +149,7 @@ def test_what_has_been_in_use_can_be_sent_again_whatever_is_proven():
 
 
 def test_dithers_that_show_nothing_are_given_up_for_a_while():
-    world = Shown().pass_(12.0)
+    world = Shown().pass_(6.0)
     quiet = replace(world.state, mode_proof=ModeProof(proven=frozenset(range(400))))
     world.state = quiet
     world.answers_of = dict.fromkeys(range(400, 450), 0.01 + 0.0j)

@@ -138,7 +138,9 @@ def lines_clear(turn: Turn, rtc: Status, window_s: float) -> tuple[float, ...]:
 
 def begin(turn: Turn, modes: tuple[int, ...]) -> None:
     """Note that a dither has been asked for to see these modes."""
-    proof = _missed(turn.state.mode_proof)
+    proof = turn.state.mode_proof
+    if turn.state.alarm(alarms.WORKER_BEHIND) is None:  # which gives windows up: no fault of theirs
+        proof = _missed(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=turn.now_ns)
     turn.state = replace(turn.state, mode_proof=shown)
     turn.log("modes.shown", f"modes {_listed(modes)} are dithered before they are controlled")

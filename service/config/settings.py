@@ -321,8 +321,8 @@ class ArchiveTable(Table):
     last_telemetry_s: float = Field(default=60.0, ge=0.0, le=3600.0)
     """So much of the last telemetry is held in memory, to be kept when somebody asks; 0: none."""
 
-    last_telemetry_mb: int = Field(default=640, ge=1, le=1_000_000)
-    """It takes no more than this, megabytes: a minute of FLAO's at 1 kHz."""
+    last_telemetry_mb: int = Field(default=256, ge=1, le=1_000_000)
+    """It takes no more than this, megabytes: half a minute of FLAO at 1 kHz, which needs 10 a second."""
 
 
 Scalar = bool | float | str

@@ -322,7 +322,7 @@ class ArchiveTable(Table):
     """So much of the last telemetry is held in memory, to be kept when somebody asks; 0: none."""
 
     last_telemetry_mb: int = Field(default=256, ge=1, le=1_000_000)
-    """It takes no more than this, megabytes: half a minute of FLAO at 1 kHz, which needs 10 a second."""
+    """It takes no more than this, megabytes: half a minute of FLAO at 1 kHz."""
 
 
 Scalar = bool | float | str

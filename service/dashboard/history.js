@@ -19,6 +19,7 @@ export class History {
   #lines = []; // of the audit trail, newest first
   #reading = 0; // number of the newest reading: an older one that comes late is dropped
   #past = null; // what the charts show
+  #isWhole = true; // whether a whole night is shown, not a part that somebody chose
 
   constructor(service, orders, root) {
     this.#service = service;
@@ -58,7 +59,8 @@ export class History {
     else if (!this.#nights.some((n) => n.date === chosen)) this.#whole();
     else {
       this.night.value = chosen;
-      this.#read();
+      if (this.#isWhole) this.#whole(); // up to now, which is later than when it was read
+      else this.#read();
     }
   }
 
@@ -96,7 +98,7 @@ export class History {
   }
 
   #span(from, to, narrow = false) {
-    [this.#from, this.#to] = [from, to];
+    [this.#from, this.#to, this.#isWhole] = [from, to, narrow];
     this.#read(narrow);
   }
 

@@ -12,13 +12,20 @@ from service.wire import DitherRequest, Status
 N_LINES = 4
 """Modes that are dithered at once."""
 
+LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
+"""Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
+
 LINE_RANGE = (0.2, 0.35)
 """Of the frame rate, where lines may go to keep clear of vibrations."""
 
 _OPTICAL_GAINS = (0.25, 0.5, 0.75, 1.0)
 """How much of its gain a loop on sky may have: nobody knows which when a dither is planned."""
 
-_FREQUENCIES = np.linspace(*LINE_RANGE, 16)
+PROVING_RANGE = (0.15, 0.45)
+"""The same of the many lines that show how modes answer: what wind does to a slow one is little of
+its size."""
+
+_MANY_LINES = np.linspace(*PROVING_RANGE, 100)
 
 
 def chosen_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
@@ -49,18 +56,19 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
     """Return how much more than was asked for a dither puts on the mirror; 1: on free modes.
 
     The loop sees a dither of its own modes and answers it: at 0.2 to 0.35 of the frame rate with
-    a delay of two frames it adds to it. The most that it makes of any line, on any sky. Without
-    ``chosen`` modes it is of those that are dithered to follow α.
+    a delay of two frames it adds to it. Of all lines together, on whatever sky. Without ``chosen``
+    modes, which many lines show, it is of the four that follow α.
     """
     dithered = chosen or _without_choice(rtc, policy) or ()
     modes = controlled(dithered, rtc)
     if not modes:
         return 1.0
     gains = np.outer([rtc.gains[mode] for mode in modes], _OPTICAL_GAINS).ravel()
+    lines = _MANY_LINES if chosen else np.array(LINE_FRACTIONS)
     found = amplification(
-        gains[:, None], _FREQUENCIES, leak=rtc.leak, delay_frames=max(rtc.delay_frames, 1.0)
+        gains[:, None], lines, leak=rtc.leak, delay_frames=max(rtc.delay_frames, 1.0)
     )
-    return max(float(found.max()), 1.0)
+    return max(float(np.sqrt(np.mean(found**2, axis=-1)).max()), 1.0)
 
 
 def why_elsewhere(request: DitherRequest, rtc: Status, policy: Policy) -> str:

@@ -14,13 +14,10 @@ from service.telemetry.comb import SIDE_OFFSETS_HZ
 from service.telemetry.lockin import LockInPlan
 from service.telemetry.played import Asked
 from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
-from service.tracking.dither_modes import LINE_RANGE, N_LINES, chosen_modes
+from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
-
-LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
-"""Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
 
 CLEARANCES_HZ = (21.0, 8.0)
 """Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond

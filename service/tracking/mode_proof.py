@@ -19,7 +19,7 @@ from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.dither_modes import N_LINES, chosen_modes
+from service.tracking.dither_modes import N_LINES, PROVING_RANGE, chosen_modes
 from service.tracking.dither_request import CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import ModeProof
 from service.tracking.policy import SECOND_NS
@@ -43,9 +43,6 @@ MOST_AT_ONCE = 100
 
 FEWER = 4
 """Divides that number after each dither that has told nothing: fewer modes are stronger."""
-
-BAND = (0.15, 0.45)
-"""Of the frame rate, where the lines are; what wind does to a slow one is little of its size."""
 
 CLOSEST_STEPS = 5
 """Between two lines, in periods of the window: four are needed to tell them apart."""
@@ -125,8 +122,8 @@ def modes_to_show(turn: Turn, rtc: Status, window_s: float) -> tuple[int, ...]:
 def lines_clear(turn: Turn, rtc: Status, window_s: float) -> tuple[float, ...]:
     """Return lines for many modes at once: evenly spaced, none on a vibration, lowest first."""
     step, edge_hz = step_of(rtc, window_s), float(SIDE_OFFSETS_HZ.max()) + 1.0
-    low = max(BAND[0] * rtc.frame_rate_hz, edge_hz)
-    high = min(BAND[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
+    low = max(PROVING_RANGE[0] * rtc.frame_rate_hz, edge_hz)
+    high = min(PROVING_RANGE[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
     # whole hertz apart: what is played is looked at second by second, and lines must not mix there
     spacing = np.ceil(max(CLOSEST_STEPS * step, (high - low) / MOST_AT_ONCE))
     avoid = (*turn.policy.dither_avoid_hz, *turn.state.vibrations_hz)

@@ -79,8 +79,8 @@ def fate(night, content):
         return found if found.status_code != httpx.codes.ACCEPTED else None
 
     found = wait_for(answer, 60.0, "the end of the fit")
-    assert found.status_code == httpx.codes.UNPROCESSABLE_ENTITY, found.text
-    return found.json()["detail"]
+    assert found.json()["state"] == "failed", found.text
+    return found.json()["reason"]
 
 
 def test_an_upload_reaches_no_file_of_the_server_and_claims_no_memory(shared):

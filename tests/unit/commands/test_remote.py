@@ -240,7 +240,8 @@ def test_telemetry_is_kept_and_followed_ended_and_removed(capsys, service):
     ]
     assert main(["end-recording", "tm-1", *who]) == 0
     assert main(["remove-recording", "tm-1", "--yes", *who]) == 0
-    assert kept.told == [(5.0, "Ada", "odd edge"), ("Ada has ended it", "tm-1"), ("tm-1",)]
+    begun = (5.0, "Ada", "odd edge", 0.0)  # nothing of before
+    assert kept.told == [begun, ("Ada has ended it", "tm-1"), ("tm-1",)]
     assert capsys.readouterr().out.splitlines() == ["tm-1 has ended: 0 MB", "tm-1 is removed"]
 
 

@@ -70,7 +70,7 @@ def test_where_none_is_free_the_dither_is_weaker_by_what_the_loop_makes_of_it():
     request = night.requests[-1]
     assert set(request.modes) <= set(night.view.in_loop)
     assert 0.6 * BUDGET_M < total_m(request) < BUDGET_M
-    assert on_the_mirror_m(request, night.view) <= BUDGET_M
+    assert on_the_mirror_m(request, night.view) <= BUDGET_M * (1.0 + 1e-9)
     assert OVER_BUDGET not in night.logged
     assert not night.alarms
 

@@ -9,8 +9,9 @@ from service.errors import CommandError
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.dither_modes import PROVING_RANGE
 from service.tracking.mode_limits import ModeProof
-from service.tracking.mode_proof import BAND, TRIES, most_modes, proven_modes
+from service.tracking.mode_proof import TRIES, most_modes, proven_modes
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
@@ -89,7 +90,7 @@ def test_many_are_shown_at_once_each_on_a_line_of_its_own_and_within_the_budget(
     assert len(proving.modes) == 50
     lines = np.sort(proving.frequency_hz)
     assert np.diff(lines).min() * WINDOW_S >= 4
-    assert BAND[0] * 1000 <= lines[0] < lines[-1] <= BAND[1] * 1000
+    assert PROVING_RANGE[0] * 1000 <= lines[0] < lines[-1] <= PROVING_RANGE[1] * 1000
     assert np.sqrt(np.sum(np.square(proving.amplitude_m))) <= POLICY.dither_budget_m * 1.001
 
 

@@ -29,6 +29,10 @@ SETTLING_S = 0.3
 SPARE_S = 0.3
 """Of dither behind the last window, for one that begins late because frames were lost."""
 
+PROVING_SPARE_S = 0.9
+"""The same where one window is all there is: frames may wait for half a second, and a status that
+shows the end of the dither before they are looked at would cost it."""
+
 OWN_DITHER = "dither-"
 PROVING_DITHER = "dither-prove-"
 ASKED_DITHER = "operator-"
@@ -128,7 +132,8 @@ def plan_dither(
     if lines is None:
         lines = clear_lines(rtc, len(chosen), choice)
     amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
-    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + SPARE_S
+    spare_s = PROVING_SPARE_S if proving else SPARE_S
+    lasting_s = SETTLING_S + choice.n_windows * choice.window_s + spare_s
     step_hz = step_of(rtc, choice.window_s)
     begins = ASKED_DITHER if asked else PROVING_DITHER if proving else OWN_DITHER
     request = DitherRequest(

@@ -19,6 +19,9 @@ export class Service extends EventTarget {
   constructor() {
     super();
     document.addEventListener("visibilitychange", () => this.#seen());
+    // a page that is left may be kept for going back, and with it one of the six connections of a browser
+    window.addEventListener("pagehide", () => this.#rest());
+    window.addEventListener("pageshow", (event) => event.persisted && this.start());
     setInterval(() => this.#watch(), 500);
   }
 
@@ -156,14 +159,16 @@ export class Service extends EventTarget {
   #seen() {
     clearTimeout(this.#hiding);
     if (document.hidden) {
-      this.#hiding = setTimeout(() => {
-        this.#source?.close();
-        this.#source = null;
-        this.connected = false;
-      }, HIDDEN_MS);
+      this.#hiding = setTimeout(() => this.#rest(), HIDDEN_MS);
     } else if (!this.#source) {
       this.start();
     }
+  }
+
+  #rest() {
+    this.#source?.close();
+    this.#source = null;
+    this.connected = false;
   }
 
   #tell(name, detail) {

@@ -59,15 +59,15 @@ _NAMED = 8
 def proven_modes(state: TrackerState) -> frozenset[int]:
     """Return the modes that are known to answer as the instrument file says.
 
-    Those of the matrix in use are: the RTC's own tells them, and of the service's only proven ones
-    are controlled.
+    Those of the matrix in use are, whatever a dither says of one: the RTC's own tells them, of the
+    service's only proven ones are controlled, and the loop runs with them.
     """
     proof = state.mode_proof
     in_use = None if state.in_use is None else state.reconstructor(state.in_use)
     controlled = frozenset(range(0 if in_use is None else in_use.n_modes))
     if in_use is not None and in_use.parent is None:
         controlled -= proof.strange
-    return (proof.proven | controlled) - proof.contrary
+    return proof.proven | controlled
 
 
 def most_modes(state: TrackerState, n_modes: int) -> int:
@@ -204,13 +204,10 @@ def _told(
 
 def _tell(turn: Turn, rtc: Status, answers: dict[int, float]) -> None:
     """Say which modes answer otherwise, and control none of them for a while."""
-    contrary = turn.state.mode_proof.contrary
-    if not contrary:
-        turn.calm(alarms.MODES_CONTRARY)
-        return
-    n_modes = max(rtc.n_controlled, _target(turn, rtc))
-    in_the_way = sorted(mode for mode in contrary if mode < n_modes)
+    contrary = turn.state.mode_proof.contrary - proven_modes(turn.state)
+    in_the_way = sorted(mode for mode in contrary if mode < _target(turn, rtc))
     if not in_the_way:
+        turn.calm(alarms.MODES_CONTRARY)
         return
     seen = ", ".join(f"{answers[mode]:+.2f}" for mode in in_the_way[:_NAMED] if mode in answers)
     text = (

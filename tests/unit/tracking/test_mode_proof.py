@@ -200,3 +200,21 @@ def test_one_window_that_says_otherwise_accuses_nobody():
         assert not world.state.mode_proof.contrary
         assert (410 in proven_modes(world.state)) is (gain > 0.0)
     assert world.alarms == set()
+
+
+def test_a_mode_that_the_loop_runs_with_is_not_accused_by_its_dither():
+    """The matrix in use is the better witness, and α is followed on."""
+    world = Shown({410: 0.6}).pass_(60.0)
+    assert world.state.rtc.n_controlled == 450
+    for _ in range(3):
+        gains = np.array([0.6, 0.6, 0.6, -0.6], dtype=complex)
+        seen = estimate(
+            t_ns=world.now_ns,
+            session=f"s{world.session}",
+            modes=(446, 447, 448, 449),
+            optical_gain=gains,
+            gain_sigma=np.full(4, 0.02),
+        )
+        world.tell(ev.WindowFitted(estimate=seen))
+    assert most_modes(world.state, 450) == 450
+    assert alarms.MODES_CONTRARY not in world.alarms

@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.fit.dialect import LARGEST_CONDITION
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
 Array = NDArray[Any]
-
-LARGEST_CONDITION = 100.0
-"""Of a reconstructor that is inverted: beyond it noise is all that would come out."""
 
 RECOGNISED = 0.5
 """Least correlation of a column with a mode for which it may be taken."""

@@ -120,10 +120,8 @@ def _to_show(turn: Turn, rtc: Status, modes: tuple[int, ...], window_s: float) -
     """Return the dither that shows how modes answer, before a matrix controls them."""
     lines = mode_proof.lines_clear(turn, rtc, window_s)
     spread = np.linspace(0, len(lines) - 1, len(modes)).round().astype(int)
-    policy = turn.policy
-    quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy, modes)
     choice = replace(
-        _choice(turn, min(budget_m(rtc, policy), quiet_m), window_s, window_s),
+        _choice(turn, quiet_budget_m(rtc, turn.policy, modes), window_s, window_s),
         modes=modes,
         lines_hz=tuple(lines[k] for k in spread),
     )
@@ -182,9 +180,12 @@ def budget_m(rtc: Status, policy: Policy) -> float:
     return float(min(policy.dither_budget_m, largest * np.sqrt(max(n, 1))))
 
 
-def quiet_budget_m(rtc: Status, policy: Policy) -> float:
-    """Return the same of what is asked for: the loop amplifies a dither of its own modes."""
-    quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy)
+def quiet_budget_m(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) -> float:
+    """Return the same of what is asked for: the loop amplifies a dither of its own modes.
+
+    Without ``chosen`` modes it is of those that are dithered to follow α.
+    """
+    quiet_m = policy.dither_budget_m / expected_amplification(rtc, policy, chosen)
     return float(min(budget_m(rtc, policy), quiet_m))
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
-from service.files.figures import PAPER_MODES, as_maps, check_plots
+from service.files.figures import PAPER_MODES, check_plots
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
-from service.model.slopes import to_conventions
+from service.model.slopes import as_maps, to_conventions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ from service.archive.records import from_json, to_json
 from service.archive.store import DAMAGE, Provenance, Store
 from service.control.gains import gain_table
 from service.errors import ArchiveError, StorageError
-from service.files.report import put_covariance
+from service.files.container import put_covariance
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.products import (
     MatrixState,

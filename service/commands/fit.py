@@ -17,8 +17,9 @@ from service.files.light import Light, read_light
 from service.files.report import document, fill_fit, table
 from service.files.run import fit_file
 from service.fit.light_rotation import Arms
-from service.fit.matrix import FitOptions, Method
+from service.fit.matrix import FitOptions
 from service.model.instrument import Instrument
+from service.model.kinds import Method
 
 ACCEPTED, REFUSED = 0, 1
 

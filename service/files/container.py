@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.files import FileKind, kind_of
+from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
 
 MOST_BYTES = 4 << 30
 """Largest array that is read: a cube of 400 full frames of 512 x 512 is a tenth of it."""
@@ -446,3 +447,19 @@ def _double_pass(container: Container) -> bool | None:
 
 def _numbers(stored: StoredArray | None) -> Array | None:
     return None if stored is None else stored.numbers()
+
+
+# --- what pyrcal writes
+
+
+def put_covariance(file: h5py.File, covariance: NDArray[np.float64]) -> None:
+    """Write the covariance ``(4, 4)`` of a registration in boundary units."""
+    description = "(4, 4) of the parameters, in the units of their names"
+    put_array(file, "covariance", covariance * COVARIANCE_SCALE, description)
+    file["covariance"].attrs["parameters"] = PARAMETERS
+
+
+def put_array(file: h5py.File, name: str, values: NDArray[Any], description: str) -> None:
+    """Write an array with a sentence that says what it holds."""
+    file[name] = values
+    file[name].attrs["description"] = description

@@ -22,6 +22,7 @@ from service.fit.methods import ScanStep
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration, rotation
+from service.model.slopes import as_maps, side_by_side
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -287,19 +288,6 @@ def shown_modes(fit: Fit) -> NDArray[np.intp]:
     """Return which columns of the fit are shown: the paper's modes, as far as they were used."""
     found = np.flatnonzero(np.isin(fit.modes + 1, PAPER_MODES))
     return found if len(found) else np.arange(min(len(fit.modes), MAPS))
-
-
-def as_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> Array:
-    """Return signals ``(n_slopes,)`` as one map, NaN where none is valid: see ``side_by_side``."""
-    planes = slopes.reshape(-1, int(valid.sum()))
-    maps = np.full((len(planes), *valid.shape), np.nan)
-    maps[:, valid] = planes
-    return side_by_side(maps)
-
-
-def side_by_side(maps: Array) -> Array:
-    """Return Sx beside Sy ``(n, 2 n)``, or four images as they lie ``(2 n, 2 n)``."""
-    return np.vstack([np.hstack(list(maps[k : k + 2])) for k in range(0, len(maps), 2)])
 
 
 def _of_mode(fit: Fit, column: int) -> tuple[Array, Array, float]:

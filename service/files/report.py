@@ -17,10 +17,11 @@ from service import __version__
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError, shown
+from service.files.container import put_array, put_covariance
 from service.fit.instrument_checks import FITTED_KEYS, NOTABLE, NOTABLE_SIGMA
-from service.fit.matrix import Fit, Method
+from service.fit.matrix import Fit
 from service.fit.methods import ScanStep
-from service.model.kinds import SlopeOrder
+from service.model.kinds import Method, SlopeOrder
 from service.model.misregistration import (
     BOUNDARY_SCALE,
     COVARIANCE_SCALE,
@@ -251,7 +252,7 @@ def fill_fit(file: h5py.File, report: FitReport) -> None:
     arrays["subset_scatter"] = fit.subset_scatter * BOUNDARY_SCALE
     for name, values in arrays.items():
         if values is not None:
-            _put(file, name, values, _DESCRIPTIONS[name])
+            put_array(file, name, values, _DESCRIPTIONS[name])
     for step, scan in enumerate(fit.paper_table or ()):
         group = file.create_group(f"paper_table/{step:02d}")
         group.attrs.update(parameter=scan.parameter, step=scan.step, minimum=scan.minimum)
@@ -449,7 +450,7 @@ def fill_reconstructor(
         ("reconstructor", provenance.inversion.matrix, "(n_modes, n_slopes), metres OPD per slope"),
         ("interaction_matrix", interaction_matrix, "(n_slopes, n_modes), slope per metre OPD"),
     ):
-        _put(file, name, np.ascontiguousarray(values, dtype="<f4"), f"{shape}, {described}")
+        put_array(file, name, np.ascontiguousarray(values, dtype="<f4"), f"{shape}, {described}")
     if provenance.fit.covariance is not None:
         put_covariance(file, provenance.fit.covariance)
     if provenance.gains is not None:
@@ -457,18 +458,6 @@ def fill_reconstructor(
         file["calibration_gains"] = provenance.gains.values[:n_modes]
         file["calibration_gains"].attrs["measured"] = provenance.gains.measured[:n_modes]
     file.attrs.update({**circumstances, **provenance.attributes(), **_made_now()})
-
-
-def put_covariance(file: h5py.File, covariance: NDArray[np.float64]) -> None:
-    """Write the covariance ``(4, 4)`` of a registration in boundary units."""
-    description = "(4, 4) of the parameters, in the units of their names"
-    _put(file, "covariance", covariance * COVARIANCE_SCALE, description)
-    file["covariance"].attrs["parameters"] = PARAMETERS
-
-
-def _put(file: h5py.File, name: str, values: NDArray[Any], description: str) -> None:
-    file[name] = values
-    file[name].attrs["description"] = description
 
 
 def _made_now() -> dict[str, str]:

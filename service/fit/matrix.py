@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -47,7 +46,7 @@ from service.fit.uncertainty import (
 from service.fit.verdict import Evidence, judged
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
-from service.model.kinds import Normalisation, SlopeOrder
+from service.model.kinds import Method, Normalisation, SlopeOrder
 from service.model.misregistration import Determination, Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination
@@ -56,19 +55,6 @@ from service.model.slopes import Orientation, SlopeRecipe
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-
-
-class Method(StrEnum):
-    """How the registration is found."""
-
-    JOINT = "joint"
-    """All four parameters together, by variable projection over a free gain per mode."""
-
-    PAPER = "paper"
-    """One parameter at a time, with parabolas through scans (Heritier et al. 2018, section 4)."""
-
-    SENSITIVITY = "sensitivity"
-    """Projection on sensitivity matrices about the start, iterated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -102,3 +102,16 @@ class Normalisation(StrEnum):
 
     LOCAL = "local"
     """Each subaperture's own flux."""
+
+
+class Method(StrEnum):
+    """How the registration is found."""
+
+    JOINT = "joint"
+    """All four parameters together, by variable projection over a free gain per mode."""
+
+    PAPER = "paper"
+    """One parameter at a time, with parabolas through scans (Heritier et al. 2018, section 4)."""
+
+    SENSITIVITY = "sensitivity"
+    """Projection on sensitivity matrices about the start, iterated."""

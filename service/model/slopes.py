@@ -218,6 +218,19 @@ def signals_of_slopes(slopes: NDArray[Any], kind: SignalKind) -> NDArray[Any]:
     return np.tensordot(part, slopes, axes=1).reshape(-1, *slopes.shape[2:])
 
 
+def as_maps(slopes: NDArray[np.floating], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return signals ``(n_slopes,)`` as one map, NaN where none is valid: see ``side_by_side``."""
+    planes = slopes.reshape(-1, int(valid.sum()))
+    maps = np.full((len(planes), *valid.shape), np.nan)
+    maps[:, valid] = planes
+    return side_by_side(maps)
+
+
+def side_by_side(maps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return Sx beside Sy ``(n, 2 n)``, or four images as they lie ``(2 n, 2 n)``."""
+    return np.vstack([np.hstack(list(maps[k : k + 2])) for k in range(0, len(maps), 2)])
+
+
 def _places(order: SlopeOrder, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return where the signals of every valid subaperture stand in the list.
 

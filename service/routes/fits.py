@@ -16,7 +16,8 @@ from starlette.requests import ClientDisconnect
 from service.errors import MatrixError
 from service.files import parse_alpha, parse_modes
 from service.files.uploads import FitAsked, FitJob, FitState
-from service.fit.matrix import FitOptions, Method
+from service.fit.matrix import FitOptions
+from service.model.kinds import Method
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
 from service.routes.views import (
     SCHEMAS,

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from service.errors import CommandError, UnknownIdError
-from service.files.figures import as_maps
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures
-from service.model.slopes import slopes_of, to_conventions, turned_mask
+from service.model.slopes import as_maps, slopes_of, to_conventions, turned_mask
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
 from service.routes.unchanged import not_modified, tag_of
 from service.routes.views import ServiceDep, answer, shows, view

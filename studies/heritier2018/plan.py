@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from service.fit.matrix import Method
+from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from studies.heritier2018.calibration import Answer, Measurement
 from studies.heritier2018.closing import GainTuning

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
-from service.fit.matrix import Fit, FitOptions, Method, fit_matrix
+from service.fit.matrix import Fit, FitOptions, fit_matrix
+from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation
 from studies.heritier2018 import telescope

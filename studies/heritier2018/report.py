@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import service
-from service.fit.matrix import Method
+from service.model.kinds import Method
 from service.model.misregistration import PARAMETERS
 from studies.heritier2018 import (
     closed,

@@ -13,7 +13,7 @@ from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
 from service.files.figures import numbers
 from service.files.report import document
 from service.files.uploads import FitJob, FitState
-from service.fit.matrix import Method
+from service.model.kinds import Method
 from tests.unit.files.made import a_fit, a_report
 from tests.unit.test_api import assert_problem
 

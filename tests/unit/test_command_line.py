@@ -15,7 +15,7 @@ from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import InversionMethod as MakeMethod
 from service.fit.matrix import FitOptions
-from service.fit.matrix import Method as FitMethod
+from service.model.kinds import Method as FitMethod
 from service.tracking.state import Mode
 from service.wire import CHUNK_LIMIT
 

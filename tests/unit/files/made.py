@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from service.files.report import FitReport
-from service.fit.matrix import Fit, Method
+from service.fit.matrix import Fit
 from service.fit.methods import ScanStep
-from service.model.kinds import SlopeOrder
+from service.model.kinds import Method, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation
 

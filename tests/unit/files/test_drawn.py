@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from service.files import figures
+from service.model.slopes import as_maps
 from tests.unit.files.made import GAINS, SYNTHETIC, VALID, a_fit
 
 
 def test_slopes_become_maps_side_by_side():
-    found = figures.as_maps(np.arange(10.0), VALID)
+    found = as_maps(np.arange(10.0), VALID)
     assert found.shape == (3, 6)
     assert found[0].tolist()[1] == 0.0
     assert found[0].tolist()[4] == 5.0

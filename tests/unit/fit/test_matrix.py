@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.fit.matrix import FitOptions, Method
+from service.fit.matrix import FitOptions
 from service.fit.uncertainty import FAR_SHARE, STRANGE_RESIDUAL
 from service.model.interaction import InteractionModel
-from service.model.kinds import Stop
+from service.model.kinds import Method, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
 from tests.numerics import small_basis

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.fit.matrix import Method
+from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from studies.heritier2018.calibration import Answer
 from studies.heritier2018.plan import AROUND, FULL, TRUTH, Variant, around_runs, in_simulator

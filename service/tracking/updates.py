@@ -63,21 +63,24 @@ def decide(turn: Turn) -> None:
         stop_unwanted(turn, rtc)
         return
     choose_dither(turn, rtc)
-    _judge_in_use(turn)
+    unjudged = _unjudged_in_use(turn)
+    # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(turn, rtc)
+    if unjudged is not None:
+        judge(turn, unjudged)
 
 
-def _judge_in_use(turn: Turn) -> None:
-    """Look at the margin of the matrix in use once α is known, and when the last look is too old.
+def _unjudged_in_use(turn: Turn) -> str | None:
+    """Return the matrix in use if its margin is not known or was judged too long ago, else None.
 
     Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged
     there and then.
     """
     state, known = turn.state, turn.known
     if known is None or state.in_use is None or not settled(known):
-        return
-    if state.making_since_ns_utc is None and _judgement_due(state, state.in_use, turn.now_ns):
-        judge(turn, state.in_use)
+        return None
+    making = state.making_since_ns_utc is not None
+    return None if making or not _judgement_due(state, state.in_use, turn.now_ns) else state.in_use
 
 
 def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:

@@ -106,6 +106,13 @@ def test_a_move_is_looked_at_without_waiting_for_the_next_look(story):
     assert story.asked(ev.JudgeMatrix)
 
 
+def test_after_a_move_the_new_matrix_comes_before_the_margin_of_the_old_one(story):
+    judged(story, told())
+    effects = story.see(moved(NEAR, shift_x_subap=0.03), n_windows=2)
+    asked = [type(e) for e in effects if isinstance(e, (ev.MakeMatrix, ev.JudgeMatrix))]
+    assert asked == [ev.MakeMatrix, ev.JudgeMatrix]
+
+
 def test_a_registration_that_may_have_jumped_makes_nothing(story):
     story.see(moved(shift_x_subap=0.4))
     assert story.state.registration.candidate is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from service.control.dither import SPAN, most_telling
@@ -31,8 +33,9 @@ _MANY_LINES = np.linspace(*PROVING_RANGE, 100)
 def chosen_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
     """Return the modes to dither: those of the settings, or the ones that tell most.
 
-    These are four above the controlled modes, or the highest four where fewer are left; until the
-    model is known they are spread evenly.
+    These are four above the controlled modes. Where fewer are left they are four of the highest
+    ``SPAN``, in the loop or not: the last of a basis tell little of a rotation, and answer least as
+    the model says. Until the model is known they are spread evenly, or the last four.
     """
     fixed = _without_choice(rtc, policy)
     if fixed is not None:
@@ -92,7 +95,17 @@ def _without_choice(rtc: Status, policy: Policy) -> tuple[int, ...] | None:
         return policy.dither_modes[: rtc.max_dither_modes]
     if rtc.n_modes - _first_free(rtc, policy) >= N_LINES:
         return None
-    return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
+    if policy.mode_information is None:
+        return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
+    return _highest(policy, rtc.n_modes)[: rtc.max_dither_modes]
+
+
+@lru_cache(maxsize=4)  # of one policy; asked for with every status
+def _highest(policy: Policy, n_modes: int) -> tuple[int, ...]:
+    """Return which of the highest modes tell most of α."""
+    assert policy.mode_information is not None
+    highest = range(max(n_modes - SPAN, 0), n_modes)
+    return most_telling(policy.mode_information, highest, N_LINES, policy.dither_sigma)
 
 
 def _first_free(rtc: Status, policy: Policy) -> int:

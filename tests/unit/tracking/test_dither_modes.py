@@ -111,3 +111,29 @@ def test_the_amplification_is_that_of_a_loop_that_runs():
         found = abs(line @ moved[n // 2 :]) / abs(line @ dither[n // 2 :])
         expected = amplification(np.array(gain), np.array(fraction), leak=leak, delay_frames=2.0)
         assert found == pytest.approx(float(expected), rel=0.01)
+
+
+def informed(blind):
+    """Settings of a telescope whose modes all tell as much of α, but for those that are blind."""
+    told = np.broadcast_to(np.diag([1.0, 1.0, 4.0, 4.0]), (N_MODES, 4, 4)).copy()
+    told[list(blind)] *= 1e-3
+    return replace(ALL, mode_information=told)
+
+
+def test_where_none_is_free_those_that_tell_most_are_dithered_not_the_last():
+    """The last modes of a basis are seen badly: the rotation was 27 of its own σ off by them."""
+    policy = informed(range(580, N_MODES))
+    for n_controlled in (400, N_MODES):
+        modes = chosen_modes(rtc(n_controlled), policy)
+        assert len(modes) == 4
+        assert N_MODES - 100 <= min(modes)
+        assert max(modes) < 580
+    assert chosen_modes(rtc(400, max_dither_modes=3), policy) == modes[:3]
+
+
+def test_the_dither_stays_where_it_is_when_its_modes_come_into_the_loop():
+    night = DitheredNight(informed(range(580, N_MODES)), n_controlled=400).live(20.0)
+    raised(night, N_MODES).live(20.0)
+    assert len({request.modes for request in night.requests}) == 1
+    assert on_the_mirror_m(night.requests[-1], night.view) <= BUDGET_M * (1.0 + 1e-9)
+    assert not night.alarms

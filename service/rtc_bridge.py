@@ -140,13 +140,14 @@ class Bridge:
         """
         self._intake.set_wakeup(callback, for_frames=for_frames)
 
-    def drain(self) -> list[FrameBlock]:
+    def drain(self, *, before_events: bool = False) -> list[FrameBlock]:
         """Return the frames that have come since the last call, as copies, in order.
 
         Each block is contiguous and of one reconstructor. Frames behind a hole are held back for
-        as long as the hole may still be filled.
+        as long as the hole may still be filled. ``before_events``: those that came before the
+        oldest event which nobody has fetched; the others wait.
         """
-        return self._intake.drain()
+        return self._intake.drain(before_events=before_events)
 
     def events(self) -> list[LinkEvent]:
         """Return what else has happened since the last call, oldest first."""

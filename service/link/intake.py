@@ -67,6 +67,18 @@ class _Arrived:
     at_s: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Put:
+    """An event that nobody has fetched."""
+
+    event: LinkEvent
+    ring: FrameRing | None
+    """That held the frames of then; None: none had come."""
+
+    end: int
+    """Frames before this one came before it."""
+
+
 class Intake:
     """Takes what zenoh's threads bring; every method may be called from any thread."""
 
@@ -83,7 +95,7 @@ class Intake:
         self._endpoint = endpoint
         self._clock = clock
         self._lock = threading.Lock()
-        self._events: deque[LinkEvent] = deque(maxlen=QUEUE_LENGTH)
+        self._events: deque[_Put] = deque(maxlen=QUEUE_LENGTH)
         self._callback: Callable[[], object] | None = None
         self._rung = False
         self._rings_for_frames = True
@@ -269,7 +281,8 @@ class Intake:
 
     def _put(self, event: LinkEvent) -> None:
         self._counted["dropped"] += len(self._events) == QUEUE_LENGTH
-        self._events.append(event)
+        ring = self._ring
+        self._events.append(_Put(event=event, ring=ring, end=0 if ring is None else ring.head))
 
     def _is_news(self, complaint: str, now_s: float) -> bool:
         """Return whether a complaint is the first of a burst of equal ones."""
@@ -279,16 +292,24 @@ class Intake:
         self._complained_s = recent | {complaint: now_s}
         return True
 
-    def drain(self) -> list[FrameBlock]:
-        """Return copies of the frames that are due, in order; see :meth:`FrameRing.take`."""
+    def drain(self, *, before_events: bool = False) -> list[FrameBlock]:
+        """Return copies of the frames that are due, in order; see :meth:`FrameRing.take`.
+
+        ``before_events``: only those that came before the oldest event which nobody has fetched.
+        What it tells is not so of them: it may be the end of the dither that they hold.
+        """
         self._rung = False
         blocks: list[FrameBlock] = []
         while True:
             with self._up_to_date():
-                if self._ring is None:
+                ring, end = self._ring, None
+                if before_events and self._events:
+                    first = self._events[0]
+                    ring, end = (ring, first.end) if first.ring is ring else (None, None)
+                if ring is None:
                     return blocks
-                more = self._ring.take(self._clock(), self._patience_s, TAKE_FRAMES)
-                waiting = self._ring.due(self._clock(), self._patience_s)
+                more = ring.take(self._clock(), self._patience_s, TAKE_FRAMES, end)
+                waiting = ring.due(self._clock(), self._patience_s, end)
             blocks += more
             if not waiting:
                 return blocks
@@ -298,7 +319,7 @@ class Intake:
         self._rung = False
         self._take_spared()
         with self._up_to_date():
-            events = list(self._events)
+            events = [put.event for put in self._events]
             self._events.clear()
         return events
 

@@ -139,14 +139,22 @@ class FrameRing:
             # copied: a few frames must not keep the memory of all that came with them
             self._hold(_part(batch, start, stop, copied=True))
 
-    def take(self, now_s: float, patience_s: float, limit: int) -> list[FrameBlock]:
-        """Return copies of at most ``limit`` frames that are due, and pass them.
+    @property
+    def head(self) -> int:
+        """Number of the frame that comes next."""
+        return self._head
+
+    def take(
+        self, now_s: float, patience_s: float, limit: int, end: int | None = None
+    ) -> list[FrameBlock]:
+        """Return copies of at most ``limit`` frames that are due, before ``end``, and pass them.
 
         Frames behind a missing one are held back until it comes or ``patience_s`` have gone by
         since it was missed. A hole, a clock step of more than half a period, another
         reconstructor, period or kind of row begins a new block.
         """
-        slots = np.arange(self._cursor, min(self._head, self._cursor + limit)) % self._capacity
+        last = min(self._head if end is None else end, self._head, self._cursor + limit)
+        slots = np.arange(self._cursor, last) % self._capacity
         waiting = (self._state[slots] == MISSING) & (now_s - self._noticed_s[slots] < patience_s)
         if waiting.any():
             slots = slots[: int(np.argmax(waiting))]
@@ -160,9 +168,9 @@ class FrameRing:
         self._batch[slots] = None
         return [_block(parts) for parts in blocks]
 
-    def due(self, now_s: float, patience_s: float) -> bool:
-        """Return whether the next place can be passed now."""
-        if self._cursor == self._head:
+    def due(self, now_s: float, patience_s: float, end: int | None = None) -> bool:
+        """Return whether the next place can be passed now, and is one before ``end``."""
+        if self._cursor >= min(self._head if end is None else end, self._head):
             return False
         slot = self._cursor % self._capacity
         waited_s = now_s - float(self._noticed_s[slot])

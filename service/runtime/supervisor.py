@@ -271,7 +271,7 @@ class Supervisor:
         return await self._workers.call(OpticsWorker.describe)
 
     async def _listen(self) -> None:
-        """Take in what the link has: events first, for frames mean nothing without them."""
+        """Take in what the link has: frames, then what was told after them."""
         rung = asyncio.Event()
         loop = asyncio.get_running_loop()
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set), for_frames=False)
@@ -282,13 +282,13 @@ class Supervisor:
                 async with asyncio.timeout(self._engine.gather_s - GATHER_S):
                     await rung.wait()
             rung.clear()
+            await self._feed()
             for heard in self._bridge.events():
                 if isinstance(heard, MeasuredMatrix):
                     self._start(self._keep_measured(heard))
                     continue
                 with self._surviving("an event of the link"):
                     self._engine.hear(heard)
-            await self._feed()
 
     async def _feed(self) -> None:
         """Take in frames, in a thread: who asks something meanwhile has an answer."""
@@ -309,7 +309,7 @@ class Supervisor:
                 self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
 
     def _taken_in(self, streams: Streams) -> tuple[list[FrameBlock], tuple[Streams, list[Window]]]:
-        blocks = self._bridge.drain()
+        blocks = self._bridge.drain(before_events=True)
         return blocks, looked_at(streams, blocks)
 
     @contextlib.contextmanager

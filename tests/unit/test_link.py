@@ -278,6 +278,29 @@ def say(intake, **changes):
     intake.status(encode(Status(**(values | changes))))
 
 
+def test_frames_that_came_before_an_event_are_had_before_it_and_the_others_after(intake):
+    say(intake)
+    intake.events()
+    send(intake, 0)
+    applied(intake, "s1")
+    send(intake, 10)
+    applied(intake, "s1")
+    assert spans(intake.drain(before_events=True)) == [("s1", 0, 10)]
+    assert intake.drain(before_events=True) == []
+    assert len(intake.events()) == 2
+    assert spans(intake.drain(before_events=True)) == [("s1", 10, 10)]
+
+
+def test_a_new_session_is_told_before_its_frames(intake, clock):
+    send(intake, 500)
+    intake.events()
+    clock.now_s += 2.0
+    send(intake, 0, session="s2")
+    assert intake.drain(before_events=True) == []
+    assert ev.SessionStarted(session="s2") in intake.events()
+    assert spans(intake.drain(before_events=True)) == [("s2", 0, 10)]
+
+
 def test_frames_of_another_shape_than_the_status_says_cost_themselves_only(intake):
     say(intake)
     send(intake, 0)

@@ -23,6 +23,7 @@ from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from tests.system.cable import free_port
 from tests.system.fake_rtc import client_session
 from tests.system.pace import Deadline, in_time, patience
+from tests.unit.test_link import applied, send
 from tests.unit.tracking.situations import POLICY, Story, record
 from tests.unit.tracking.test_acquisition import Acquiring
 
@@ -254,7 +255,9 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
     async with running(supervisor):
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
         monkeypatch.setattr("service.runtime.engine.fed", broken)
-        monkeypatch.setattr(bridge, "drain", lambda: [SimpleNamespace(n_frames=50, dt_ns=10**6)])
+        monkeypatch.setattr(
+            bridge, "drain", lambda **_: [SimpleNamespace(n_frames=50, dt_ns=10**6)]
+        )
         await until(lambda: "internal.error" in [e.name for e in supervisor._engine.state.log])
         monkeypatch.undo()
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
@@ -265,7 +268,7 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
 
 
 async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, bridge, monkeypatch):
-    def broken():
+    def broken(**_):
         raise ValueError("a ring that is bent")
 
     async with running(supervisor):
@@ -276,6 +279,29 @@ async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, br
         await until(lambda: supervisor._engine.streams.rtc is not None)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a ring that is bent" in entry.text
+
+
+async def test_frames_are_looked_at_before_what_was_told_after_them(
+    supervisor, bridge, monkeypatch
+):
+    """A status that shows the end of a dither must not cost the window that has just ended."""
+    order = []
+
+    def seen(streams, block):
+        order.append(block.first_seq)
+        return streams, []
+
+    async with running(supervisor):
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        send(bridge._intake, 0)
+        await until(lambda: bridge._intake.events() == [] and not bridge.drain())
+        monkeypatch.setattr("service.runtime.engine.fed", seen)
+        monkeypatch.setattr(supervisor._engine, "hear", lambda told: order.append(told.id))
+        send(bridge._intake, 10)
+        applied(bridge._intake, "s1")
+        send(bridge._intake, 20)
+        await until(lambda: len(order) == 3)
+    assert order == [10, "cm-1", 20]
 
 
 async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, bridge, monkeypatch):
@@ -289,7 +315,7 @@ async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, br
     async with running(supervisor):
         blocks = [SimpleNamespace(n_frames=50, dt_ns=10**6)]
         monkeypatch.setattr("service.runtime.engine.fed", slowly)
-        monkeypatch.setattr(bridge, "drain", lambda: [blocks.pop()] if blocks else [])
+        monkeypatch.setattr(bridge, "drain", lambda **_: [blocks.pop()] if blocks else [])
         await until(looking.is_set, 20.0)
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
         assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == "mode is auto"

@@ -59,7 +59,9 @@ export function showWaiting(service, orders) {
   bar.hidden = !fresh || (!proposal && !others.length);
   bar.dataset.asks = String(Boolean(proposal));
   put($("#waiting-title"), proposal ? "WAITING FOR YOU" : "WAITING FOR");
-  put($("#proposal"), proposal ? described(proposal, orders.wins) : "");
+  const approval = (state?.waiting_for ?? []).find(({ name }) => name === "approval")?.text ?? "";
+  const besides = approval.split("; ").slice(1); // why nobody else sends it, and when another one replaces it
+  put($("#proposal"), proposal ? [described(proposal, orders.wins), ...besides].join("; ") : "");
   $("#proposal-buttons").hidden = !proposal;
   const lines = others.slice(0, 3).map((w) => `${w.party}: ${w.text}`);
   if (others.length > 3) lines.push(`and ${others.length - 3} more`);

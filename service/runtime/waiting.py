@@ -6,6 +6,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Final
 
 from service.link.intake import SPARED
@@ -16,9 +17,10 @@ from service.tracking import events as ev
 from service.tracking.activity import operating
 from service.tracking.alarms import Act, Alarm, Party, Waiting, forbids
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.worth import PROPOSAL_STANDS_S, outdated
 from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0
@@ -308,9 +310,22 @@ def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
             yield Waiting(name="acknowledgement", party=Party.RTC, text=text)
         elif record.state is MatrixState.PROPOSED and (state.mode is not Mode.AUTO or no_return):
-            why = f" ({no_return})" if no_return else ""
-            text = f"reconstructor {record.id} is proposed: approve or reject it{why}"
-            yield Waiting(name="approval", party=Party.OPERATOR, text=text)
+            text = f"reconstructor {record.id} is proposed: approve or reject it"
+            more = [no_return or "", _replaced(state, record)]
+            yield Waiting(
+                name="approval",
+                party=Party.OPERATOR,
+                text="; ".join((text, *filter(None, more))),
+            )
+
+
+def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
+    """Return that a proposal will be replaced, and when; empty: it fits α."""
+    if state.mode is Mode.HOLD or not outdated(state, record):
+        return ""
+    until_s = record.created_ns_utc / SECOND_NS + PROPOSAL_STANDS_S
+    then = datetime.fromtimestamp(until_s, UTC)
+    return f"α has moved on since: a newer one follows after {then:%H:%M:%S} UTC"
 
 
 def _told(state: TrackerState) -> str:

@@ -29,7 +29,7 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
 from service.tracking.state import Level, Mode
 from service.tracking.turn import Turn
-from service.tracking.worth import outdated
+from service.tracking.worth import left_behind
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
@@ -43,7 +43,7 @@ def set_mode(turn: Turn, command: cmd.SetMode) -> None:
 
 
 def approve(turn: Turn, command: cmd.Approve) -> None:
-    """Send a proposal, judged anew where need be, unless α is no longer what it was made for.
+    """Send a proposal, judged anew where need be, unless α has left what it was made for behind.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def approve(turn: Turn, command: cmd.Approve) -> None:
     record, known = _proposed(turn, command.id), turn.known
     if known is not None and not known.usable:
         raise CommandError(f"{record.id} cannot be judged: α is invalid ({known.standing.reason})")
-    if outdated(turn.state, record):
+    if left_behind(turn.state, record, turn.policy):
         raise CommandError(f"{record.id} was made for another α than the present one: refit")
     reconstructors.send_once_judged(turn, record.id)
 

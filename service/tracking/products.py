@@ -31,7 +31,8 @@ class MatrixState(StrEnum):
     """The stability gate refused it: it is never offered."""
 
     PROPOSED = "proposed"
-    """It passed the gate and waits for an operator."""
+    """It passed the gate and waits for an operator: for half a minute at least, unless the
+    mirror has moved too far for it."""
 
     DISCARDED = "discarded"
     """An operator rejected it, or what it was made for has passed: another α, another proposal."""

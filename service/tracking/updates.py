@@ -10,11 +10,13 @@ from service.tracking.mode_proof import awaits_proof, most_modes
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make
-from service.tracking.sending import why_no_return
+from service.tracking.sending import why_no_return, why_unsendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import (
+    PROPOSAL_STANDS_S,
     fewer_than,
+    left_behind,
     look_is_old,
     more_to_try,
     outdated,
@@ -105,7 +107,7 @@ def _choose_update(turn: Turn, rtc: Status) -> None:
         return
     first_ns = max(_next_attempt_ns(state, rtc, turn.policy), state.no_making_before_ns_utc)
     in_use = state.reconstructor(state.in_use) if state.in_use else None
-    if _busy(state) or now_ns < first_ns or in_use is None:
+    if _busy(turn) or now_ns < first_ns or in_use is None:
         return
     why, n_now = why_worthwhile(state, in_use, turn.policy, now_ns), rtc.n_controlled
     n_safe = most_modes(state, rtc.n_modes)
@@ -120,17 +122,28 @@ def _choose_update(turn: Turn, rtc: Status) -> None:
         make(turn, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
 
 
-def _busy(state: TrackerState) -> bool:
-    """Return whether a reconstructor is on its way, or one that fits α awaits an operator.
+def _busy(turn: Turn) -> bool:
+    """Return whether a reconstructor is on its way, or one awaits an operator.
 
     In auto nobody is going to decide on a proposal left from another mode or an absent RTC, but
     where there would be no way back.
     """
+    state = turn.state
     awaited = state.mode is not Mode.AUTO or why_no_return(state) is not None
     return any(
-        r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and not outdated(state, r))
+        r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and _stands(turn, r))
         for r in state.reconstructors
     )
+
+
+def _stands(turn: Turn, record: ReconstructorRecord) -> bool:
+    """Return whether a proposal is left for an operator to decide on: it fits α, or is new."""
+    state = turn.state
+    if not outdated(state, record):
+        return True
+    age_s = (turn.now_ns - record.created_ns_utc) / SECOND_NS
+    usable = not left_behind(state, record, turn.policy) and why_unsendable(state, record) is None
+    return usable and age_s < PROPOSAL_STANDS_S
 
 
 def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:

@@ -36,6 +36,10 @@ SIGNIFICANT = 18.5
 NOTICED = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A move of α that changes what a new matrix would win (numeric units), if it is more than 1 σ."""
 
+PROPOSAL_STANDS_S = 30.0
+"""A proposal is not replaced before, however much better α is known by then: an operator reads why,
+looks at the loop and clicks, and the gate judges it once more."""
+
 VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A verdict of the gate is not for a registration further away than this (numeric units)."""
 
@@ -203,6 +207,12 @@ def _jumped(state: TrackerState, in_use: ReconstructorRecord, known: Registratio
     """
     since = known.jumped_ns_utc is not None and known.jumped_ns_utc > in_use.created_ns_utc
     return since and outdated(state, in_use)
+
+
+def left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
+    """Return whether α has gone so far from this reconstructor that nobody may want it now."""
+    known = state.registration
+    return known is not None and (moved(state, record, policy) or _jumped(state, record, known))
 
 
 def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:

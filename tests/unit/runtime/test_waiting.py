@@ -1,6 +1,7 @@
 """What the link complains of, and whom the service waits for, from what is known at one moment."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from service.runtime.waiting import (
 from service.tracking.alarms import Alarm, Party, Waiting
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
-from tests.unit.tracking.situations import ALPHA, START_NS, Story, record, rtc
+from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record, rtc
 
 SECOND = 1_000_000_000
 
@@ -237,6 +238,19 @@ def test_what_an_operator_has_to_do_is_named():
     parties = {name: found[name].party for name in ("mode", "dither-stopped", "approval")}
     assert set(parties.values()) == {Party.OPERATOR}
     assert found["acknowledgement"].party is Party.RTC
+
+
+def test_who_is_to_approve_of_a_proposal_hears_when_another_one_replaces_it():
+    story = Story(Mode.PROPOSE).meet()
+    story.see(n_windows=6)
+    story.make("cm-1", created_ns_utc=START_NS)
+    asked = "reconstructor cm-1 is proposed: approve or reject it"
+    assert waits(link(*WELL), story.state)["approval"].text == asked
+    known = story.state.registration
+    moved_on = replace(known, alpha=moved(known.alpha, shift_x_subap=0.03))
+    found = waits(link(*WELL), replace(story.state, registration=moved_on))["approval"].text
+    then = datetime.fromtimestamp(START_NS / SECOND + 30, UTC).strftime("%H:%M:%S")
+    assert found == f"{asked}; α has moved on since: a newer one follows after {then} UTC"
 
 
 def test_a_wait_is_on_record_once_it_lasts_and_not_again_and_again():

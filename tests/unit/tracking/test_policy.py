@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from service.errors import ModelError
@@ -8,6 +9,7 @@ from service.tracking import events as ev
 from service.tracking.dither_request import Choice, lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
+from service.tracking.worth import outdated
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     N_MODES,
@@ -302,6 +304,41 @@ class TestProposals:
         story.make("cm-2")
         assert story.matrix_state("cm-1") is MatrixState.DISCARDED
         assert not story.asked(ev.SendMatrix)
+
+    def drifting(self):
+        """A proposal is five seconds old, and α by a fortieth of a subaperture elsewhere."""
+        wide = replace(POLICY, update_threshold=np.array([0.08, 0.08, np.deg2rad(0.08), 0.005]))
+        story = Story(Mode.PROPOSE, wide).meet()
+        story.see(n_windows=6)
+        story.make("cm-1")
+        for k in range(1, 6):
+            story.see(moved(shift_x_subap=0.005 * k), every_s=1.0)
+        story.see(moved(shift_x_subap=0.025), n_windows=5, every_s=0.2)
+        assert outdated(story.state, story.state.reconstructor("cm-1"))
+        return story
+
+    def looked_at(self, story, seconds):
+        """Return what is made while windows go on as before, beside a matrix not made for α."""
+        effects = ()
+        for _ in range(seconds):
+            effects += story.see(moved(shift_x_subap=0.025), every_s=1.0)
+        return of_kind(effects, ev.MakeMatrix)
+
+    def test_an_operator_has_half_a_minute_before_a_better_one_replaces_it(self):
+        story = self.drifting()
+        assert not story.asked(ev.MakeMatrix)[1:], "but the first"
+        assert not self.looked_at(story, 23)
+        assert self.looked_at(story, 2)
+
+    def test_approved_meanwhile_it_is_sent_if_the_gate_accepts_it_for_alpha_of_now(self):
+        story = self.drifting()
+        effects = story.tell(cmd.Approve(id="cm-1"))
+        assert of_kind(effects, ev.SendMatrix | ev.JudgeProposal)
+
+    def test_one_from_before_a_jump_is_replaced_at_once(self):
+        story = self.drifting()
+        effects = story.see(moved(shift_x_subap=0.4), n_windows=4)
+        assert of_kind(effects, ev.MakeMatrix)
 
     def test_in_auto_a_proposal_left_behind_stops_nothing(self):
         story = self.proposed()

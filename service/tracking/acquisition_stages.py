@@ -192,10 +192,10 @@ def tell_of_misses(turn: Turn) -> None:
     """Say that no registration is found in a loop that holds well: it is not opened for that."""
     if turn.state.loop_holds and _missed_enough(turn.state):
         text = (
-            f"{turn.acquisition.misses} windows in a row found no registration, though the loop "
-            "holds well: modes or slopes are probably in another order, or of another sign, than "
-            "the instrument file tells; compare both with it, or measure an interaction matrix; "
-            "the loop is left closed (acquire opens it to look from afar)"
+            "window after window finds no registration, though the loop holds well: modes or "
+            "slopes are probably in another order, or of another sign, than the instrument file "
+            "tells; compare both with it, or measure an interaction matrix; the loop is left "
+            "closed (acquire opens it to look from afar)"
         )
         turn.alarm(NOT_FOUND, text)
     elif not turn.acquisition.misses:

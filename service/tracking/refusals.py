@@ -9,7 +9,7 @@ from service.tracking import alarms
 from service.tracking.activity import ramping
 from service.tracking.alarms import Act
 from service.tracking.policy import SECOND_NS
-from service.tracking.turn import Turn
+from service.tracking.turn import Turn, says_the_same
 
 IN_A_ROW = 3
 """Windows refused one after the other that are no chance, and windows used that end it."""
@@ -34,12 +34,13 @@ def refuse(turn: Turn, reason: str, kind: RefusalKind) -> None:
         return
     run = min(turn.state.window_run, 0) - 1
     turn.state = replace(turn.state, window_run=run)
-    if run <= -IN_A_ROW and not _excused(turn):
-        text = (
-            f"{-run} windows in a row were refused, the last one because {reason}; α is not "
-            "measured meanwhile"
-        )
-        turn.alarm(alarms.WINDOWS_REFUSED, text)
+    if run > -IN_A_ROW or _excused(turn):
+        return
+    text = f"windows are refused one after the other: {reason}; α is not measured meanwhile"
+    before = turn.state.alarm(alarms.WINDOWS_REFUSED)
+    if before is not None and says_the_same(before.text, text):
+        text = before.text  # one cause is one text: of each window the log tells the numbers
+    turn.alarm(alarms.WINDOWS_REFUSED, text)
 
 
 def use(turn: Turn) -> None:

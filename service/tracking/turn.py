@@ -180,7 +180,12 @@ def _same(before: LogEntry, entry: LogEntry) -> bool:
         return False
     if entry.name not in REPEATING:
         return before.text == entry.text
-    return _NUMBERS.sub("", before.text) == _NUMBERS.sub("", entry.text)
+    return says_the_same(before.text, entry.text)
+
+
+def says_the_same(one: str, other: str) -> bool:
+    """Return whether two texts differ in nothing but numbers."""
+    return _NUMBERS.sub("", one) == _NUMBERS.sub("", other)
 
 
 def _ranges(text: str) -> tuple[tuple[str, str], ...]:

@@ -22,9 +22,9 @@ def story():
     return told
 
 
-def refuse(story, n=1, kind=RefusalKind.OTHER):
+def refuse(story, n=1, kind=RefusalKind.OTHER, reason=MISSING):
     for _ in range(n):
-        refused = WindowRefused(reason=MISSING, t_ns_utc=story.now_ns, kind=kind)
+        refused = WindowRefused(reason=reason, t_ns_utc=story.now_ns, kind=kind)
         story.tell(ev.WindowLost(refused=refused), after_s=2.0)
     return story
 
@@ -46,7 +46,17 @@ def test_the_third_in_a_row_is_an_alarm_with_the_reason_and_the_service_is_degra
 def test_hundreds_of_them_are_one_line_of_alarm(story):
     refuse(story, 145)
     assert story.logged.count(WINDOWS_REFUSED) == 1
-    assert text_of(story).startswith("145 windows in a row")
+    assert story.state.windows_refused == 145
+
+
+def test_its_text_stays_while_the_cause_does_and_changes_with_it(story):
+    refuse(story, IN_A_ROW)
+    told = text_of(story)
+    assert MISSING in told
+    refuse(story, reason=MISSING.replace("150", "153"))
+    assert text_of(story) == told
+    refuse(story, reason="the rotation is beyond 2 deg")
+    assert "beyond 2 deg" in text_of(story)
 
 
 def test_two_in_a_row_between_good_ones_are_none(story):

@@ -95,15 +95,14 @@ def _without_choice(rtc: Status, policy: Policy) -> tuple[int, ...] | None:
         return policy.dither_modes[: rtc.max_dither_modes]
     if rtc.n_modes - _first_free(rtc, policy) >= N_LINES:
         return None
-    if policy.mode_information is None:
-        return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
     return _highest(policy, rtc.n_modes)[: rtc.max_dither_modes]
 
 
 @lru_cache(maxsize=4)  # of one policy; asked for with every status
 def _highest(policy: Policy, n_modes: int) -> tuple[int, ...]:
-    """Return which of the highest modes tell most of α."""
-    assert policy.mode_information is not None
+    """Return which of the highest modes tell most of α, or the last while nobody knows."""
+    if policy.mode_information is None:
+        return tuple(range(max(n_modes - N_LINES, 0), n_modes))
     highest = range(max(n_modes - SPAN, 0), n_modes)
     return most_telling(policy.mode_information, highest, N_LINES, policy.dither_sigma)
 

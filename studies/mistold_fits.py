@@ -268,10 +268,10 @@ def page(found: list[dict[str, Any]]) -> str:
         f"**{len(wrong)} mistold: {len(accepted)} accepted, {len(beyond)} of them beyond "
         f"{MOST_SIGMA:g} σ; {len(wrong) - len(accepted)} refused.**",
         "",
-        "| matrix | modes | told wrong | verdict | x, y (subap) | rotation (deg) | magnification | "
-        "largest error / σ | residual | what it says |",
-        "|" + " --- |" * 10,
-        *(_row(one) for one in found),
+        "| told wrong | fits | accepted | largest error x, y (subap) | rotation (deg) | "
+        "magnification | over σ | the first says |",
+        "|" + " --- |" * 8,
+        *(_row(told, found) for told in dict.fromkeys(one["told"] for one in found)),
         "",
         "## Errors over σ",
         "",
@@ -289,16 +289,14 @@ def _worst(one: Mapping[str, Any]) -> float:
     return float(np.max(np.abs(one["error"]) / np.array(one["sigma"])))
 
 
-def _row(one: Mapping[str, Any]) -> str:
-    cells = [one["case"], "KL" if one["modal"] else "zonal", one["told"]]
-    cells.append("accepted" if one["accepted"] else "refused")
-    if "error" in one:
-        x, y, turned, size = one["error"]
-        cells += [f"{x:+.4f}, {y:+.4f}", f"{turned:+.4f}", f"{size:+.5f}", f"{_worst(one):.1f}"]
-        cells.append(f"{one['residual']:.1%}")
-    else:
-        cells += ["-"] * 5
-    said = one["said"].replace("|", "/")
+def _row(told: str, found: list[dict[str, Any]]) -> str:
+    these = [one for one in found if one["told"] == told]
+    cells = [told, str(len(these)), str(sum(one["accepted"] for one in these))]
+    fitted = [one for one in these if "error" in one]
+    x, y, turned, size = np.max(np.abs([one["error"] for one in fitted]), axis=0)
+    cells += [f"{x:.4f}, {y:.4f}", f"{turned:.4f}", f"{size:.5f}"]
+    cells.append(f"{max(map(_worst, fitted)):.1f}")
+    said = these[0]["said"].replace("|", "/")
     cells.append(said if len(said) < _LONGEST else f"{said[:_LONGEST]}...")
     return "| " + " | ".join(cells) + " |"
 

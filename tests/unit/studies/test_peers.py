@@ -250,10 +250,12 @@ def test_the_page_tells_the_refusal_of_a_wrong_stop_and_what_was_missed():
         orientation={},
         seconds=1.0,
     )
-    wrong = replace(right, question=Question.WRONG_STOP, accepted=False, verdict="refused: stop")
+    wrong = replace(
+        right, question=Question.WRONG_STOP, accepted=False, verdict='with stop = "x" the misfit'
+    )
     text = page([(case, _measured())], [right, wrong])
-    assert "| +0.210, +0.000 | +0.0000 | +0.0000 | 0.100 | 1.23% | accepted | **no** |" in text
-    assert "| refused: stop |" in text
+    assert "| +0.210, +0.000 | +0.0000 | +0.0000 | 0.100 | 1.23% | **no** |" in text
+    assert '| stop = "x" |' in text
     assert "As asked: 1 of 2." in text
 
 

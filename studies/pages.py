@@ -72,12 +72,12 @@ def house() -> str:
         # packages: the built manual holds copies of the examples
         folders = sorted(path.parent for path in (ROOT / top).rglob("__init__.py"))
         for folder in folders:
-            rows = [
-                (f"`{path.name}`", (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""))
+            lines = [
+                f"- `{path.name}`: {text.partition(chr(10))[0]}"
                 for path in sorted(folder.glob("*.py"))
+                for text in (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "",)
             ]
-            lines = [(name, text.partition("\n")[0]) for name, text in rows]
-            parts += [f"## {folder.relative_to(ROOT)}", table(("file", "has"), lines)]
+            parts += [f"## {folder.relative_to(ROOT)}", "\n".join(lines)]
     return "\n\n".join(parts) + "\n"
 
 

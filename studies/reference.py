@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
+from itertools import chain
 from typing import Any
 
 from check_rtc.__main__ import check_parser
@@ -21,6 +23,13 @@ Schema = Mapping[str, Any]
 _LIMITS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 
 _HEAD = ("key", "type", "default", "meaning")
+
+_OPTION = ("argument", "meaning")
+
+_COMMON = "Commands that ask a running service"
+
+_OFTEN = 20
+"""What so many commands say in the same words stands once, before them."""
 
 
 def page(title: str, *parts: str) -> str:
@@ -131,19 +140,34 @@ def commands() -> str:
     """Return docs/cli.md: every command with its options."""
     intro = (
         "`make` puts `pyrcal` into `.venv/bin`. Each command tells the same with `--help`; "
-        "`pyrcal sim --help` and `pyrcal campaign --help` are manuals of their own."
+        "`pyrcal sim --help` and `pyrcal campaign --help` are manuals of their own. What commands "
+        "that ask a running service have in common stands once, before the others; `--who` and "
+        "`--why` are of those that order something."
     )
     parsers = dict(_parsers(command_line())) | {
         "pyrcal demo": demo_parser(),
         "pyrcal check-rtc": check_parser(),
     }
-    parts = []
-    for name, parser in parsers.items():
-        rows = list(_options(parser))
-        texts = [" ".join((text or "").split()) for text in (parser.description, parser.epilog)]
-        parts += [f"## {name}", *(text for text in texts if text)]
-        parts += [table(("argument", "meaning"), rows)] if rows else []
+    told = {name: _texts(parser) for name, parser in parsers.items()}
+    rows = {name: list(_options(parser)) for name, parser in parsers.items()}
+    often = {
+        line: None
+        for lines in (told, rows)
+        for line, n in Counter(chain.from_iterable(lines.values())).items()
+        if n >= _OFTEN
+    }
+    parts = [f"## {_COMMON}", *(line for line in often if isinstance(line, str))]
+    parts.append(table(_OPTION, [line for line in often if isinstance(line, tuple)]))
+    for name in parsers:
+        parts += [f"## {name}", *(text for text in told[name] if text not in often)]
+        own = [row for row in rows[name] if row not in often]
+        parts += [table(_OPTION, own)] if own else []
     return page("The command line", intro, *parts)
+
+
+def _texts(parser: argparse.ArgumentParser) -> list[str]:
+    texts = [" ".join((text or "").split()) for text in (parser.description, parser.epilog)]
+    return [text for text in texts if text]
 
 
 def _parsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
@@ -200,14 +224,16 @@ def runbook(acts: Mapping[str, str]) -> str:
     parts = [
         "An alarm lasts as long as what it tells of. It is on the page, in `GET /v1/state`, on "
         "the wire (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "
-        "numbers; here is what each means and what to do."
+        "numbers; here is what each means and what to do.",
+        "## What an alarm may forbid",
+        table(("word", "what it forbids while the alarm lasts"), list(acts.items())),
     ]
     for name, kind in ALARMS.items():
         lines = [
             ("It is", kind.severity.value),
             ("What is the matter", kind.means),
             ("What to do", kind.do),
-            ("Meanwhile it forbids to", "; ".join(acts[a] for a in acts if a in kind.forbids)),
+            ("It forbids", ", ".join(f"`{act}`" for act in acts if act in kind.forbids)),
             ("Who can end it", f"the {kind.party}" if kind.party else ""),
             ("A refusal says", kind.because),
         ]

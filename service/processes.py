@@ -14,7 +14,6 @@ import contextlib
 import multiprocessing
 import os
 import pickle
-import resource
 import signal
 import threading
 import time
@@ -166,17 +165,6 @@ def _answer(work: bytes) -> object:
         return error
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job
         return WorkerError(f"failed unforeseen: {error!r}")
-
-
-def within(memory_mb: int, work: Callable[[], R]) -> R:
-    """Do the work in as much memory; in the process itself."""
-    most_bytes = memory_mb * 1_000_000
-    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
-    try:
-        return work()
-    except MemoryError as error:
-        text = f"needs more memory than {memory_mb} MB, the most it may have"
-        raise WorkerError(text) from error
 
 
 def _be_polite(nice: int) -> None:

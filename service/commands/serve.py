@@ -22,13 +22,13 @@ from typing_extensions import override
 from service.archive import Archive
 from service.commands.program import leave
 from service.commands.running import announced
-from service.config import Settings, load_instrument, packaged_instrument
+from service.config import Settings
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
+from service.files.fit_folder import FitRequest
 from service.files.last_telemetry import LastTelemetry
-from service.files.uploads import UploadFitter
 from service.keys import KeyFile
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, instrument_sha256
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.clock import ServiceClock
@@ -221,24 +221,29 @@ def _supervisor(
     )
 
 
+FIT_PROGRAM = (sys.executable, "-m", "service.commands.uploaded")
+"""``pyrcal fit`` of an upload; of the service nothing is imported there but what it stands on."""
+
+
 def _desk(settings: Settings, instrument: Instrument) -> FitQueue:
     """Return the desk for fits of uploads; an uploaded instrument is read like any other."""
     most_bytes = settings.fits.upload_limit_mb * 1_000_000
     return FitQueue(
         folder=settings.service.data_dir / "uploads",
-        fit=UploadFitter(
-            own=instrument,
-            load_instrument=load_instrument,
-            packaged_instrument=packaged_instrument,
+        program=FIT_PROGRAM,
+        request=FitRequest(
+            asked={},
+            own_instrument=str(settings.service.instrument),
+            own_sha256=instrument_sha256(instrument),
             most_bytes=most_bytes,
             threads=settings.compute.threads,
+            nice=settings.compute.nice,
+            memory_mb=settings.fits.memory_limit_mb,
         ),
         limits=FitLimits(
             most_bytes=most_bytes,
             waiting=settings.fits.waiting,
             seconds=settings.fits.time_limit_s,
-            nice=settings.compute.nice,
-            memory_mb=settings.fits.memory_limit_mb,
         ),
         clock_ns=time.time_ns,
     )

@@ -15,8 +15,6 @@ from starlette.requests import ClientDisconnect
 
 from service.errors import MatrixError
 from service.files import parse_alpha, parse_modes
-from service.files.uploads import FitAsked, FitJob, FitState
-from service.fit.matrix import FitOptions
 from service.model.kinds import Method
 from service.routes.problems import COMMAND, INVALID, UNKNOWN, problem_response
 from service.routes.views import (
@@ -29,7 +27,7 @@ from service.routes.views import (
     shows,
     view,
 )
-from service.runtime.uploads import FitQueue
+from service.runtime.uploads import FitJob, FitQueue, FitState
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 
@@ -114,20 +112,9 @@ class FitParameters(BaseModel):
     measurement: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Id of a matrix the RTC has measured for this service; there is no body then."""
 
-    def asked(self) -> FitAsked:
-        """Return this as the fit understands it."""
-        return FitAsked(
-            options=FitOptions(
-                method=self.method,
-                modes=None if self.modes is None else parse_modes(self.modes),
-                start=None if self.start is None else parse_alpha(self.start),
-                gain_map=self.gain_map,
-                anamorphosis=self.anamorphosis,
-            ),
-            dataset=self.dataset,
-            instrument=self.instrument,
-            reference=self.reference,
-        )
+    def asked(self) -> dict[str, Any]:
+        """Return what ``pyrcal fit`` is told of it."""
+        return self.model_dump(mode="json", exclude={"name", "measurement"})
 
 
 class FitDocument(BaseModel):

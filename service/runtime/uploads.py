@@ -6,13 +6,14 @@ import asyncio
 import contextlib
 import hashlib
 import itertools
+import json
 import shutil
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial
+from enum import StrEnum
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,18 +29,11 @@ from service.errors import (
     TooLargeError,
     TooSlowError,
     UnknownIdError,
+    WorkerError,
 )
 from service.files import NUMPY_BEGINS
-from service.files.uploads import (
-    FIGURES,
-    STAGE,
-    UNFINISHED,
-    UPLOAD,
-    FitAsked,
-    FitJob,
-    FitState,
-)
-from service.runtime.workers import run_in_process
+from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, UPLOAD, FitRequest
+from service.runtime.programs import run_program
 
 FITS_KEPT = 50
 """Finished fits that are remembered."""
@@ -60,6 +54,64 @@ _BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", NUMPY_BEGINS, b"PK\x
 """First bytes of HDF5, FITS, anything gzipped, NumPy, and zip."""
 
 
+class FitState(StrEnum):
+    """How far a fit is."""
+
+    RECEIVING = "receiving"
+    """The upload is on its way."""
+
+    WAITING = "waiting"
+    """It stands in the queue."""
+
+    RUNNING = "running"
+    DONE = "done"
+    """There is a document; its verdict may be a refusal."""
+
+    FAILED = "failed"
+    """There is none; the reason says why."""
+
+    GIVEN_UP = "given-up"
+    """There is none: somebody has ended it."""
+
+
+UNFINISHED = frozenset({FitState.RECEIVING, FitState.WAITING, FitState.RUNNING})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitJob:
+    """One fit the service was asked for."""
+
+    id: str
+    """Never reused while the service runs."""
+
+    state: FitState
+    """How far it is."""
+
+    asked_ns_utc: int
+    """When it was asked for, the service's clock."""
+
+    name: str = ""
+    """Of the measured matrix, or the file, as whoever asked calls it."""
+
+    n_bytes: int = 0
+    """Of the upload so far."""
+
+    sha256: str = ""
+    """Of the upload; empty until it is whole."""
+
+    reason: str = ""
+    """Why it failed."""
+
+    stage: str = ""
+    """What it is at while it runs: reading, modes, orientation, fit, verdict, figures."""
+
+    document: Mapping[str, Any] | None = None
+    """What was found, what ``pyrcal fit --json`` prints."""
+
+    figures: bytes | None = None
+    """What its figures are drawn from, JSON."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitLimits:
     """What fits of uploads may take."""
@@ -73,30 +125,27 @@ class FitLimits:
     seconds: float
     """Of one fit."""
 
-    nice: int
-    """Of its process: the telescope goes first."""
-
-    memory_mb: int
-    """That its process may allocate."""
-
 
 class FitQueue:
     """Takes uploads in, has them fitted one after the other, and forgets them when it ends.
 
     Belongs to the event loop. ``folder`` is emptied when the desk opens; an upload stays there
-    until its fit is finished. ``fit`` runs in a process of its own, so it must be picklable.
+    until its fit is finished. ``program`` are the words that start ``pyrcal fit``; the folder of
+    the fit is its last. ``request`` is what each is asked, but for what users choose.
     """
 
     def __init__(
         self,
         *,
         folder: Path,
-        fit: Callable[[Path, FitAsked], Mapping[str, Any]],
+        program: Sequence[str],
+        request: FitRequest,
         limits: FitLimits,
         clock_ns: Callable[[], int],
     ) -> None:
         self._folder = folder
-        self._fit = fit
+        self._program = program
+        self._request = request
         self._limits = limits
         self._clock_ns = clock_ns
         self._numbers = itertools.count(1)
@@ -174,7 +223,11 @@ class FitQueue:
         return job
 
     async def take(
-        self, asked: FitAsked, body: AsyncIterator[bytes], n_bytes: int | None, name: str = ""
+        self,
+        asked: Mapping[str, Any],
+        body: AsyncIterator[bytes],
+        n_bytes: int | None,
+        name: str = "",
     ) -> FitJob:
         """Keep an upload and put its fit in the queue, under a ``name`` for whoever looks there.
 
@@ -255,17 +308,14 @@ class FitQueue:
             )
         self._put(replace(self._jobs[fit_id], n_bytes=n_bytes, sha256=digest.hexdigest()))
 
-    async def _carry_out(self, fit_id: str, asked: FitAsked) -> None:
+    async def _carry_out(self, fit_id: str, asked: Mapping[str, Any]) -> None:
         folder = self._folder / fit_id
-        work = partial(self._fit, folder, asked)
         try:
             async with self._turn:
                 self._put(replace(self._jobs[fit_id], state=FitState.RUNNING))
-                limits = self._limits
-                found = await run_in_process(
-                    work, nice=limits.nice, limit_s=limits.seconds, memory_mb=limits.memory_mb
-                )
-            drawn = await asyncio.to_thread(_kept, folder / FIGURES)
+                await asyncio.to_thread(replace(self._request, asked=asked).write, folder)
+                await run_program([*self._program, str(folder)], limit_s=self._limits.seconds)
+            found, drawn = await asyncio.to_thread(_answered, folder)
             done = replace(self._jobs[fit_id], state=FitState.DONE, document=found, figures=drawn)
             self._put(done)
             self._log.info("fit.done", id=fit_id, verdict=found["verdict"])
@@ -288,8 +338,13 @@ class FitQueue:
         await asyncio.to_thread(shutil.rmtree, self._folder / fit_id, ignore_errors=True)
 
 
-def _kept(path: Path) -> bytes | None:
-    return path.read_bytes() if path.exists() else None
+def _answered(folder: Path) -> tuple[dict[str, Any], bytes]:
+    """Return what a fit has found, and what its figures are drawn from."""
+    try:
+        found: dict[str, Any] = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
+        return found, (folder / FIGURES).read_bytes()
+    except (OSError, ValueError) as error:
+        raise WorkerError(f"the fit has ended and left no answer: {error}") from error
 
 
 async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.processes import Apart, Worker, within
+from service.processes import Worker
 from service.snapshot import Pace
 from service.tracking import events as ev
 from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
@@ -200,34 +200,6 @@ def _run(
     if first is not None:
         worker.run(first)
     return worker.run(work)
-
-
-async def run_in_process(
-    work: Callable[[], R], *, nice: int, limit_s: float, memory_mb: int | None = None
-) -> R:
-    """Run ``work`` in a nice'd process and return its result; it must be picklable, like that.
-
-    ``memory_mb`` bounds what the process may allocate, its program included.
-
-    Raises
-    ------
-    PyrcalError
-        What ``work`` has raised of this kind.
-    WorkerError
-        If it raised anything else, needs more memory, the process died, or ``limit_s`` have passed.
-    """
-    process = Apart(nice=nice)
-    if memory_mb is not None:
-        work = partial(within, memory_mb, work)
-    try:
-        async with asyncio.timeout(limit_s):
-            return await asyncio.to_thread(process.do, work)
-    except TimeoutError as error:
-        raise WorkerError(f"took longer than {limit_s:g} s and was stopped") from error
-    except EOFError as error:
-        raise WorkerError("the process of the job died; out of memory?") from error
-    finally:
-        process.kill()
 
 
 # --- how the work keeps pace with the telemetry: what it costs, and what is said where it does not

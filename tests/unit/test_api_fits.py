@@ -5,15 +5,13 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import httpx
-import numpy as np
 import pytest
 
 from service.api import create_app
 from service.errors import BusyError, MatrixError, TooLargeError, UnknownIdError
 from service.files.figures import numbers
 from service.files.report import document
-from service.files.uploads import FitJob, FitState
-from service.model.kinds import Method
+from service.runtime.uploads import FitJob, FitState
 from tests.unit.files.made import a_fit, a_report
 from tests.unit.test_api import assert_problem
 
@@ -95,22 +93,27 @@ async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(
     }
     assert response.headers["location"] == "/v1/fits/fit-1"
     assert (desk.body, desk.length) == (b"file", 4)
-    asked, options = desk.asked, desk.asked.options
-    assert (asked.dataset, asked.instrument, asked.reference) == ("D", "flao-lbt", "im.h5")
     assert desk.name == "last night"
-    assert options.method is Method.PAPER
-    assert options.modes.tolist() == [0, 1, 2, 3]
-    assert options.start.vector == pytest.approx([0.1, 0.0, np.deg2rad(65.0), 0.98])
-    assert (options.gain_map, options.anamorphosis) == (True, True)
+    assert desk.asked == {
+        "dataset": "D",
+        "method": "paper",
+        "modes": "0:4",
+        "start": "0.1,0,65,0.98",
+        "gain_map": True,
+        "anamorphosis": True,
+        "instrument": "flao-lbt",
+        "reference": "im.h5",
+    }
 
 
 async def test_without_parameters_the_defaults_of_the_command_hold(client, desk):
     assert (await client.post("/v1/fits", content=b"file")).status_code == 202
-    options = desk.asked.options
-    assert options.method is Method.JOINT
-    assert options.modes is None
-    assert options.start is None
-    assert desk.asked.dataset is None
+    assert desk.asked == {
+        **dict.fromkeys(("dataset", "modes", "start", "instrument", "reference")),
+        "method": "joint",
+        "gain_map": False,
+        "anamorphosis": False,
+    }
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from schemathesis.engine.events import FatalError, NonFatalError, ScenarioFinish
 from service.api import create_app
 from service.archive import Archive
 from service.errors import WorkerError
+from service.files.fit_folder import FitRequest
 from service.keys import KeyFile, KeyScope
 from service.routes import admission
 from service.routes.admission import Hosts
@@ -85,8 +86,19 @@ def app(tmp_path, monkeypatch):
             archive=archive,
             actions=actions,
         )
-        limits = FitLimits(most_bytes=10_000, waiting=10_000, seconds=1, nice=0, memory_mb=500)
-        desk = FitQueue(folder=tmp_path, fit=dict, limits=limits, clock_ns=Clock())
+        limits = FitLimits(most_bytes=10_000, waiting=10_000, seconds=1)
+        request = FitRequest(
+            asked={},
+            own_instrument="small",
+            own_sha256="",
+            most_bytes=10_000,
+            threads=1,
+            nice=0,
+            memory_mb=500,
+        )
+        desk = FitQueue(
+            folder=tmp_path, program=("false",), request=request, limits=limits, clock_ns=Clock()
+        )
         # it sends hundreds of wrong keys, and expects 401 for each: 429 has a test of its own
         monkeypatch.setattr(admission, "MOST_FAILURES", 100_000)
         hosts = Hosts(allowed=("testserver",))

@@ -3,9 +3,6 @@
 import os
 import signal
 import time
-from dataclasses import dataclass
-
-import numpy as np
 
 from service.errors import MatrixError
 
@@ -18,10 +15,6 @@ def niceness(_bench=None):
     return os.nice(0)
 
 
-def who():
-    return os.getpid(), os.nice(0)
-
-
 def interrupted(_bench):
     """Survive what Ctrl-C sends to the whole process group."""
     os.kill(os.getpid(), signal.SIGINT)
@@ -29,12 +22,6 @@ def interrupted(_bench):
 
 
 def asleep(_bench):
-    time.sleep(60.0)
-
-
-def asleep_at(folder):
-    """Tell there who sleeps."""
-    (folder / "pid").write_text(str(os.getpid()))
     time.sleep(60.0)
 
 
@@ -71,38 +58,3 @@ def remembering(bench):
 
 def remembered(bench):
     return getattr(bench, "told", None)
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is asked of a fit, as far as these jobs look at it."""
-
-    dataset: str | None = None
-
-
-def at_a_stage(folder, _asked):
-    (folder / "stage").write_text("orientation")
-    time.sleep(60.0)
-
-
-def drawing(folder, asked):
-    (folder / "figures.json").write_text("{}")
-    return telling(folder, asked)
-
-
-def telling(folder, asked):
-    """Say what lies in the folder of an upload, instead of fitting it."""
-    content = (folder / "upload").read_bytes()
-    return {"verdict": f"accepted: {len(content)} bytes of {asked.dataset}"}
-
-
-def sleeping(_folder, _asked):
-    time.sleep(60.0)
-
-
-def hungry():
-    return len(np.ones(400_000_000))
-
-
-def modest():
-    return float(np.ones(1_000_000).sum())

@@ -2,8 +2,10 @@
 
 import asyncio
 import hashlib
+import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -16,16 +18,24 @@ from service.errors import (
     TooSlowError,
     UnknownIdError,
 )
-from service.files.uploads import FitState
+from service.files.fit_folder import FitRequest
 from service.runtime import uploads
-from service.runtime.uploads import FitLimits, FitQueue
+from service.runtime.uploads import FitLimits, FitQueue, FitState
 from tests.system.pace import in_time
-from tests.unit.runtime.jobs import Asked, at_a_stage, drawing, refusing, sleeping, telling
 
-pytestmark = [pytest.mark.timeout(60), pytest.mark.usefixtures("light_processes")]
+pytestmark = pytest.mark.timeout(60)
 
-LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0, nice=0, memory_mb=4000)
-ASKED = Asked()
+LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0)
+REQUEST = FitRequest(
+    asked={},
+    own_instrument="tiny",
+    own_sha256="",
+    most_bytes=10_000_000,
+    threads=1,
+    nice=0,
+    memory_mb=4000,
+)
+ASKED = {"dataset": "D"}
 HDF5 = b"\x89HDF\r\n\x1a\n" + b"\x00" * 5_000_000
 
 
@@ -38,10 +48,11 @@ async def in_chunks(content, size=300_000):
 async def opened(tmp_path):
     desks = []
 
-    def make(fit=telling, **limits):
+    def make(job="telling", **limits):
         desk = FitQueue(
             folder=tmp_path / "uploads",
-            fit=fit,
+            program=(sys.executable, str(Path(__file__).with_name("fit_program.py")), job),
+            request=REQUEST,
             limits=replace(LIMITS, **limits),
             clock_ns=time.time_ns,
         )
@@ -77,8 +88,8 @@ def files(tmp_path):
 async def test_an_upload_is_kept_fitted_and_removed_but_what_figures_are_drawn_from(
     opened, tmp_path
 ):
-    desk = opened(drawing)
-    job = await taken(desk, asked=replace(ASKED, dataset="D"))
+    desk = opened()
+    job = await taken(desk)
     assert job.state is FitState.WAITING
     assert job.n_bytes == len(HDF5)
     assert job.sha256 == hashlib.sha256(HDF5).hexdigest()
@@ -90,7 +101,7 @@ async def test_an_upload_is_kept_fitted_and_removed_but_what_figures_are_drawn_f
 
 
 async def test_a_fit_that_cannot_be_made_says_why(opened, tmp_path):
-    desk = opened(refusing)
+    desk = opened("refusing")
     failed = await finished(desk, await taken(desk))
     assert failed.state is FitState.FAILED
     assert failed.reason == "transposed"
@@ -98,8 +109,14 @@ async def test_a_fit_that_cannot_be_made_says_why(opened, tmp_path):
     assert not files(tmp_path)
 
 
+async def test_a_program_that_leaves_no_answer_is_a_fit_that_failed(opened):
+    desk = opened("silent")
+    failed = await finished(desk, await taken(desk))
+    assert failed.reason.startswith("the fit has ended and left no answer")
+
+
 async def test_fits_run_one_after_the_other(opened):
-    desk = opened(sleeping)
+    desk = opened("sleeping")
     first, second = await taken(desk), await taken(desk)
     await until(lambda: desk.job(first.id).state is FitState.RUNNING)
     assert desk.job(second.id).state is FitState.WAITING
@@ -107,7 +124,7 @@ async def test_fits_run_one_after_the_other(opened):
 
 
 async def test_what_a_fit_is_at_is_told_and_it_ends_when_it_is_given_up(opened, tmp_path):
-    desk = opened(at_a_stage)
+    desk = opened("at_a_stage")
     first, second = await taken(desk), await desk.take(ASKED, in_chunks(HDF5), None, "im.h5")
     await until(lambda: desk.job(first.id).stage)
     assert desk.job(first.id).stage == "orientation"
@@ -121,7 +138,7 @@ async def test_what_a_fit_is_at_is_told_and_it_ends_when_it_is_given_up(opened, 
 
 
 async def test_too_many_unfinished_fits_are_refused_before_anything_is_read(opened):
-    desk = opened(sleeping)
+    desk = opened("sleeping")
     await taken(desk), await taken(desk)
     untouched = in_chunks(HDF5)
     with pytest.raises(BusyError, match="found 2 fits unfinished"):
@@ -195,7 +212,7 @@ async def test_a_disk_that_is_full_is_said_as_such(opened, monkeypatch):
 
 
 async def test_a_fit_that_takes_too_long_is_stopped(opened, tmp_path):
-    desk = opened(sleeping, seconds=1.0)
+    desk = opened("sleeping", seconds=1.0)
     failed = await finished(desk, await taken(desk))
     assert failed.reason == "took longer than 1 s and was stopped"
     assert not files(tmp_path)
@@ -214,7 +231,7 @@ async def test_only_the_last_finished_fits_are_remembered(opened, monkeypatch):
 
 
 async def test_closing_ends_what_runs_and_clears_the_disk(opened, tmp_path):
-    desk = opened(sleeping)
+    desk = opened("sleeping")
     await taken(desk)
     await asyncio.sleep(0.2)
     begun = time.monotonic()

@@ -1,28 +1,23 @@
 import io
 import json
-import pickle
+import os
+import subprocess
+import time
 import zipfile
 from dataclasses import replace
 
 import h5py
-import numpy as np
 import pytest
 
-from service.config import load_instrument, packaged_instrument
+from service.commands.fit_upload import MOST_FILES, fit_upload, opened_parcel
+from service.commands.serve import FIT_PROGRAM
+from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError
-from service.files.uploads import (
-    FIGURES,
-    MOST_FILES,
-    STAGE,
-    UPLOAD,
-    FitAsked,
-    UploadFitter,
-    opened_parcel,
-)
+from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, UPLOAD, FitRequest
 from service.fit import matrix
-from service.fit.matrix import FitOptions
+from service.model.instrument import instrument_sha256
 from tests.data.tiny.make import ALPHA, HERE
-from tests.numerics import flao_basis, small_instrument
+from tests.numerics import flao_basis
 
 TOML = '[wfs]\nvalid_subapertures = "mask.h5:/mask"\n[mirror]\nmodes = "modes.fits"\n'
 
@@ -160,18 +155,29 @@ def test_a_reference_is_found_wherever_it_stands_in_the_instrument_file(tmp_path
     assert "secret.h5" in refused(path, unpacked)
 
 
-ASKED = FitAsked(options=FitOptions(modes=np.arange(15)))
+ASKED = {
+    **dict.fromkeys(("dataset", "start", "instrument", "reference")),
+    "method": "joint",
+    "modes": "0:15",
+    "gain_map": False,
+    "anamorphosis": False,
+}
+OWN = HERE / "tiny.toml"
+REQUEST = FitRequest(
+    asked=ASKED,
+    own_instrument=str(OWN),
+    own_sha256=instrument_sha256(load_instrument(OWN)),
+    most_bytes=1_000_000,
+    threads=1,
+    nice=0,
+    memory_mb=4000,
+)
 
 
-def fitter(own):
-    made = UploadFitter(
-        own=own,
-        load_instrument=load_instrument,
-        packaged_instrument=packaged_instrument,
-        most_bytes=1_000_000,
-        threads=1,
-    )
-    return pickle.loads(pickle.dumps(made))
+def fitted(folder, **asked):
+    """Fit what lies there in this process, and return the document."""
+    fit_upload(folder, replace(REQUEST, asked=ASKED | asked))
+    return json.loads((folder / DOCUMENT).read_text())
 
 
 def uploaded(folder, *files):
@@ -185,8 +191,7 @@ def uploaded(folder, *files):
 
 
 def test_a_matrix_alone_belongs_to_the_services_own_instrument(tmp_path):
-    own = load_instrument(HERE / "tiny.toml")
-    found = fitter(own)(uploaded(tmp_path, HERE / "tiny.h5"), ASKED)
+    found = fitted(uploaded(tmp_path, HERE / "tiny.h5"))
     assert found["n_modes_used"] == 15
     assert abs(found["rotation_deg"] - ALPHA["rotation_deg"]) < 0.2
     drawn = json.loads((tmp_path / FIGURES).read_text())
@@ -195,32 +200,84 @@ def test_a_matrix_alone_belongs_to_the_services_own_instrument(tmp_path):
     assert (tmp_path / STAGE).read_text() == "figures"
 
 
+def test_an_instrument_file_that_has_changed_since_is_told_and_is_not_the_services_own(tmp_path):
+    folder = uploaded(tmp_path, HERE / "tiny.h5")
+    fit_upload(folder, replace(REQUEST, own_sha256="of another day"))
+    told = json.loads((folder / DOCUMENT).read_text())["notes"][-1]
+    assert told == "the instrument file has changed since the service began: read as it is now"
+    assert not json.loads((folder / FIGURES).read_text())["own_instrument"]
+
+
 def test_an_instrument_may_come_with_the_matrix(tmp_path):
     folder = uploaded(tmp_path, HERE / "tiny.toml", HERE / "tiny.h5")
-    found = fitter(small_instrument())(folder, ASKED)
-    assert abs(found["rotation_deg"] - ALPHA["rotation_deg"]) < 0.2
+    assert abs(fitted(folder)["rotation_deg"] - ALPHA["rotation_deg"]) < 0.2
     assert not json.loads((folder / FIGURES).read_text())["own_instrument"]
 
 
 def test_a_packaged_instrument_may_be_named(tmp_path, monkeypatch):
     monkeypatch.setattr(matrix, "modal_basis", lambda _instrument: flao_basis())
-    asked = FitAsked(options=FitOptions(), instrument="flao-lbt")
     with pytest.raises(MatrixError, match=r"found shape \(224, 40\); expected \(1408 slopes"):
-        fitter(small_instrument())(uploaded(tmp_path, HERE / "tiny.h5"), asked)
+        fitted(uploaded(tmp_path, HERE / "tiny.h5"), modes=None, instrument="flao-lbt")
 
 
 def test_refusals_do_not_tell_where_the_service_keeps_its_files(tmp_path):
     (tmp_path / "other.h5").write_bytes(b"x")
     folder = uploaded(tmp_path, HERE / "tiny.toml", tmp_path / "other.h5")
     with pytest.raises(MatrixError) as error:
-        fitter(small_instrument())(folder, ASKED)
+        fitted(folder)
     assert str(error.value).startswith("other.h5: found something else")
 
 
 def test_a_file_of_the_server_is_no_packaged_instrument(tmp_path, monkeypatch):
     monkeypatch.chdir(HERE)
-    asked = replace(ASKED, instrument="tiny.toml")
     with pytest.raises(
         MatrixError, match=r"instrument tiny\.toml: neither a packaged name .*flao-lbt"
     ):
-        fitter(small_instrument())(uploaded(tmp_path, HERE / "tiny.h5"), asked)
+        fitted(uploaded(tmp_path, HERE / "tiny.h5"), instrument="tiny.toml")
+
+
+# --- as the service starts it
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, None),
+        ({"own_instrument": "nobodys"}, "instrument nobodys: neither a packaged name"),
+        ({"memory_mb": 60}, "needs more memory than 60 MB, the most it may have"),
+    ],
+)
+def test_the_program_leaves_its_answer_or_says_why_there_is_none(tmp_path, change, said):
+    folder = uploaded(tmp_path, HERE / "tiny.h5")
+    replace(REQUEST, **change).write(folder)
+    begun = subprocess.run(
+        [*FIT_PROGRAM, str(folder)], stdin=open_end(), capture_output=True, text=True, check=False
+    )
+    if said is None:
+        assert begun.returncode == 0, begun.stderr
+        assert json.loads((folder / DOCUMENT).read_text())["n_modes_used"] == 15
+    else:
+        assert begun.returncode == 2
+        assert begun.stderr.splitlines()[-1].startswith(said)
+        assert not (folder / DOCUMENT).exists()
+
+
+def test_the_program_ends_with_the_service_and_is_as_nice_as_asked(tmp_path):
+    folder = uploaded(tmp_path, HERE / "tiny.h5")
+    os.mkfifo(folder / "slow.h5")  # whoever opens it waits for ever
+    (folder / UPLOAD).unlink()
+    (folder / UPLOAD).symlink_to(folder / "slow.h5")
+    replace(REQUEST, nice=3).write(folder)
+    with subprocess.Popen([*FIT_PROGRAM, str(folder)], stdin=subprocess.PIPE) as process:
+        while not (folder / STAGE).exists():
+            assert process.poll() is None
+            time.sleep(0.02)
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == os.nice(0) + 3
+        process.stdin.close()
+        assert process.wait(30.0) == 2
+
+
+def open_end():
+    """Return a pipe that nobody closes before this process ends, as the service holds one."""
+    end, _ = os.pipe()
+    return end

@@ -1,4 +1,4 @@
-"""Fits of uploads: what may be asked, what came, and the fit in a process of its own."""
+"""Fits of uploads: what came, which of its files is what, and the fit."""
 
 from __future__ import annotations
 
@@ -7,19 +7,22 @@ import re
 import shutil
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from service.config import load_instrument, packaged_instrument
 from service.errors import ConfigurationError, MatrixError, PyrcalError
+from service.files import parse_alpha, parse_modes
 from service.files.container import check_sealed
 from service.files.figures import numbers
+from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, STAGES, UPLOAD, FitRequest
 from service.files.report import document
 from service.files.run import fit_file
 from service.fit.matrix import FitOptions
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, instrument_sha256
+from service.model.kinds import Method
 
 MOST_FILES = 32
 
@@ -146,143 +149,64 @@ def _texts(value: object) -> Iterator[str]:
             yield from _texts(part)
 
 
-UPLOAD = "upload"
-"""Name of what was uploaded, in the folder of its fit."""
+def fit_upload(folder: Path, request: FitRequest) -> None:
+    """Fit what was uploaded into the folder, and write there what came of it.
 
-STAGE, FIGURES = "stage", "figures.json"
-"""In the same folder: what the fit is at, in a word, and what its figures are drawn from."""
+    Raises
+    ------
+    MatrixError
+        If something in the upload cannot be used, said without the service's own paths.
+    """
+    unpacked = folder / "unpacked"
+    unpacked.mkdir()
 
-STAGES = ("reading", "modes", "orientation", "fit", "verdict", "figures")
-"""What a fit does, in this order."""
+    def tell(stage: str) -> None:
+        (folder / STAGE).write_text(stage, encoding="utf-8")
 
-
-class FitState(StrEnum):
-    """How far a fit is."""
-
-    RECEIVING = "receiving"
-    """The upload is on its way."""
-
-    WAITING = "waiting"
-    """It stands in the queue."""
-
-    RUNNING = "running"
-    DONE = "done"
-    """There is a document; its verdict may be a refusal."""
-
-    FAILED = "failed"
-    """There is none; the reason says why."""
-
-    GIVEN_UP = "given-up"
-    """There is none: somebody has ended it."""
-
-
-UNFINISHED = frozenset({FitState.RECEIVING, FitState.WAITING, FitState.RUNNING})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FitAsked:
-    """What was asked for, besides the measured matrix itself."""
-
-    options: FitOptions
-    """As for any fit."""
-
-    dataset: str | None = None
-    """Name of the matrix in its file; None: the usual one."""
-
-    instrument: str | None = None
-    """A packaged instrument; None: the service's own, or the one that was uploaded."""
-
-    reference: str | None = None
-    """The measured file in an upload of several; None: the only one that can be it."""
+    tell(STAGES[0])
+    asked = request.asked
+    try:
+        parcel = opened_parcel(folder / UPLOAD, unpacked, asked["reference"], request.most_bytes)
+        instrument, remarks = _instrument_of(parcel, request)
+        report = fit_file(
+            instrument,
+            parcel.reference,
+            _options(asked),
+            dataset=asked["dataset"],
+            threads=request.threads,
+            progress=tell,
+        )
+    except PyrcalError as error:
+        said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
+        raise MatrixError(said) from error
+    tell(STAGES[-1])
+    report = replace(report, notes=(*report.notes, *remarks))
+    own = asked["instrument"] is None and parcel.instrument is None and not remarks
+    _write(folder / FIGURES, {"own_instrument": own, **numbers(report.fit)})
+    _write(folder / DOCUMENT, document(report))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FitJob:
-    """One fit the service was asked for."""
-
-    id: str
-    """Never reused while the service runs."""
-
-    state: FitState
-    """How far it is."""
-
-    asked_ns_utc: int
-    """When it was asked for, the service's clock."""
-
-    name: str = ""
-    """Of the measured matrix, or the file, as whoever asked calls it."""
-
-    n_bytes: int = 0
-    """Of the upload so far."""
-
-    sha256: str = ""
-    """Of the upload; empty until it is whole."""
-
-    reason: str = ""
-    """Why it failed."""
-
-    stage: str = ""
-    """What it is at while it runs: reading, modes, orientation, fit, verdict, figures."""
-
-    document: Mapping[str, Any] | None = None
-    """What was found, as ``service.files.report.document`` says it."""
-
-    figures: bytes | None = None
-    """What its figures are drawn from, JSON of ``service.files.figures.numbers``."""
+def _instrument_of(parcel: Parcel, request: FitRequest) -> tuple[Instrument, tuple[str, ...]]:
+    """Return the instrument that is meant, and what whoever reads the fit should know of it."""
+    if request.asked["instrument"] is not None:
+        return packaged_instrument(request.asked["instrument"]), ()
+    if parcel.instrument is not None:
+        return load_instrument(parcel.instrument), ()
+    own = load_instrument(request.own_instrument)
+    if instrument_sha256(own) == request.own_sha256:
+        return own, ()
+    return own, ("the instrument file has changed since the service began: read as it is now",)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class UploadFitter:
-    """Fits what was uploaded into a folder; can be pickled."""
+def _options(asked: Mapping[str, Any]) -> FitOptions:
+    return FitOptions(
+        method=Method(asked["method"]),
+        modes=None if asked["modes"] is None else parse_modes(asked["modes"]),
+        start=None if asked["start"] is None else parse_alpha(asked["start"]),
+        gain_map=asked["gain_map"],
+        anamorphosis=asked["anamorphosis"],
+    )
 
-    own: Instrument
-    load_instrument: Callable[[Path], Instrument]
-    """Reads that of an upload."""
 
-    packaged_instrument: Callable[[str], Instrument]
-    """Reads a packaged one; a name is never a file of this machine."""
-
-    most_bytes: int
-    """Of the files of an archive together."""
-
-    threads: int
-    """That share the work."""
-
-    def __call__(self, folder: Path, asked: FitAsked) -> dict[str, Any]:
-        """Return the document of the fit.
-
-        Raises
-        ------
-        MatrixError
-            If something in the upload cannot be used, said without the service's own paths.
-        """
-        unpacked = folder / "unpacked"
-        unpacked.mkdir()
-
-        def tell(stage: str) -> None:
-            (folder / STAGE).write_text(stage, encoding="utf-8")
-
-        tell(STAGES[0])
-        try:
-            parcel = opened_parcel(folder / UPLOAD, unpacked, asked.reference, self.most_bytes)
-            if asked.instrument is not None:
-                instrument = self.packaged_instrument(asked.instrument)
-            elif parcel.instrument is not None:
-                instrument = self.load_instrument(parcel.instrument)
-            else:
-                instrument = self.own
-            report = fit_file(
-                instrument,
-                parcel.reference,
-                asked.options,
-                dataset=asked.dataset,
-                threads=self.threads,
-                progress=tell,
-            )
-        except PyrcalError as error:
-            said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
-            raise MatrixError(said) from error
-        tell(STAGES[-1])
-        drawn = {"own_instrument": instrument is self.own, **numbers(report.fit)}
-        (folder / FIGURES).write_text(json.dumps(drawn), encoding="utf-8")
-        return document(report)
+def _write(path: Path, found: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(found, allow_nan=False), encoding="utf-8")

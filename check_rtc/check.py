@@ -21,9 +21,8 @@ from check_rtc.examine import Examination, examine
 from check_rtc.offload import Registered
 from check_rtc.talk import Talk
 from check_rtc.watch import Watch
-from service.commands.terminal import say
 from service.config import load_instrument, packaged_instrument
-from service.errors import ConfigurationError, LinkError, ModelError, shown
+from service.errors import ConfigurationError, LinkError, ModelError, say, shown
 from service.fit.dialect import Dialect, of_reconstructor
 from service.link.session import Endpoint
 from service.model.instrument import Instrument

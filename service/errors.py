@@ -25,6 +25,7 @@ exceptions: their text tells the operator what to do.
 Such texts quote what strangers have written, so they reach a terminal as :func:`shown` has it.
 """
 
+import sys
 import unicodedata
 
 _UNSEEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
@@ -44,6 +45,11 @@ def shown(text: str, keep: str = "") -> str:
         else character.encode("unicode_escape").decode("ascii")
         for character in text
     )
+
+
+def say(line: str) -> None:
+    """Tell whoever sits at the terminal something beside the answer."""
+    sys.stderr.write(f"{shown(line)}\n")
 
 
 class PyrcalError(Exception):

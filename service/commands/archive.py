@@ -16,10 +16,10 @@ from service.archive import Archive
 from service.archive.nights import FOREVER_NS, HOUR_NS, MOST_THINNED
 from service.archive.records import to_json
 from service.archive.retention import Item, due, items, remove, verify
-from service.commands.terminal import say, show_progress
+from service.commands.terminal import show_progress
 from service.config import Settings, load_settings
 from service.config.policy import keeping_of
-from service.errors import ConfigurationError, UnknownIdError, shown
+from service.errors import ConfigurationError, UnknownIdError, say, shown
 
 DONE, DAMAGED = 0, 1
 

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote, urlencode
 
+from service.commands.options import named
 from service.commands.reading import understood
-from service.commands.remote import DONE, Request, named
+from service.commands.remote import DONE, Request
 from service.commands.rest import Document, Service, chunks
 from service.commands.terminal import print_document, print_lines
 from service.errors import ConfigurationError

@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 
 from service.archive.store import write_whole
-from service.commands.terminal import say, show_progress
+from service.commands.terminal import show_progress
 from service.config import load_instrument
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, say
 from service.files.figures import check_plots, write_sheet
 from service.files.light import Light, read_light
 from service.files.report import document, fill_fit, table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import getpass
 import os
 import time
 import tomllib
@@ -10,8 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from service.commands.running import data_dir_of_the_one
-from service.commands.terminal import login, say
-from service.errors import ArchiveError, ConfigurationError
+from service.errors import ArchiveError, ConfigurationError, say
 from service.keys import KeyFile, KeyScope
 
 DONE = 0
@@ -68,12 +68,19 @@ def _recorded(file: KeyFile, name: str, text: str) -> None:
     index, now_ns = Index(path), time.time_ns()
     try:
         index.open()
-        entry = AuditEntry(t_ns_utc=now_ns, who=login(), name=name, text=text, whence="cli")
+        entry = AuditEntry(t_ns_utc=now_ns, who=_login(), name=name, text=text, whence="cli")
         index.record((), (entry,))
     except ArchiveError as error:
         say(f"pyrcal: the audit trail does not have it: {error}")
     finally:
         index.close()
+
+
+def _login() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container may run under a number that has no name
+        return ""
 
 
 def data_dir(options: argparse.Namespace) -> Path:

@@ -9,11 +9,12 @@ import uuid
 from typing import NamedTuple
 from urllib.parse import quote
 
+from service.commands.options import named
 from service.commands.reading import reconstructor_lines, understood
-from service.commands.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request, named
+from service.commands.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request
 from service.commands.rest import Document, Service
-from service.commands.terminal import login, print_document, print_lines, say
-from service.errors import ConfigurationError, shown
+from service.commands.terminal import login, print_document, print_lines
+from service.errors import ConfigurationError, say, shown
 
 LOOK_S = 0.5
 """Between two looks at work under way."""

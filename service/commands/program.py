@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
 import signal
@@ -9,11 +10,11 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from types import FrameType
 from typing import NoReturn
 
-from service.commands.terminal import say
-from service.errors import PyrcalError
+from service.errors import PyrcalError, say
 
 INTERRUPTED = 130
 
@@ -30,6 +31,72 @@ def status_of(task: Callable[[], int], name: str = "pyrcal") -> int:
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def run_command(
+    read: Callable[[], argparse.Namespace],
+    check: Callable[[argparse.Namespace], None],
+    *,
+    own_process: bool,
+    serves: bool,
+) -> int:
+    """Return the exit status of a command, each a module with a ``main`` of its own.
+
+    Parameters
+    ----------
+    read
+        Reads the command line; ``module`` of what it returns names the command's.
+    check
+        Refuses files that cannot be what they are given as, before anything large is imported.
+    own_process
+        Whether signals are this program's to hear.
+    serves
+        Whether the command runs until it is told to stop, and hears signals by itself.
+    """
+    try:
+        try:
+            return _commanded(read, check, own_process=own_process, serves=serves)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # whoever reads has seen enough, and Python would complain at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _commanded(
+    read: Callable[[], argparse.Namespace],
+    check: Callable[[argparse.Namespace], None],
+    *,
+    own_process: bool,
+    serves: bool,
+) -> int:
+    if own_process:
+        _leave_when_asked(0 if serves else INTERRUPTED)
+    options = read()
+    options.own_process = own_process
+
+    def carry_out() -> int:
+        check(options)
+        command = import_module(options.module)
+        if own_process and not serves:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        status: int = command.main(options)
+        return status
+
+    status = status_of(carry_out)
+    if own_process and serves:
+        leave(status)
+    return status
+
+
+def _leave_when_asked(status: int) -> None:
+    """End at once on SIGINT and SIGTERM: nothing has begun, and imports must not be cut in two.
+
+    Holds for ``run`` until the service hears them itself.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: leave(status))
 
 
 def imported_and_run(

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from urllib.parse import quote
 
-from service.commands.remote import DONE, NOT_DONE, Request, named
+from service.commands.options import named
+from service.commands.remote import DONE, NOT_DONE, Request
 from service.commands.rest import Document, Service
 from service.commands.status import (
     alarm_line,

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.archive.store import write_whole
-from service.commands.terminal import say, show_progress
+from service.commands.terminal import show_progress
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
-from service.errors import ConfigurationError, MatrixError
+from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
 from service.files.container import file_sha256
 from service.files.light import read_light

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from service.commands.terminal import say
-from service.errors import ConfigurationError
+from service.commands.options import Words, add, words
+from service.errors import ConfigurationError, say
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
 """Exit statuses; 2 is that of a command line that makes no sense."""
@@ -27,29 +27,6 @@ Exit status: 0 done, 1 refused by the service or not done (of status: not all is
 line that makes no sense, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for
 --url and the key's file.
 """
-
-
-class Words(NamedTuple):
-    """An option or an operand: ``--name VALUE``, a flag ``--name``, ``operand VALUE``."""
-
-    form: str
-    purpose: str | None
-    how: dict[str, Any]
-    """What else argparse is told."""
-
-
-def words(form: str, purpose: str | None = None, **how: Any) -> Words:  # noqa: ANN401 - argparse's own
-    """Return an option or an operand; one with ``choices`` is no flag."""
-    return Words(form, purpose, how)
-
-
-def add(to: Any, *every: Words) -> None:  # noqa: ANN401 - argparse's own, whose type is private
-    """Add options and operands to a command, or to a group of them."""
-    for form, purpose, how in every:
-        name, _, value = form.partition(" ")
-        flag = name.startswith("-") and not value and "choices" not in how
-        named = {"metavar": value} if value else {"action": "store_true"} if flag else {}
-        to.add_argument(name, help=purpose, **named, **how)
 
 
 class Request(NamedTuple):
@@ -331,7 +308,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         parser = commands.add_parser(
             request.name, help=request.purpose, description=request.purpose, epilog=_EPILOG
         )
-        parser.set_defaults(request=request, module="remote")
+        parser.set_defaults(request=request, module=__name__)
         add(parser, *request.words)
         if request.module == "orders":
             add(parser, words("--why WHY", "kept in the audit trail", default=""))
@@ -360,7 +337,7 @@ def main(options: argparse.Namespace) -> int:
     request: Request = options.request
     service = Service(options.url or os.environ.get(URL) or USUAL_URL, _key(options.key_file))
     try:
-        status: int = import_module(f"service.commands.{request.module}").carry_out(
+        status: int = import_module(f"{__package__}.{request.module}").carry_out(
             service, request, options
         )
     except RefusedError as error:
@@ -380,9 +357,3 @@ def _key(file: Path | None) -> str:
         return file.read_text(encoding="ascii").strip()
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"--key-file {file}: {error}") from error
-
-
-def named(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """Return those of these options that were given."""
-    given = {name: getattr(options, name, None) for name in names}
-    return {name: value for name, value in given.items() if value is not None}

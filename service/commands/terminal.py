@@ -8,12 +8,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from service.errors import shown
-
-
-def say(line: str) -> None:
-    """Tell the user something beside the answer."""
-    sys.stderr.write(f"{shown(line)}\n")
+from service.errors import say, shown
 
 
 def login() -> str:

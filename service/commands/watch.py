@@ -17,8 +17,8 @@ from service.commands.reading import understood
 from service.commands.remote import DONE, Request
 from service.commands.rest import Document, RefusedError, Service, UnreachableError
 from service.commands.status import status_lines
-from service.commands.terminal import clock, print_document, print_lines, say, span
-from service.errors import shown
+from service.commands.terminal import clock, print_document, print_lines, span
+from service.errors import say, shown
 
 if TYPE_CHECKING:
     from rich.console import Group

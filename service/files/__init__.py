@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from service.fit.light_rotation import Arms
     from service.model.misregistration import Misregistration
 
 
@@ -119,7 +118,7 @@ def parse_alpha(text: str) -> Misregistration:
     ValueError
         If it is not four finite numbers, or the magnification is not positive.
     """
-    values = _numbers(text)
+    values = numbers_in(text)
     if len(values) != 4 or values[3] <= 0.0:
         expected = "expected X,Y,ROT,MAG: subapertures, degrees, ratio, like 0.3,-0.1,65,0.98"
         raise ValueError(f"found {text.strip()!r}, {expected}")
@@ -128,25 +127,7 @@ def parse_alpha(text: str) -> Misregistration:
     return Misregistration.from_boundary(dict(zip(PARAMETERS, values, strict=True)))
 
 
-def parse_arms(text: str) -> Arms:
-    """Return the spider's arms ``WIDTH:DEG,DEG,...``: subapertures, degrees from +x towards +y.
-
-    Raises
-    ------
-    ValueError
-        If it is not a width above 0 and at least one finite angle.
-    """
-    first, _, rest = text.partition(":")
-    width, angles = _numbers(first), _numbers(rest)
-    if not angles or len(width) != 1 or width[0] <= 0.0:
-        expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
-        raise ValueError(f"found {text.strip()!r}, {expected}")
-    from service.fit.light_rotation import Arms
-
-    return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
-
-
-def _numbers(text: str) -> list[float]:
+def numbers_in(text: str) -> list[float]:
     """Return the finite numbers that a text lists; none where something else is among them."""
     try:
         values = [float(part) for part in text.split(",")]

@@ -10,8 +10,7 @@ import structlog
 
 from service.__main__ import main
 from service.commands.serve import log_to_the_terminal
-from service.commands.terminal import say
-from service.errors import MatrixError, shown
+from service.errors import MatrixError, say, shown
 
 EVIL = "\x1b]0;title\x07 \u202egnp.exe\u2066 two\nlines\r\x9b2J\x00\u2028"
 

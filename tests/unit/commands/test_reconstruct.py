@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.archive.store import write_whole
-from service.commands.arguments import check_files, command_line, with_negative_numbers
+from service.commands.arguments import command_line, with_negative_numbers
+from service.commands.offline_arguments import check_files
 from service.commands.reconstruct import SAMPLING, main
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError

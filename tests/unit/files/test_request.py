@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from service.files import parse_alpha, parse_arms, parse_modes
+from service.commands.offline_arguments import parse_arms
+from service.files import parse_alpha, parse_modes
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,12 @@ export function showAlarmLines(service) {
   list.replaceChildren(...lines.map(({ text, tone }) => make("li", { text, title: text, data_tone: tone })));
 }
 
-// A banner under the header: what is the matter, what to do, where more is said. Smaller once somebody knows.
+// A critical alarm that lasts and is muted is no news, and still there.
+function mutedCritical(state) {
+  return (state?.alarms ?? []).filter((alarm) => alarm.muted && alarm.severity === "critical").sort(worstFirst);
+}
+
+// A banner under the header: what is the matter, what to do, where more is said. Smaller once somebody knows, a line once it is muted.
 export class CriticalBanner {
   #service;
   #root = $("#critical");
@@ -76,24 +81,27 @@ export class CriticalBanner {
   show() {
     const { state, fresh, now } = this.#service;
     // one that was there when the connection was lost is not over for that
-    const [alarm, ...others] = this.#service.locked ? [] : lasting(state).filter(({ severity }) => severity === "critical");
+    const critical = [...lasting(state).filter(({ severity }) => severity === "critical"), ...mutedCritical(state)];
+    const [alarm, ...others] = this.#service.locked ? [] : critical;
     this.#root.hidden = !alarm;
-    document.body.dataset.alarm = alarm ? (alarm.acknowledged ? "known" : "critical") : "";
+    document.body.dataset.alarm = !alarm ? "" : alarm.muted ? "muted" : alarm.acknowledged ? "known" : "critical";
     if (!alarm) return;
     this.#name = alarm.name;
     const part = (selector) => this.#root.querySelector(selector);
-    const { acknowledged: seen } = alarm;
+    const { acknowledged: seen, muted } = alarm;
     const since = milliseconds(alarm.since_ns_utc);
-    put(part("h2"), `${SYMBOLS.critical} ${alarm.name}`);
+    const known = muted ? `; muted by ${muted.by} until ${clock(milliseconds(muted.until_ns_utc))} UTC` : seen ? `; ${seen.by} knows` : "";
+    put(part("h2"), `${muted ? SYMBOLS.muted : SYMBOLS.critical} ${alarm.name}`);
     put(part(".cause"), sentence(firstClause(alarm.cause || alarm.text)));
     put(part(".remedy span"), firstClause(alarm.do));
-    part(".remedy").hidden = !alarm.do;
+    part(".remedy").hidden = !alarm.do || Boolean(muted);
     put(part(".found"), alarm.text);
-    put(part(".since"), `since ${clock(since)} UTC, ${ago(since, now, true)}${seen ? `; ${seen.by} knows` : ""}${fresh ? "" : "; as last heard"}`);
+    part(".found").hidden = Boolean(muted);
+    put(part(".since"), `since ${clock(since)} UTC, ${ago(since, now, true)}${known}${fresh ? "" : "; as last heard"}`);
     const runbook = runbookOf(alarm.name);
     part("a").hidden = !runbook;
     if (runbook) part("a").href = runbook;
-    part("button").hidden = Boolean(seen);
-    put(part(".others"), others.length ? `also critical: ${others.map(({ name }) => name).join(", ")}` : "");
+    part("button").hidden = Boolean(seen || muted);
+    put(part(".others"), others.length ? `also critical: ${others.map(({ name, muted: hushed }) => (hushed ? `${name} (muted)` : name)).join(", ")}` : "");
   }
 }

@@ -47,6 +47,12 @@ class StagedService(FakeService):
         notes[name] = replace(notes[name], acknowledged=remark)
         self.change(notes=tuple(notes.values()))
 
+    def mute(self, name, remark):
+        """Have somebody mute an alarm, or nobody any more."""
+        notes = {note.name: note for note in self.now.tracker.notes}
+        notes[name] = replace(notes[name], muted=remark)
+        self.change(notes=tuple(notes.values()))
+
     def over(self, name):
         """End an alarm that nobody has acknowledged."""
         state = self.now.tracker

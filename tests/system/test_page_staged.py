@@ -130,6 +130,26 @@ def test_once_somebody_knows_it_gives_way_but_stays(page):
     page.until("!document.querySelector('#critical').checkVisibility()")
 
 
+def test_muted_it_is_a_line_and_no_banner_and_another_one_takes_its_place(page):
+    page.service.alarm("loop-diverging", "found")
+    page.until("document.querySelector('#critical').checkVisibility()")
+    page.service.mute("loop-diverging", Remark(by="Ada", reason="", t_ns_utc=1, until_ns_utc=1))
+    page.says("#critical", "muted by Ada until")
+    page.says("#critical h2", "⊘ loop-diverging")
+    for size in (LAPTOP, NARROW):
+        page.resize(size)
+        page.until(f"innerWidth === {size[0]}")
+        assert page.js("document.querySelector('#critical').offsetHeight") < 0.2 * size[1]
+        assert size_px(page, "#critical .cause") < largest_px(page)
+        assert page.js("document.documentElement.scrollWidth") <= size[0]
+        assert page.faults_of_access() == []
+    assert not page.js("document.querySelector('#critical button').checkVisibility()")
+    page.service.alarm("edge-slip", "slipped")
+    page.says("#critical h2", "■ edge-slip")
+    page.says("#critical .others", "also critical: loop-diverging (muted)")
+    assert size_px(page, "#critical .cause") == largest_px(page)
+
+
 def test_a_lost_connection_does_not_end_it(page):
     page.service.alarm("loop-diverging", "found")
     page.until("document.querySelector('#critical').checkVisibility()")

@@ -9,11 +9,18 @@ import pytest
 from tests.system.night import wait_for
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+errors = pytest.importorskip("selenium.common.exceptions", reason="selenium is not installed")
 Keys = webdriver.Keys
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DRIVER = shutil.which("chromedriver")
 AXE = Path(__file__).parents[1] / "data" / "axe" / "axe.min.js"
+AT_REST = """
+const [element, done] = arguments;
+const place = () => JSON.stringify(element.getBoundingClientRect());
+const before = place();
+setTimeout(() => done(element.isConnected && place() === before), 50);
+"""
 WIDE, LAPTOP, NARROW = (1440, 900), (1280, 800), (390, 844)
 
 NEEDS_A_BROWSER = pytest.mark.skipif(
@@ -81,7 +88,25 @@ class Page:
         self.until(found, timeout_s)
 
     def click(self, selector):
-        self.driver.find_element("css selector", selector).click()
+        """Click what stands still: drawn anew or moved meanwhile it would get nothing of it."""
+        self._at_rest(selector, lambda element: element.click())
+
+    def enter(self, selector):
+        """Press the enter key on it."""
+        self._at_rest(selector, lambda element: element.send_keys("\n"))
+
+    def _at_rest(self, selector, act):
+        def done():
+            try:
+                element = self.driver.find_element("css selector", selector)
+                if not self.driver.execute_async_script(AT_REST, element):
+                    return False
+                act(element)
+            except (errors.NoSuchElementException, errors.StaleElementReferenceException):
+                return False
+            return True
+
+        wait_for(done, 10.0, lambda: f"{selector} at rest; {self.text()}", every_s=0.02)
 
     def press(self, keys):
         """Type with whatever has the focus."""

@@ -56,6 +56,10 @@ FARTHEST = 12.0
 """Times what two windows together hardly exceed by chance that is beyond all turbulence: it has led
 them as far as 6."""
 
+SAME_WAY = 0.95
+"""Cosine between two steps from α, each by the noise of windows, of one and the same jump. Of two
+mistakes in four parameters one pair in 150 points as much the same way."""
+
 LITTLE = 0.3
 """Share of a jump by which a window may fall short of it and still be of the new place."""
 
@@ -131,9 +135,30 @@ def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Dist
     )
     nearest = min(_farthest(seen_from, one, policy).innovation for one in (alone, reading))
     if _apart(first.alpha, first, reading, policy) >= min(nearest, JUMP_THRESHOLD):
-        return NEAR
+        return _jump_inside_first(known, first, reading, policy)
     found = _farthest(seen_from, _together(first, reading), policy)
     return replace(found, rotation_limit=ROTATION_LIMIT_OF_TWO)
+
+
+def _jump_inside_first(
+    known: Registration, first: Seen, reading: Reading, policy: Policy
+) -> Distance:
+    """Return how far a window lies if the mirror jumped there inside the one before it.
+
+    That one lies between α and the new place: it is far out by itself, on the same way, and not
+    beyond. Only a jump beyond all turbulence is told like this.
+    """
+    if known.candidate is None:
+        return NEAR
+    found = _farthest((last_of(known),), reading, policy)
+    if found.excess <= FARTHEST:
+        return NEAR
+    total = _noise_of_two(first, reading, policy)
+    part, whole = (one.alpha.vector - known.alpha.vector for one in (first, reading))
+    along = float(part @ np.linalg.solve(total, whole))
+    part_sq, whole_sq = (float(step @ np.linalg.solve(total, step)) for step in (part, whole))
+    same_way = along >= SAME_WAY * np.sqrt(part_sq * whole_sq) and part_sq <= whole_sq
+    return found if same_way else NEAR
 
 
 def window_before(known: Registration) -> Seen | None:
@@ -160,8 +185,11 @@ def wholly_after(first: Seen, reading: Reading, old: Misregistration, policy: Po
     The first window after a jump began before it. What it may lack of the way (2 σ of the
     difference allowed for) must be little.
     """
-    lacks = np.sqrt(_apart(first.alpha, first, reading, policy)) + 2.0
-    return bool(lacks <= LITTLE * np.sqrt(_apart(old, first, reading, policy)))
+    apart = _apart(first.alpha, first, reading, policy)
+    lacks = np.sqrt(apart) + 2.0
+    return apart < JUMP_THRESHOLD and bool(
+        lacks <= LITTLE * np.sqrt(_apart(old, first, reading, policy))
+    )
 
 
 def look_surprise(known: Registration, joint: Joint, reading: Reading, policy: Policy) -> float:
@@ -214,11 +242,15 @@ def _together(first: Seen, reading: Reading) -> Reading:
 
 def _apart(place: Misregistration, first: Seen, reading: Reading, policy: Policy) -> float:
     """Return how far a window lies from a place by the noise of two: squared, 4 is expected."""
+    difference = reading.alpha.vector - place.vector
+    return float(difference @ np.linalg.solve(_noise_of_two(first, reading, policy), difference))
+
+
+def _noise_of_two(first: Seen, reading: Reading, policy: Policy) -> Array:
+    """Return ``(4, 4)`` covariance of the difference of two windows of one place."""
     elapsed_s = max(reading.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
     added = _drifted(elapsed_s, policy) + 2.0 * (VARYING * policy.floor) ** 2
-    total = first.covariance + reading.covariance + np.diag(added)
-    difference = reading.alpha.vector - place.vector
-    return float(difference @ np.linalg.solve(total, difference))
+    return np.asarray(first.covariance + reading.covariance + np.diag(added))
 
 
 def _drifted(elapsed_s: float, policy: Policy) -> Array:

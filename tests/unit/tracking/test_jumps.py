@@ -145,6 +145,32 @@ def test_a_jump_is_flagged_by_windows_within_seconds_wherever_it_falls(jump):
     assert max(found) <= 3 * WINDOW_S
 
 
+LARGE = np.array([0.3, -0.1, np.deg2rad(1.0), 0.0])
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.8, 0.95])
+def test_a_large_jump_inside_a_window_is_told_by_that_window_and_the_next(share):
+    """The first lies on the way to the new place, the second at it."""
+    sky = Sky(5, jump=LARGE, at_s=40.0 + WINDOW_S * (1.0 - share))
+    for k in range(1, 19):
+        sky.window(k * WINDOW_S)
+    assert [at_s for at_s, name in sky.flags() if name == JUMP] == [40.0 + 2 * WINDOW_S]
+    error = sky.story.state.registration.alpha.vector - sky.mean(45.0, WINDOW_S)
+    assert np.all(np.abs(error) < 4 * WINDOW)
+
+
+@pytest.mark.parametrize("first", [-LARGE, LARGE[[1, 0, 2, 3]], 1.5 * LARGE])
+def test_two_windows_far_out_that_no_jump_explains_are_none(first):
+    """The other way, another way, and beyond the place that the next one tells."""
+    sky = Sky(5)
+    for k in range(1, 11):
+        sky.window(k * WINDOW_S)
+    for k, aside in ((11, first), (12, LARGE)):
+        sky.jump, sky.at_s = aside, 0.0
+        sky.window(k * WINDOW_S)
+    assert JUMP not in {name for _, name in sky.flags()}
+
+
 def test_a_jump_between_windows_is_flagged_by_the_looks():
     """10 %, the bias learnt from windows before: two looks at most, half of the time within 5 s."""
     found = []

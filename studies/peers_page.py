@@ -81,7 +81,8 @@ def page(matrices: Sequence[tuple[Case, Measured]], answers: Sequence[Answer]) -
         "\n## The registration found\n",
         _READING,
         "\n",
-        _table(straight),
+        _table([a for a in straight if a.question is Question.ALL]),
+        _few([a for a in straight if a.question is Question.FEW]),
         _TURNED,
         "\n",
         _table(turned),
@@ -148,6 +149,18 @@ def _table(answers: Sequence[Answer]) -> str:
             )
             for answer in answers
         ),
+    )
+
+
+def _few(answers: Sequence[Answer]) -> str:
+    """Return what the fits of the lowest modes alone come to."""
+    if not answers:
+        return ""
+    x, y, turned, size = np.max(np.abs([a.error * _PERCENT for a in answers]), axis=0)
+    reached = sum(a.as_asked for a in answers)
+    return (
+        f"\nWith the 20 lowest modes {reached} of {len(answers)} are as asked; largest errors "
+        f"{x:.3f}, {y:.3f} % of a subaperture, {turned:.4f} deg, {size:.4f} %.\n"
     )
 
 

@@ -229,13 +229,10 @@ def runbook(acts: Mapping[str, str]) -> str:
         table(("word", "what it forbids while the alarm lasts"), list(acts.items())),
     ]
     for name, kind in ALARMS.items():
-        lines = [
-            ("It is", kind.severity.value),
-            ("What is the matter", kind.means),
-            ("What to do", kind.do),
-            ("It forbids", ", ".join(f"`{act}`" for act in acts if act in kind.forbids)),
-            ("Who can end it", f"the {kind.party}" if kind.party else ""),
-            ("A refusal says", kind.because),
-        ]
-        parts += [f"## {name}", "\n".join(f"- **{head}**: {text}" for head, text in lines if text)]
+        forbids = ", ".join(f"`{act}`" for act in acts if act in kind.forbids)
+        head = [f"*{kind.severity.value}*", forbids and f"forbids {forbids}"]
+        head.append(f"the {kind.party} can end it" if kind.party else "")
+        means = kind.means[:1].upper() + kind.means[1:]
+        do = f"**Do**: {kind.do}."
+        parts += [f"## {name}", "; ".join(part for part in head if part), f"{means}.", do]
     return page("Runbook: what to do about an alarm", *parts)

@@ -41,6 +41,12 @@ NO_LONGER_STALE = 0.8
 """Share of the stale limit that σ must be below before α is stale no more: one that wavers about
 the limit does not come and go."""
 
+FIRST_WINDOWS = 5
+"""Windows that a faint star needs until σ is within its limit for the first time,"""
+
+FIRST_WINDOWS_S = 10.0
+"""as long as they follow one another within this: σ shrinks then, and is no alarm."""
+
 CANDIDATE_FOR_S = 60.0
 """A jump that nothing has confirmed or denied for so long is no longer waited for."""
 
@@ -198,7 +204,7 @@ def age(turn: Turn) -> None:
         elif turn.dither is None and _too_wide_for_the_gate(turn.state, known):
             want_window(turn, "σ has grown beyond what the stability gate accepts")
         turn.known = replace(known, standing=standing)
-    text = _why_stale(turn.state)
+    text = _why_stale(turn.state, turn.now_ns)
     if text is None:
         turn.calm(STALE)
     else:
@@ -290,14 +296,23 @@ def _without_old_candidate(known: Registration, now_ns: int) -> Registration:
     return replace(known, candidate=None, doubt=doubt, doubt_voids=True)
 
 
-def _why_stale(state: TrackerState) -> str | None:
+def _why_stale(state: TrackerState, now_ns: int) -> str | None:
     """Return why α is worth too little for a closed loop, in the words of its validity, or None."""
     known = state.registration
     if known is None or state.rtc is None or not state.rtc.in_loop or known.n_windows == 0:
         return None
+    if state.alarm(STALE) is None and _sharpens(known, now_ns):
+        return None
     if known.standing.validity in _WORTHLESS and not known.doubt:
         return f"{known.standing.reason}: have it dithered"
     return None
+
+
+def _sharpens(known: Registration, now_ns: int) -> bool:
+    """Return whether σ is above its limit because only the first windows have come so far."""
+    since_s = (now_ns - known.window_ns_utc) / SECOND_NS
+    few = known.n_windows < FIRST_WINDOWS and since_s < FIRST_WINDOWS_S
+    return few and known.standing.validity is Validity.STALE
 
 
 def _too_wide_for_the_gate(state: TrackerState, known: Registration) -> bool:

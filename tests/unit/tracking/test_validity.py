@@ -100,6 +100,16 @@ class TestTime:
         assert not story.alarms
         assert story.state.dither_due_since_ns_utc is None
 
+    def test_a_sigma_that_the_first_windows_still_bring_down_is_no_alarm(self):
+        """On a faint star one says less of α than the limit asks; none that follows is one."""
+        story = Story(Mode.HOLD).meet()
+        for _ in range(2):
+            story.see(covariance=np.diag(1.9 * POLICY.stale_sigma) ** 2)
+            assert worth(story) is Validity.STALE
+            assert "estimate-stale" not in story.alarms
+        story.wait(11)
+        assert "estimate-stale" in story.alarms
+
     def test_an_alarm_that_lasts_says_the_same_all_the_time(self, story):
         story.wait(80)
         texts = set()

@@ -90,7 +90,7 @@ def _show(service: Service, request: Request, options: argparse.Namespace) -> st
     document, tag = service.get(path_of(request.decides_on, options))
     about = document
     if "id" not in options:
-        about = service.get(f"{request.decides_on}/previous").document
+        about, tag = service.get(f"{request.decides_on}/previous")
     options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
         lines = list(reconstructor_lines(about))

@@ -250,7 +250,7 @@ const BUSY = new Set(["approve", "rollback", "dither-start", "acquire", "measure
 const DECIDED_ON = {
   approve: (orders) => `v1/reconstructors/${encodeURIComponent(orders.proposal.id)}`,
   reject: (orders) => `v1/reconstructors/${encodeURIComponent(orders.proposal.id)}`,
-  rollback: () => "v1/reconstructors",
+  rollback: (orders) => `v1/reconstructors/${encodeURIComponent(orders.before.id)}`,
 };
 
 // What else an order needs: why it cannot be given.
@@ -409,10 +409,8 @@ const ORDERS = {
       path: `v1/reconstructors/${encodeURIComponent(record.id)}/reject`,
     };
   },
-  rollback(orders, _, { reconstructors, in_use: used }) {
-    const [before, inUse] = [beforeOf(reconstructors), reconstructors.find((r) => r.id === used)];
-    const { state } = orders;
-    needs(before, "no earlier reconstructor has been in use");
+  rollback(orders, _, before) {
+    const { state, inUse } = orders;
     return {
       title: `Roll back to ${before.id}`,
       facts: [

@@ -7,7 +7,7 @@ said. What takes longer is seen in the state and in the events.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeVar
 
@@ -257,20 +257,22 @@ class Client:
         return await self._orders(command, self.caller, links)
 
     async def decides(
-        self, command: Command, shown: Callable[[TrackerState], Response], **links: str
+        self, command: Command, *shown: Callable[[TrackerState], Response], **links: str
     ) -> AcceptedView:
-        """Do the same, if what is ``shown`` is still what whoever decides has seen."""
+        """Do the same, if one of what is ``shown`` is still what whoever decides has seen."""
         caller = replace(self.caller, check=lambda: self._check(shown))
         return await self._orders(command, caller, links)
 
-    def _check(self, shown: Callable[[TrackerState], Response]) -> None:
+    def _check(self, shown: Sequence[Callable[[TrackerState], Response]]) -> None:
         if self.seen is None:
             if self.strict:
                 raise UntaggedError("found no If-Match, expected the ETag of what is decided on")
             return
-        now = shown(self.service.snapshot().tracker).headers["ETag"]
-        if self.seen != "*" and now not in {tag.strip() for tag in self.seen.split(",")}:
-            raise StaleError(f"found If-Match {self.seen:.80}, it is {now} now: look again")
+        state = self.service.snapshot().tracker
+        now = [each(state).headers["ETag"] for each in shown]
+        if self.seen != "*" and not {tag.strip() for tag in self.seen.split(",")} & {*now}:
+            told = " or ".join(now)
+            raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: look again")
 
     async def _orders(
         self, command: Command, caller: Caller, links: dict[str, str]
@@ -325,6 +327,15 @@ def _all(state: TrackerState) -> Response:
     return tagged(state, RECONSTRUCTORS)
 
 
+def _before(state: TrackerState) -> Response:
+    """Return what shows the reconstructor that was in use before; where there is none, all.
+
+    It stays as it is while the one in use is judged and others are proposed.
+    """
+    before = state.reconstructor(state.previous or "")
+    return _all(state) if before is None else tagged(before)
+
+
 _DECIDES: dict[int | str, Any] = {**UNKNOWN, **DECISION}
 
 
@@ -358,7 +369,7 @@ async def rollback(client: ClientDep, command: Annotated[Rollback, body(Rollback
 
     It is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
-    return await client.decides(command, _all, reconstructors=_ALL)
+    return await client.decides(command, _all, _before, reconstructors=_ALL)
 
 
 @router.post("/stop", status_code=202)

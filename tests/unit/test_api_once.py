@@ -154,6 +154,27 @@ async def test_who_decides_on_what_has_changed_since_is_told_to_look_again(
     assert len(service.commands) == 4
 
 
+async def test_a_rollback_is_decided_on_the_one_before_whatever_is_judged_or_proposed_beside_it(
+    client, service
+):
+    def use(*records):
+        service.tracker = replace(service.tracker, reconstructors=records, in_use=records[-1].id)
+
+    async def back(tag):
+        return (await client.post("/v1/rollback", headers={"If-Match": tag})).status_code
+
+    before, used = replace(CM, state=MatrixState.SUPERSEDED), replace(CM, id="cm-2")
+    use(before, replace(used, state=MatrixState.APPLIED))
+    all_, one = [
+        (await client.get(f"/v1/reconstructors{path}")).headers["etag"] for path in ("", "/cm-1")
+    ]
+    assert (await client.get("/v1/reconstructors/previous")).headers["etag"] == one
+    use(before, replace(used, state=MatrixState.APPLIED, reason="judged again"))
+    assert (await back(all_), await back(one)) == (412, 202)
+    use(before, replace(used, state=MatrixState.SUPERSEDED), replace(used, id="cm-3"))
+    assert await back(one) == 412
+
+
 @pytest.mark.parametrize(("seen", "order"), DECISIONS)
 async def test_who_wants_to_be_held_to_it_must_say_what_was_seen(client, service, seen, order):
     strict = {"Prefer": "respond-async, handling=strict"}

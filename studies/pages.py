@@ -38,7 +38,7 @@ _STATES: dict[str, type[StrEnum]] = {
 
 
 def states() -> str:
-    """Return docs/states.md: what the service can be in, from the tables that it goes by."""
+    """Return docs/reference/states.md: what the service can be in, from its own tables."""
     parts = [
         "# What the service can be in",
         "Written by `python -m studies.pages` from the tables that the service goes by; "
@@ -57,13 +57,14 @@ def states() -> str:
         "be acknowledged again; one that an operator's order ends has been seen. A muted one "
         "is not shown for a time, of twelve hours at most, and forbids what it "
         "forbids. Operators' acknowledgements and mutes outlive a restart.",
-        "[The runbook](runbook.md) has each: what is the matter, what to do, what it forbids.",
+        "[The runbook](../operate/runbook.md) has each: what is the matter, what to do, what it "
+        "forbids.",
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def house() -> str:
-    """Return docs/house.md: every file of every program by its first line."""
+    """Return docs/reference/house.md: every file of every program by its first line."""
     parts = [
         "# Which file has what",
         "Written by `python -m studies.pages` from the first line of each file; change those.",
@@ -101,26 +102,26 @@ def _whole(number: str) -> float:
 
 
 def rest() -> str:
-    """Return docs/rest.md."""
+    """Return docs/integrate/rest.md."""
     return reference.rest(json.loads(openapi()))
 
 
 def runbook() -> str:
-    """Return docs/runbook.md."""
+    """Return docs/operate/runbook.md."""
     acts = {act: _lower(text) for act, text in _described(Act).items()}
     return reference.runbook(acts)
 
 
 PAGES = {
-    "states.md": states,
-    "house.md": house,
+    "reference/states.md": states,
+    "reference/house.md": house,
     "rtc.md": rtc,
     "openapi.json": openapi,
-    "settings.md": reference.settings,
-    "instrument.md": reference.instrument,
-    "cli.md": reference.commands,
-    "rest.md": rest,
-    "runbook.md": runbook,
+    "reference/settings.md": reference.settings,
+    "reference/instrument.md": reference.instrument,
+    "reference/cli.md": reference.commands,
+    "integrate/rest.md": rest,
+    "operate/runbook.md": runbook,
 }
 
 

@@ -42,7 +42,7 @@ def page(title: str, *parts: str) -> str:
 
 
 def settings() -> str:
-    """Return docs/settings.md: every key of the service's settings."""
+    """Return docs/reference/settings.md: every key of the service's settings."""
     intro = (
         "Command line > environment > TOML file > defaults. A key `port` in the section `[api]` is "
         "`PYRCAL_API__PORT` in the environment; values other than text are written as in TOML "
@@ -53,12 +53,12 @@ def settings() -> str:
 
 
 def instrument() -> str:
-    """Return docs/instrument.md: every key of an instrument file."""
+    """Return docs/reference/instrument.md: every key of an instrument file."""
     intro = (
         "A TOML file that tells of the telescope, the pyramid, the mirror and how the RTC lists "
-        "slopes. What has no default must be there. [Fitting a measured matrix](fitting.md) has "
-        "the smallest one, and what orientation means. A reference to data is `path:/dataset`, "
-        "relative to the file."
+        "slopes. What has no default must be there. [Fitting a measured "
+        "matrix](../integrate/fitting.md) has the smallest one, and what orientation means. A "
+        "reference to data is `path:/dataset`, relative to the file."
     )
     return page("The instrument file", intro, *_tables(WHOLE))
 
@@ -137,7 +137,7 @@ def _text(field: Schema) -> str:
 
 
 def commands() -> str:
-    """Return docs/cli.md: every command with its options."""
+    """Return docs/reference/cli.md: every command with its options."""
     intro = (
         "`make` puts `pyrcal` into `.venv/bin`. Each command tells the same with `--help`; "
         "`pyrcal sim --help` and `pyrcal campaign --help` are manuals of their own. What commands "
@@ -198,10 +198,10 @@ def _options(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
 
 
 def rest(described: Schema) -> str:
-    """Return docs/rest.md: what may be asked over REST, from its OpenAPI document."""
+    """Return docs/integrate/rest.md: what may be asked over REST, from its OpenAPI document."""
     intro = (
         "At `http://127.0.0.1:8080`, unless the settings say otherwise. `/docs` shows every field "
-        "and tries it; [openapi.json](openapi.json) is for programs. Errors are "
+        "and tries it; [openapi.json](../openapi.json) is for programs. Errors are "
         "`application/problem+json`."
     )
     by_tag: dict[str, list[tuple[str, str]]] = {}
@@ -220,7 +220,7 @@ def rest(described: Schema) -> str:
 
 
 def runbook(acts: Mapping[str, str]) -> str:
-    """Return docs/runbook.md: what to do about each alarm; ``acts`` is what one may forbid."""
+    """Return docs/operate/runbook.md: what to do about each alarm; ``acts``: what it may forbid."""
     parts = [
         "An alarm lasts as long as what it tells of. It is on the page, in `GET /v1/state`, on "
         "the wire (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "

@@ -77,8 +77,8 @@ REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own or
 the array 'interaction_matrix' or the one that --dataset names. What is printed on standard output
 is the answer; progress goes to standard error. Exit status: 0 accepted, 1 fitted but refused (the
 verdict says why), 2 input that cannot be used. OOPAO's metre is (n - 1)/n of ours for a pupil of n
-points: its mirror comes out that much smaller. docs/fitting.md explains format, orientation and
-verdicts.
+points: its mirror comes out that much smaller. docs/integrate/fitting.md explains format,
+orientation and verdicts.
 """
 
 _RECONSTRUCT = """

@@ -140,7 +140,7 @@ def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
     elif recipe.orientation is None:
         say(
             'note: slopes.orientation is "auto" and no fit has found it: the reconstructor is for '
-            "slopes in the axes of docs/fitting.md"
+            "slopes in the axes of docs/integrate/fitting.md"
         )
     return replace(instrument, slopes=recipe)
 

@@ -53,7 +53,7 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
     key.set_defaults(module="service.commands.key")
     key.description = (
         "Make, list and revoke the keys of those who may ask a service, in its data_dir. A running "
-        "service goes by them at once. docs/operating.md says how a key is shown."
+        "service goes by them at once. docs/operate/operating.md says how a key is shown."
     )
     key.epilog = "Exit status: 0 done, 2 it cannot be done."
     settings = "the service's settings, TOML"

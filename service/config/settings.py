@@ -339,7 +339,7 @@ class RuleTable(Table):
     ``state.elevation_deg``; how it is compared; with what."""
 
     blocks: tuple[Literal["measure", "decide", "send_new", "send_known", "ask"], ...] = ()
-    """What is forbidden while it holds, as docs/states.md says of alarms."""
+    """What is forbidden while it holds, as docs/reference/states.md says of alarms."""
 
     severity: Literal["warning", "serious", "critical"] = "serious"
     """How much it matters."""

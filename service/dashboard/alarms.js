@@ -26,7 +26,7 @@ export function unseen(state) {
 
 // Where the manual says what to do; null: rules of an observatory's own are not in it.
 export function runbookOf(name) {
-  return name.includes(".") ? null : `manual/runbook.html#${name}`;
+  return name.includes(".") ? null : `manual/operate/runbook.html#${name}`;
 }
 
 // The first clause stands by itself: it is what is read from afar.

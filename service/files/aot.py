@@ -99,7 +99,7 @@ def write_aot(
 ) -> None:
     """Write telemetry and α over time as AOT FITS.
 
-    Slopes are in the order, axes and signs of docs/conventions.md, ``(t, 2, n_valid)``, pixels
+    Slopes are in the order, axes and signs of conventions.md, ``(t, 2, n_valid)``, pixels
     ``(t, 4, n_valid)``; modal commands are metres OPD, ``(t, n_modes)``. Each reconstructor in use
     has a loop of its own. α is the ``transformation_matrix`` ``(3, 3, t)`` of the mirror: from
     metres in the pupil, as its actuators are drawn, to metres on the sensor.

@@ -1,7 +1,7 @@
 """The alarms by name: how much each matters, what it forbids, and what operators did about it.
 
-The one table of them is alarms.toml; docs/runbook.md shows it. What operators do about them is as
-LSST's ts_watcher has it (doc/displaying_alarms.rst there).
+The one table of them is alarms.toml; docs/operate/runbook.md shows it. What operators do about them
+is as LSST's ts_watcher has it (doc/displaying_alarms.rst there).
 """
 
 from __future__ import annotations

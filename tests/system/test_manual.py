@@ -33,7 +33,7 @@ def desk(tmp_path_factory):
     folder = tmp_path_factory.mktemp("desk")
     (bench,) = [
         text
-        for text, _ in blocks_of(ROOT / "docs" / "fitting.md", "toml")
+        for text, _ in blocks_of(ROOT / "docs" / "integrate" / "fitting.md", "toml")
         if text.startswith("[instrument]")
     ]
     (folder / "bench.toml").write_text(bench, encoding="utf-8")
@@ -45,6 +45,8 @@ def desk(tmp_path_factory):
     shutil.copytree(ROOT / "tests" / "data" / "tiny", folder / "tests" / "data" / "tiny")
     return folder
 
+
+HOWTO = ROOT / "docs" / "operate" / "howto.md"
 
 ASKED = {"status", "reconstructors", "export", "audit", "dither", "stop", "resume"}
 """Commands to a running service that end at once and leave the night as it was."""
@@ -95,9 +97,9 @@ def test_the_bench_of_the_manual_is_fitted_where_it_was_measured(desk, tmp_path)
 
 
 def asked_for_real(night, folder):
-    """What docs/operating.md types at a running service, in its order: each is answered."""
+    """What docs/operate/operating.md types at a running service, in its order: each is answered."""
     done = []
-    for words in typed(ROOT / "docs" / "operating.md"):
+    for words in typed(ROOT / "docs" / "operate" / "operating.md"):
         if words[0] in ASKED and not {"ID", "measurement", "recording"} & set(words):
             answer = pyrcal(words, folder, folder, PYRCAL_URL=f"http://127.0.0.1:{night.port}")
             told = {0, 1} if words[0] == "status" else {0}  # 1: there is an alarm
@@ -107,8 +109,8 @@ def asked_for_real(night, folder):
 
 
 def test_a_night_is_rehearsed_with_the_bench_of_the_manual(desk, tmp_path):
-    """Run, sim and check-rtc of docs/howto.md, each as it is written there."""
-    written = [words for words in typed(ROOT / "docs" / "howto.md") if "bench.toml" in words]
+    """Run, sim and check-rtc of docs/operate/howto.md, each as it is written there."""
+    written = [words for words in typed(HOWTO) if "bench.toml" in words]
     by_name = {name: [w for w in written if w[0] == name] for name in ("run", "sim", "check-rtc")}
     with a_night(tmp_path) as night:
 
@@ -130,7 +132,7 @@ def test_a_night_is_rehearsed_with_the_bench_of_the_manual(desk, tmp_path):
         assert "the RTC there is that of system bench" in passive.log
         os.kill(service.popen.pid, 2)
         service.ended(20.0)
-        kept = [words for words in typed(ROOT / "docs" / "howto.md") if words[0] == "archive"]
+        kept = [words for words in typed(HOWTO) if words[0] == "archive"]
         for words in kept:
             done = pyrcal(words, desk, night.directory / "data")
             assert done.returncode == 0, (words, done.stderr)

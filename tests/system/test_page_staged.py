@@ -76,7 +76,7 @@ def proposed(service):
 
 
 def test_cause_and_remedy_of_a_critical_alarm_are_the_largest_thing_of_the_page(page):
-    runbook = (ROOT / "docs" / "runbook.md").read_text(encoding="utf-8")
+    runbook = (ROOT / "docs" / "operate" / "runbook.md").read_text(encoding="utf-8")
     for name, kind in CRITICAL.items():
         page.service.calm()
         page.service.alarm(name, f"{kind.means}; {kind.do}")
@@ -94,7 +94,7 @@ def test_cause_and_remedy_of_a_critical_alarm_are_the_largest_thing_of_the_page(
             assert bottom_px(page, "#critical .buttons") < FIRST_SCREEN * size[1]
             assert page.js("document.documentElement.scrollWidth") <= size[0]
         link = page.js("document.querySelector('#critical a').href")
-        assert link.endswith(f"/manual/runbook.html#{name}")
+        assert link.endswith(f"/manual/operate/runbook.html#{name}")
         assert f"\n## {name}\n" in runbook
 
 

@@ -46,8 +46,9 @@ def wheel(tmp_path_factory):
 
 def test_a_wheel_has_the_manual_inside(wheel):
     names = set(wheel.namelist())
-    pages = [path.stem for path in (ROOT / "docs").glob("*.md")]
-    assert {f"service/manual/{page}.html" for page in pages} <= names
+    docs = ROOT / "docs"
+    pages = [path.relative_to(docs).with_suffix(".html") for path in docs.rglob("*.md")]
+    assert {f"service/manual/{page.as_posix()}" for page in pages} <= names
     assert "service/manual/searchindex.js" in names
     assert any(name.endswith("tracking.png") for name in names)
 

@@ -257,7 +257,7 @@ def test_what_needs_no_mathematics_imports_none(tmp_path):
     [one for one in AT_ONCE if one[0][0] in {"--help", "status"} or "none.h5" in one[0]],
 )
 def test_what_needs_no_mathematics_comes_at_once(words, status):
-    """0.3 s on the machine of docs/operating.md; a slower one may take twice as long."""
+    """0.3 s on the machine of docs/operate/operating.md; a slower one may take twice as long."""
     spent_s, found = processor_s(*words, enough_s=0.6)
     assert found == status
     assert spent_s < 0.6

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from service.config.mirrors import grid
 from service.model.kinds import Stop
-from service.model.misregistration import Misregistration, rotation
+from service.model.misregistration import Misregistration
 from studies.peers import KEPT, REQUIREMENTS, ROOT, environment
-from studies.peers_cases import in_degrees
+from studies.peers_cases import in_degrees, mirror_points
 from studies.peers_pushpull import Bench, Measured, read_product, write_job
 
 Array = NDArray[Any]
@@ -42,7 +42,28 @@ WITH_PUPIL = Misregistration(
 )
 """In quarters of a subaperture: SPECULA's pupil images move by whole samples."""
 
-_NAMES = {NEAR: "near", FAR: "far", WITH_PUPIL: "with-pupil"}
+FRESH = Misregistration(
+    shift_x_subap=-0.33, shift_y_subap=0.21, rotation_rad=np.deg2rad(1.4), magnification=1.011
+)
+FRESH_FAR = Misregistration(
+    shift_x_subap=0.07, shift_y_subap=0.62, rotation_rad=np.deg2rad(-0.7), magnification=0.994
+)
+FRESH_WITH_PUPIL = Misregistration(
+    shift_x_subap=-0.5, shift_y_subap=-0.25, rotation_rad=np.deg2rad(-1.7), magnification=1.013
+)
+"""Measured after every constant of the fit was set."""
+
+_NAMES = {
+    NEAR: "near",
+    FAR: "far",
+    WITH_PUPIL: "with-pupil",
+    FRESH: "fresh",
+    FRESH_FAR: "fresh-far",
+    FRESH_WITH_PUPIL: "fresh-with-pupil",
+}
+
+OBSCURATION, OBSCURED = 0.14, 0.25
+"""Linear central obscuration of the bench, and of another whose user believes it to be the same."""
 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -63,10 +84,15 @@ class ZonalCase:
     own_mirror: bool = False
     """Whether the peer's own mirror is moved by its own tools."""
 
+    obscuration_ratio: float = OBSCURATION
+    """Of the peer's telescope."""
+
     @property
     def name(self) -> str:
         """Of its files."""
-        return f"{self.peer}-{_NAMES[self.alpha]}{'-own-mirror' if self.own_mirror else ''}"
+        kind = "-own-mirror" if self.own_mirror else ""
+        kind += "-obscured" if self.obscuration_ratio > OBSCURATION else ""
+        return f"{self.peer}-{_NAMES[self.alpha]}{kind}"
 
     @property
     def bench(self) -> Bench:
@@ -75,7 +101,7 @@ class ZonalCase:
         moved = self.stop is Stop.MIRROR
         return Bench(
             diameter_m=8.0,
-            obscuration_ratio=0.14,
+            obscuration_ratio=self.obscuration_ratio,
             n_subapertures=20,
             pupil_separation_subap=26,
             wavelength_m=790e-9,
@@ -97,6 +123,20 @@ def zonal_cases(peer: str) -> tuple[ZonalCase, ...]:
     if peer == "oopao":
         asked.append(ZonalCase(peer=peer, stop=Stop.TELESCOPE, alpha=NEAR, own_mirror=True))
     return tuple(asked)
+
+
+def fresh_cases(peer: str) -> tuple[ZonalCase, ...]:
+    """Return matrices at registrations that no constant of the fit was chosen on."""
+    return (
+        ZonalCase(peer=peer, stop=Stop.TELESCOPE, alpha=FRESH),
+        ZonalCase(peer=peer, stop=Stop.TELESCOPE, alpha=FRESH_FAR),
+        ZonalCase(peer=peer, stop=Stop.MIRROR, alpha=FRESH_WITH_PUPIL),
+    )
+
+
+def obscured_case(peer: str) -> ZonalCase:
+    """Return the matrix of a telescope that is obscured more than its user says."""
+    return ZonalCase(peer=peer, stop=Stop.TELESCOPE, alpha=FRESH, obscuration_ratio=OBSCURED)
 
 
 def actuators_m() -> NDArray[np.float64]:
@@ -136,12 +176,7 @@ def _pushed(case: ZonalCase) -> dict[str, Array]:
             "mode_to_actuator": np.eye(len(positions_m)),
         }
     bench = case.bench
-    along = (np.arange(bench.n_pupil) - (bench.n_pupil - 1) / 2) / bench.sampling
-    x, y = np.meshgrid(along, along)
-    points = np.column_stack([x.ravel(), y.ravel()])
-    if case.stop is Stop.TELESCOPE:
-        points = points - case.alpha.vector[:2]
-    points = points @ rotation(case.alpha.rotation_rad) / case.alpha.magnification
+    points = mirror_points(bench, case.alpha, case.stop)
     metres = points * bench.diameter_m / bench.n_subapertures
     apart = np.linalg.norm(metres - positions_m[:, None], axis=2)
     shapes = COUPLING ** ((apart / PITCH_M) ** 2)
@@ -151,7 +186,7 @@ def _pushed(case: ZonalCase) -> dict[str, Array]:
 def main() -> int:
     """Measure what is not yet measured, of the peers named."""
     for peer in sys.argv[1:]:
-        for case in zonal_cases(peer):
+        for case in (*zonal_cases(peer), *fresh_cases(peer), obscured_case(peer)):
             measured = measured_zonal(case)
             print(case.name, measured.matrix.shape, f"{measured.seconds:.0f} s")
     return 0

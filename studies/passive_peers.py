@@ -22,10 +22,11 @@ from OOPAO.Atmosphere import Atmosphere
 from service.config import load_instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.kinds import Stop
-from service.model.misregistration import Misregistration, rotation
+from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.telemetry import passive
 from service.telemetry.frames import FrameBlock
+from studies.peers_cases import mirror_points
 from studies.peers_oopao import Oopao
 from studies.peers_pushpull import Bench
 
@@ -112,10 +113,7 @@ def basis() -> ModalBasis:
 
 def shapes(alpha: Misregistration) -> Array:
     """Return the modes where the mirror lies, on the peer's pupil ``(n_modes, n * n)``."""
-    along = (np.arange(BENCH.n_pupil) - (BENCH.n_pupil - 1) / 2) / BENCH.sampling
-    x, y = np.meshgrid(along, along)
-    points = np.column_stack([x.ravel(), y.ravel()]) - alpha.vector[:2]
-    points = points @ rotation(alpha.rotation_rad) / alpha.magnification
+    points = mirror_points(BENCH, alpha, Stop.TELESCOPE)
     return np.asarray(basis().render(points), np.float32).T
 
 

@@ -146,21 +146,23 @@ def job_arrays(case: Case) -> dict[str, Array]:
             "pitch_m": np.array(instrument().analytic_mirror.pitch_m),
             "mode_to_actuator": basis(Influence.GAUSSIAN).mode_to_actuator,
         }
-    points = mirror_points(case)
+    points = mirror_points(bench(case), case.alpha, case.stop)
     shapes = basis(Influence.THIN_PLATE).render(points)
     n = bench(case).n_pupil
     return {"shapes_m": shapes.T.reshape(N_MODES, n, n)}
 
 
-def mirror_points(case: Case) -> Array:
-    """Return where each point of the peer's pupil grid, row-major, lies on the mirror."""
-    told = bench(case)
+def mirror_points(told: Bench, alpha: Misregistration, stop: Stop) -> Array:
+    """Return where each point of a peer's pupil grid, row-major, lies on the mirror, subapertures.
+
+    Where the mirror is the stop the pupil moves with it: only what turns it and its size is left.
+    """
     along = (np.arange(told.n_pupil) - (told.n_pupil - 1) / 2) / told.sampling
     x, y = np.meshgrid(along, along)
     points = np.column_stack([x.ravel(), y.ravel()])
-    if case.stop is Stop.TELESCOPE:
-        points = points - case.alpha.vector[:2]
-    return np.asarray(points @ rotation(case.alpha.rotation_rad) / case.alpha.magnification)
+    if stop is Stop.TELESCOPE:
+        points = points - alpha.vector[:2]
+    return np.asarray(points @ rotation(alpha.rotation_rad) / alpha.magnification)
 
 
 def digest(case: Case, requirement: str) -> str:

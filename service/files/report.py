@@ -119,7 +119,7 @@ _ROWS = (
     ("shift x", "subapertures", 4),
     ("shift y", "subapertures", 4),
     ("rotation", "deg", 4),
-    ("magnification", "ratio", 5),
+    ("magnification", "ratio, of the mirror as drawn over the pupil as told", 5),
 )
 """Name, unit and decimals of each parameter."""
 

@@ -1,7 +1,8 @@
 """What a matrix says of its instrument: the other stop, the coupling of the mirror, the modulation.
 
 The registration is fitted together with the last two; what is found is held against the file. Of
-what is the one or the other (stop, normalisation, kind of influence) the other is tried as well.
+what is the one or the other (stop, normalisation, kind of influence) the other is tried as well,
+and so are other pupils.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from service.fit.methods import Settled, spread
 from service.fit.models import BETTER, CHEAP, FitModels, Optic, Other
+from service.fit.pupil_checks import Few, other_pupils
 from service.fit.solver import refine
 from service.fit.uncertainty import Uncertainty
 from service.model.misregistration import Misregistration
@@ -122,23 +124,15 @@ def rivals(settled: Settled) -> tuple[Rival, ...]:
     Each is allowed its own registration, coupling and modulation, to first order about those found;
     where the matrix cannot tell, it is fitted as well.
     """
-    models, solution, target = settled.models, settled.solution, settled.target
-    modes = spread(target.n_modes)
-    few = target.column_subset(modes)
-    here = Misregistration.from_vector(solution.vector)
-    # derivatives hardly depend on the hypothesis: those of the instrument as it is serve all
-    derivatives = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
-
-    def left(tried: FitModels) -> float:
-        models.counter.n += 1
-        matrix = tried.model(CHEAP, tried.basis.subset(modes)).interaction_matrix(here)
-        return few.project(matrix, derivatives).chi_at_best
-
-    own, found = left(models), []
-    for change, other in models.other_instruments.items():
-        share, moved = left(other) / own, np.zeros(4)
+    few, solution = Few(settled), settled.solution
+    own = few.left(few.matrix(settled.models))
+    found = [
+        Rival(change=change, share=share, moved=moved) for change, share, moved in other_pupils(few)
+    ]
+    for change, other in settled.models.other_instruments.items():
+        share, moved = few.left(few.matrix(other)) / own, np.zeros(4)
         if change.believed <= share < 1.0 / BETTER:
-            there = refine(other, target, solution.vector, settled.nuisances)
+            there = refine(other, settled.target, solution.vector, settled.nuisances)
             moved = there.vector - solution.vector if there.converged else moved
         found.append(Rival(change=change, share=share, moved=moved))
     return tuple(sorted(found, key=lambda one: one.share / one.change.believed))

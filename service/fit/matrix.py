@@ -28,12 +28,14 @@ from service.fit.methods import (
     settle_at,
 )
 from service.fit.models import FitModels
+from service.fit.noise import structure
 from service.fit.orientation import (
     DOUBTFUL,
     LEAST_CORRELATION,
     find_orientation,
     overruled,
 )
+from service.fit.pupil_checks import Few, left_by_light
 from service.fit.reference import Reference, Target, checked, target_of
 from service.fit.remarks import remarks
 from service.fit.solver import nuisances_of
@@ -345,6 +347,10 @@ def _answer(
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
     others = rivals(settled)
+    power = np.sum(target.matrix[target.rows] ** 2, axis=0)
+    noise = None if usable.noise is None else usable.noise / usable.passes
+    structured = structure(seen.residual, power, noise)
+    by_light = residual_fraction**2 * (1.0 - left_by_light(Few(settled)))
     sure = uncertainty(
         seen,
         values,
@@ -362,6 +368,8 @@ def _answer(
     evidence = Evidence(
         solution=solution,
         residual_fraction=residual_fraction,
+        structure=structured,
+        after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
         uncertainty=sure,
         landing=found.landing,
         rivals=others,

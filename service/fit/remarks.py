@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from service.fit.reference import Target
 from service.fit.solver import Solution
-from service.fit.verdict import Evidence, factor_of_passes
+from service.fit.verdict import MOST_STRUCTURE, Evidence, factor_of_passes
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE
@@ -28,8 +28,8 @@ OWN = 0.35
 
 _NAMED = 12
 
-STRAIGHT = 0.02
-"""Distance of the magnification from 1 within which pitch and diameter are as drawn."""
+STRAIGHT = 0.01
+"""Distance of the magnification from 1 beyond which pitch or diameter may be told wrong."""
 
 UNIFORM = 0.06
 """Relative scatter of gains that are off together."""
@@ -64,6 +64,7 @@ def remarks(
         *_order(told.order, found.order),
         *_mirrored(told, found),
         *_optics(evidence),
+        *_light(evidence),
         *_size(evidence),
         *_passes(evidence),
         *_scale(evidence, about),
@@ -110,6 +111,16 @@ def _optics(evidence: Evidence) -> Iterator[str]:
         f"registration allows for it, which moved it by {moved[0]:.2g}, {moved[1]:.2g} "
         f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; correct the instrument file"
     )
+
+
+def _light(evidence: Evidence) -> Iterator[str]:
+    """Yield that uneven light explains what is left over."""
+    if evidence.structure > MOST_STRUCTURE >= evidence.after_light:
+        yield (
+            f"{evidence.structure:.0%} of the signal is left over and no noise; a smooth gain over "
+            "the pupil explains it: uneven light, which sigma allows for; give the light "
+            "(--flux-map), or have the gain fitted (--gain-map)"
+        )
 
 
 def _size(evidence: Evidence) -> Iterator[str]:

@@ -4,6 +4,7 @@ They are made by the FFT pyramid of tests/physics and by Gaussians written out h
 model is in them.
 """
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -193,3 +194,60 @@ def test_actuators_in_millimetres_are_an_error_that_says_what_was_expected():
         ModelError, match=r"bench: found \d+ of 13.* modes that move nothing.* metres"
     ):
         fitted(bench(positions_m=ACTUATORS_M * 1e3))
+
+
+def masked(about: Instrument) -> Instrument:
+    """The same with the RTC's own mask, as users give it."""
+    mask = lit_subapertures(bench())
+    return replace(about, wfs=replace(about.wfs, valid_subapertures=mask))
+
+
+def noisy(share: float) -> np.ndarray:
+    """Every element with as much noise, whatever the actuator's own size."""
+    scatter = np.random.default_rng(8).normal(size=zonal().shape)
+    return zonal() + share * zonal().std() * scatter
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15])
+@pytest.mark.parametrize("told", [0.25, 0.3])
+def test_an_obscuration_told_wrong_is_refused_and_the_right_one_named(told, noise):
+    found = fitted(masked(replace(bench(), obscuration_ratio=told)), noisy(noise))
+    assert not found.accepted
+    named = re.search(r"obscuration_ratio = (0\.\d+)", found.verdict)
+    assert named is not None, found.verdict
+    assert float(named[1]) == pytest.approx(OBSCURATION, abs=0.04)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.2, 0.3])
+def test_noise_that_nobody_has_told_of_is_no_cause_to_refuse(noise):
+    found = fitted(bench(), noisy(noise))
+    assert found.residual_fraction > noise
+    assert found.accepted, found.verdict
+    assert np.all(sigmas_off(found) < 3.0)
+
+
+def test_what_no_cause_explains_is_refused_and_says_how_much_it_is():
+    """An arm across the pupil of which the file has no key, and which is not smooth."""
+    rows, columns = np.nonzero(lit_subapertures(bench()))
+    shaded = np.where(np.abs(rows - columns) < 2, 0.6, 1.0)
+    shaded *= np.where((rows + columns) % 5 == 0, 1.3, 1.0)
+    found = fitted(bench(), zonal() * np.tile(shaded, 2)[:, None])
+    assert not found.accepted
+    assert re.search(
+        r"leaves 1\d% of the signal that is no noise, expected at most 9%", found.verdict
+    )
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.02])
+def test_a_diameter_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_other(factor):
+    found = fitted(replace(bench(), diameter_m=DIAMETER_M * factor))
+    as_told = TRUTH.vector * [1.0, 1.0, 1.0, factor]
+    assert np.all(np.abs(found.alpha.vector - as_told) < 3.0 * found.sigma)
+    assert any("diameter_m" in remark for remark in found.remarks)
+
+
+def test_a_pupil_told_two_percent_small_is_refused_and_the_right_one_named():
+    wfs = replace(bench().wfs, pupil_diameter_subap=N * 0.98)
+    found = fitted(masked(replace(bench(), wfs=wfs)))
+    assert not found.accepted
+    assert re.search(r"pupil_diameter_subap = 12(\.1)? ", found.verdict), found.verdict

@@ -7,7 +7,10 @@ from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
 from tests.numerics import small_instrument
-from tests.unit.fit.bench import GRID, PLAIN, error, fit, instrument, listed, matrix
+from tests.unit.fit.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, listed, matrix
+
+STRAIGHT = replace(ELSEWHERE, magnification=1.006)
+"""So near to 1 that neither pitch nor diameter is doubted."""
 
 RNG = np.random.default_rng(3)
 
@@ -47,6 +50,16 @@ def test_a_modulation_is_found_beside_uneven_light():
     assert np.all(np.abs(corrected.alpha.vector - found.alpha.vector) < sigma)
 
 
+def test_light_that_explains_what_is_left_over_is_named():
+    coordinates = np.linspace(-7.0, 7.0, 57)
+    x, _ = np.meshgrid(coordinates, coordinates)
+    lamp = Illumination(coordinates=coordinates, intensity=1.0 + 0.6 * x / 7.0)
+    found = fit(matrix(illumination=lamp))
+    assert found.accepted, found.verdict
+    assert any("uneven light" in remark for remark in found.remarks)
+    assert not any("uneven light" in remark for remark in fit(matrix()).remarks)
+
+
 def test_a_modulation_off_by_a_tenth_is_lived_with():
     assert fit(matrix(about=changed(modulation_lambda_over_d=3.3))).accepted
 
@@ -83,7 +96,7 @@ def test_twice_what_two_passes_give_is_per_metre_of_surface():
 )
 def test_a_factor_of_two_among_scattered_gains_is_told(factor, passes, words):
     scattered = np.exp(0.2 * np.sin(np.arange(40) * 1.7))
-    found = fit(factor * scattered * matrix(), double_pass=passes)
+    found = fit(factor * scattered * matrix(STRAIGHT), double_pass=passes)
     assert found.accepted
     assert [words in remark for remark in found.remarks] == ([True] if words else [])
 
@@ -93,7 +106,7 @@ def test_an_order_that_the_data_overrule_is_told():
     found = fit(listed(matrix(), SlopeOrder.YX, PLAIN), auto)
     assert found.order is SlopeOrder.YX
     assert any('write order = "yx" into [slopes]' in remark for remark in found.remarks)
-    assert fit(matrix(), auto).remarks == ()
+    assert fit(matrix(STRAIGHT), auto).remarks == ()
 
 
 def test_columns_of_the_wrong_sign_or_in_anothers_place_are_named():
@@ -113,7 +126,7 @@ def test_a_column_that_is_another_modes_is_named():
 
 
 def test_a_matrix_that_is_right_needs_no_remarks():
-    assert fit(matrix(noise=0.1)).remarks == ()
+    assert fit(matrix(STRAIGHT, noise=0.1)).remarks == ()
 
 
 def test_optical_gains_of_a_sky_are_accepted():

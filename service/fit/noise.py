@@ -1,0 +1,66 @@
+"""How much of what a fit leaves over is noise, and how much is something that the model has not.
+
+Noise is another in every element; what an instrument does that its file does not say is the same
+thing in many of them. So the singular values of pure noise are spread as Marchenko and Pastur say,
+and their median tells its size whatever structure lies in the largest.
+
+References
+----------
+Marchenko & Pastur 1967, Math. USSR Sb. 1, 457; Gavish & Donoho 2014, IEEE Trans. Inf. Theory 60,
+5040.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_POINTS = 4001
+"""Of the distribution whose median is taken."""
+
+
+def structure(residual: Array, power: Array, noise: Array | None) -> float:
+    """Return the RMS of what is left over and is no noise, over the RMS of the measurement.
+
+    What is spread evenly over all directions cannot be told from noise and counts as such.
+
+    Parameters
+    ----------
+    residual
+        ``(n_rows, n_modes)`` of the fit.
+    power
+        ``(n_modes,)`` sum of squares of each measured column.
+    noise
+        ``(n_modes,)`` 1 σ of one element of each column, from repeated measurements; None: unknown.
+    """
+    n_rows = len(residual)
+    left = np.sum(residual**2, axis=0) / power
+    # of one stroke for all noise is alike in slopes, of strokes that make slopes alike in shares;
+    # no column is believed to have more of it than is left over there
+    alike_in_slopes = np.minimum(noise_sigma(residual) ** 2 * n_rows / power, left)
+    alike_in_shares = noise_sigma(residual / np.sqrt(power)) ** 2 * n_rows
+    known = np.zeros(1) if noise is None else n_rows * noise**2 / power
+    most = max(np.mean(alike_in_slopes), alike_in_shares, np.mean(known))
+    return float(np.sqrt(max(np.mean(left) - most, 0.0)))
+
+
+def noise_sigma(matrix: Array) -> float:
+    """Return 1 σ of the noise in each element of a matrix that holds something else beside it."""
+    few, many = sorted(matrix.shape)
+    values = np.linalg.svd(matrix, compute_uv=False)
+    return float(np.median(values) / np.sqrt(many * _median_square(few / many)))
+
+
+@cache
+def _median_square(aspect: float) -> float:
+    """Return the median of squared singular values of unit noise, over the longer side."""
+    low, high = (1.0 - np.sqrt(aspect)) ** 2, (1.0 + np.sqrt(aspect)) ** 2
+    # even steps of the angle: the density is infinite at 0 where the matrix is square
+    angle = (np.arange(_POINTS) + 0.5) / _POINTS * np.pi
+    square = (low + high) / 2.0 - (high - low) / 2.0 * np.cos(angle)
+    share = np.cumsum(np.sin(angle) ** 2 / square)
+    return float(np.interp(0.5, share / share[-1], square))

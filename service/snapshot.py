@@ -16,6 +16,8 @@ from service.tracking.activity import Operating, operating
 from service.tracking.alarms import ALARMS, Kind, Note, Severity, Waiting
 from service.tracking.attention import muted, note_of, stale, worst
 from service.tracking.commands import GainGroup
+from service.tracking.interlocks import Permission, permissions
+from service.tracking.policy import Policy
 from service.tracking.registration import Registration
 from service.tracking.sending import why_no_return
 from service.tracking.state import LogEntry, TrackerState
@@ -55,6 +57,9 @@ class Snapshot:
     tracker: TrackerState
     """What is known of registration and reconstructors."""
 
+    policy: Policy
+    """The user's numbers that the service goes by."""
+
     link: LinkStatistics
     """What has passed on the link."""
 
@@ -92,6 +97,11 @@ class Snapshot:
         """What the service is in, as a control room has it."""
         hindered = "; ".join(wait.text for wait in self.waiting_for if wait.hinders)
         return operating(self.tracker, hindered, self.now_ns)
+
+    @property
+    def permitted(self) -> Mapping[str, Permission]:
+        """Which orders may be given now, by name; one that may not says why, and what to do."""
+        return permissions(self.tracker, self.policy, self.now_ns)
 
     @property
     def window_refusal(self) -> LogEntry | None:

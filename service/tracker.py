@@ -15,6 +15,7 @@ from service.tracking import (
     attention,
     dither,
     evidence,
+    interlocks,
     measuring,
     mode_proof,
     offload,
@@ -28,7 +29,6 @@ from service.tracking import (
 )
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import refuse_if_occupied
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.loop import CommandState
@@ -63,7 +63,8 @@ def step(
     UnknownIdError
         If it names a reconstructor nobody has heard of.
     """
-    refuse_if_occupied(state, event, now_ns)
+    if isinstance(event, Command):
+        interlocks.require(state, event, policy, now_ns)
     turn = Turn(state, event, policy, now_ns)
     attention.judge_rules(turn)
     measuring.watch_measurement(turn)

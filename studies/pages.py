@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 from service.api import create_app
-from service.tracking.activity import ALLOWS, OCCUPIES, Occupation, Operation
+from service.tracking.activity import OCCUPIES, Occupation, Operation
 from service.tracking.alarms import Act, Attention, Severity
 from service.tracking.commands import Command
+from service.tracking.interlocks import ALLOWS
 from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
 from service.tracking.state import AcquisitionStage, Mode
@@ -44,7 +45,8 @@ def states() -> str:
         "Written by `python -m studies.pages` from the tables that the service goes by; "
         "change those.",
         "## What runs, and which commands that refuses",
-        "Two may run at a time: what refuses a command says so, and how to end it.",
+        "Two may run at a time: what refuses a command says so, and how to end it. `permitted` in "
+        "`GET /v1/state` says the same of every order as it is now.",
         table(("while", "refused", "the service is"), _refusals()),
     ]
     for title, kind in _STATES.items():

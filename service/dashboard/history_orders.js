@@ -9,12 +9,13 @@ function needed(so, otherwise) {
 export const HISTORY_ORDERS = {
   publish: {
     title: "Publish again",
-    busy: true,
-    needs: (orders, state, id) => (!id ? "no reconstructor is chosen" : id === state.in_use ? `${id} is in use` : ""),
-    about: (orders, id) => `v1/reconstructors/${encodeURIComponent(id)}`,
+    permitted: "publish",
+    about(orders, id) {
+      needed(id, "no reconstructor is chosen");
+      return `v1/reconstructors/${encodeURIComponent(id)}`;
+    },
     make(orders, id, record) {
       const { inUse, state } = orders;
-      needed(record.id !== state.in_use, `${record.id} is in use`);
       return {
         title: `Publish ${record.id} again`,
         facts: [
@@ -32,8 +33,7 @@ export const HISTORY_ORDERS = {
   },
   refit: {
     title: "Refit",
-    busy: true,
-    needs: (orders, state) => (state.registration ? "" : "α is not known yet"),
+    permitted: "refit",
     make(orders) {
       const { rtc, registration, mode } = orders.state;
       return {

@@ -59,32 +59,26 @@ export class Orders {
     return assessment?.id === inUse ? assessment.expected.loss_m : null;
   }
 
-  // Orders of a page of its own: how each is called, what it needs, and what its dialog says.
+  // Orders of a page of its own: how each is called, here and in the state, and what its dialog says.
   learn(orders) {
-    for (const [name, { title, needs: lacks, busy: waits = false, about, make: made }] of Object.entries(orders)) {
+    for (const [name, { title, permitted, about, make: made }] of Object.entries(orders)) {
       TITLES[name] = title;
-      NEEDS[name] = lacks ?? (() => "");
-      if (waits) BUSY.add(name);
+      PERMITTED[name] = permitted;
       if (about) DECIDED_ON[name] = about;
       ORDERS[name] = made;
     }
   }
 
-  // Why something cannot be ordered now; empty: it can. The service has the last word.
-  whyNot(name, value) {
+  // Why something cannot be ordered now, in the words of the service; empty: it can.
+  whyNot(name) {
     if (this.#service.forbidden) return this.#service.forbidden;
     if (!this.#service.fresh) return "the connection to the service is lost";
-    const { state, work } = this;
-    if (BUSY.has(name) && state.stopped_because) return `everything is stopped: ${state.stopped_because}; release it first`;
-    const needs = NEEDS[name]?.(this, state, value) ?? "";
-    if (needs || !BUSY.has(name)) return needs;
-    if (state.rtc === null) return "no RTC is there";
-    return work ? `${work.title.toLowerCase()} is under way: wait for it, or end it` : "";
+    return this.state.permitted[PERMITTED[name]]?.reason ?? "";
   }
 
   async open(name, value) {
     if (this.#dialog.open || this.#opening) return;
-    const why = this.whyNot(name, value);
+    const why = this.whyNot(name);
     if (why) {
       this.say(`${TITLES[name] ?? name} cannot be ordered now: ${why}`);
       return;
@@ -243,37 +237,24 @@ export function described(record, wins = null) {
   return `${record.id}: ${record.n_modes} modes${gain}, margin ${verdict(record.gate)}`;
 }
 
-// What needs the mirror or the loop, and an RTC.
-const BUSY = new Set(["approve", "rollback", "dither-start", "acquire", "measure", "noisy"]);
+// What each order is called in the state that the service publishes; the others need no permission.
+const PERMITTED = {
+  approve: "approve", reject: "reject", rollback: "rollback", hold: "set_mode", mode: "set_mode", acquire: "acquire",
+  abort: "abort_acquisition", "give-up": "give_up", "dither-start": "start_dither", "dither-stop": "stop_dither",
+  stop: "stop_everything", resume: "resume", measure: "measure", noisy: "measure_noisy", "open-loop": "open_loop",
+  acknowledge: "acknowledge_alarm", "acknowledge-all": "acknowledge_alarm", mute: "mute_alarm", unmute: "unmute_alarm",
+};
+
+function pathOf(record) {
+  needs(record, "the reconstructors are being read: look again");
+  return `v1/reconstructors/${encodeURIComponent(record.id)}`;
+}
 
 // What of REST an order decides about: it is sent with the tag of what was seen of that.
 const DECIDED_ON = {
-  approve: (orders) => `v1/reconstructors/${encodeURIComponent(orders.proposal.id)}`,
-  reject: (orders) => `v1/reconstructors/${encodeURIComponent(orders.proposal.id)}`,
-  rollback: (orders) => `v1/reconstructors/${encodeURIComponent(orders.before.id)}`,
-};
-
-// What else an order needs: why it cannot be given.
-const NEEDS = {
-  approve: (orders, state) => {
-    if (!orders.proposal) return "no reconstructor is proposed";
-    const known = state.registration;
-    return known?.validity === "invalid" ? `α is invalid: ${known.validity_reason}` : "";
-  },
-  reject: (orders) => (orders.proposal ? "" : "no reconstructor is proposed"),
-  rollback: (orders) => (orders.before ? "" : "no earlier reconstructor has been in use"),
-  hold: (orders, state) => (state.mode === "hold" ? "mode is hold already" : ""),
-  abort: (orders, state) => (state.acquisition.under_way ? "" : "no acquisition is under way"),
-  "give-up": (orders, state) => (state.measuring ?? state.gathering ? "" : "nothing is being measured"),
-  "open-loop": (orders) => (orders.work?.order === "open-loop" ? "" : "no gain ramp is under way"),
-  measure: (orders, state) => (state.dither ? `${state.dither.id} is running: stop the dither first` : ""),
-  stop: (orders, state) => (state.stopped_because ? `everything is stopped already: ${state.stopped_because}` : ""),
-  resume: (orders, state) => (state.stopped_because ? "" : "nothing is stopped"),
-  acknowledge: (_, state, name) => (alarmOf(state, name)?.attention ? "" : `${name} is over`),
-  mute: (_, state, name) => (alarmOf(state, name) ? "" : `${name} is over`),
-  unmute: (_, state, name) => (alarmOf(state, name)?.muted ? "" : `${name} is not muted`),
-  "acknowledge-all": (_, state) => (unseen(state).length ? "" : "every alarm is acknowledged"),
-  "dither-start": (orders, state) => (state.dither ? `${state.dither.id} is running: stop it first` : ""),
+  approve: (orders) => pathOf(orders.proposal),
+  reject: (orders) => pathOf(orders.proposal),
+  rollback: (orders) => pathOf(orders.before),
 };
 
 // The alarm of this name, whether it lasts, went unseen, or is only muted.
@@ -309,6 +290,7 @@ const ORDERS = {
   },
   acknowledge(orders, name) {
     const alarm = alarmOf(orders.state, name);
+    needs(alarm?.attention, `${name} is over`);
     const lasts = Boolean(alarm.severity);
     return {
       title: `Acknowledge ${name}`,
@@ -339,6 +321,7 @@ const ORDERS = {
   },
   mute(orders, name) {
     const alarm = alarmOf(orders.state, name);
+    needs(alarm, `${name} is over`);
     return {
       title: `Mute ${name}`,
       fields: [{ name: "for_s", label: "For", options: MUTE_TIMES, needed: true }],
@@ -355,7 +338,8 @@ const ORDERS = {
     };
   },
   unmute(orders, name) {
-    const { muted } = alarmOf(orders.state, name);
+    const muted = alarmOf(orders.state, name)?.muted;
+    needs(muted, `${name} is not muted`);
     return {
       title: `Unmute ${name}`,
       facts: [`${muted.by} muted it${muted.reason ? `: ${muted.reason}` : ""}. It is listed again from now on.`],
@@ -522,6 +506,7 @@ const ORDERS = {
     };
   },
   "open-loop"(orders) {
+    needs(orders.work?.order === "open-loop", "no gain ramp is under way");
     return {
       title: "End the gain ramp",
       facts: [

@@ -43,6 +43,7 @@ from service.tracking.activity import Operating
 from service.tracking.alarms import Alarm, Note, Remark, Waiting
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, Dithering, DitherPlan
+from service.tracking.interlocks import Permission
 from service.tracking.loop import LoopCommand
 from service.tracking.mode_limits import ModeLimit, ModeProof
 from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
@@ -465,6 +466,7 @@ view("ObservatoryValueView", ObservatoryValue)
 view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
 EVENTS = view("EventsView", TrackerState, "alarms log", "What happened, and what is wrong now.")
 view("WaitingView", Waiting)
+view("PermissionView", Permission)
 view("PaceView", Pace)
 view(
     "LinkView",
@@ -482,7 +484,8 @@ STATE = view(
     "tracker.config_id tracker.dither tracker.dithering tracker.vibrations_hz tracker.measuring "
     "tracker.gathering "
     "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
-    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating no_return "
+    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating permitted "
+    "no_return "
     "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
     "tracker.windows_refused tracker.windows_outlying window_refusal pace link",
     "What the service knows, at one glance.",

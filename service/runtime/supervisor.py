@@ -129,7 +129,6 @@ class Supervisor:
         self._running: set[asyncio.Task[None]] = set()
         self._broken = ""
         """The last fault that nobody foresaw."""
-
         self._started_ns = self._clock.now_ns()
         self._log = structlog.get_logger().bind(system=state.system)
 
@@ -152,6 +151,7 @@ class Supervisor:
             link=link,
             now_ns=self._clock.now_ns(),
             started_ns=self._started_ns,
+            policy=self.policy,
             ready=not any(wait.hinders for wait in waiting),
             ready_reason="; ".join(f"{wait.party}: {wait.text}" for wait in waiting) or "ready",
             waiting_for=waiting,

@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.control.gate import FORGIVING_LEAK
-from service.errors import CommandError
 from service.telemetry.windows import RefusalKind
 from service.tracking import acquisition_stages as stages
 from service.tracking import commands as cmd
@@ -26,6 +25,7 @@ from service.tracking import reconstructors, worth
 from service.tracking.activity import ramping
 from service.tracking.alarms import ACQUISITION, Act
 from service.tracking.dither import allow, choose_dither, make_way
+from service.tracking.loop import present
 from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -49,31 +49,13 @@ _LOST = (MatrixState.REJECTED, MatrixState.FAILED)
 
 
 def acquire_on_command(turn: Turn, _: cmd.Acquire) -> None:
-    """Begin one because an operator says so.
-
-    Raises
-    ------
-    CommandError
-        If none can begin now.
-    """
-    reason = stages.why_not_now(turn.state, turn.policy)
-    if turn.rtc is None or reason is not None:
-        raise CommandError(reason or "no RTC is there")
+    """Begin one because an operator says so."""
     allow(turn)
-    _begin(turn, turn.rtc, "the operator asks", commanded=True)
+    _begin(turn, present(turn.rtc), "the operator asks", commanded=True)
 
 
 def abort_on_command(turn: Turn, _: cmd.AbortAcquisition) -> None:
-    """End one because an operator says so.
-
-    Raises
-    ------
-    CommandError
-        If there is none.
-    """
-    interrupted = turn.acquisition.stage is AcquisitionStage.INTERRUPTED
-    if not turn.acquisition.under_way and not interrupted:
-        raise CommandError("no acquisition is under way")
+    """End one because an operator says so."""
     turn.calm(ACQUISITION)
     stages.abort(turn, "by the operator", held_off=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from service.tracking import validity
 from service.tracking.alarms import ACQUISITION, NOT_FOUND, Act, forbidding, forbids
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
+from service.tracking.loop import NO_RTC
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict
@@ -93,14 +95,10 @@ def far_dither(stage: AcquisitionStage, rtc: Status, policy: Policy, now_ns: int
     It is strong: an open loop leaves the pyramid little response, and nothing is observed
     meanwhile that could be spoilt.
     """
-    lines = lines_of(rtc.frame_rate_hz, WINDOW_S, rtc.max_dither_modes)
-    modes = modes_of(reach_of(stage), rtc.n_modes, len(lines)) if lines else ()
-    if len(modes) < FEWEST_LINES:
-        return (
-            f"found room for {len(modes)} dithered modes; expected at least {FEWEST_LINES}: the "
-            f"RTC plays {rtc.max_dither_modes} at once, at {rtc.frame_rate_hz:g} Hz, and its basis "
-            f"has {rtc.n_modes}"
-        )
+    modes, lines = _far_modes(stage, rtc)
+    reason = _why_too_few(modes, rtc)
+    if reason is not None:
+        return reason
     request = DitherRequest(
         id=f"{ACQUIRING_DITHER}{now_ns}",
         kind=DitherKind.SINE,
@@ -110,6 +108,28 @@ def far_dither(stage: AcquisitionStage, rtc: Status, policy: Policy, now_ns: int
         duration_s=DITHER_S,
     )
     return Dither(request=request, asked_ns_utc=now_ns, window_s=WINDOW_S)
+
+
+def _far_modes(stage: AcquisitionStage, rtc: Status) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Return the modes dithered in a stage with the loop open, and lines for them, Hz."""
+    lines = _lines(rtc.frame_rate_hz, rtc.max_dither_modes)
+    return modes_of(reach_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
+
+
+@lru_cache(maxsize=4)
+def _lines(frame_rate_hz: float, n_lines: int) -> tuple[float, ...]:
+    """Return the lines of an RTC; whether there are enough is asked with every state shown."""
+    return lines_of(frame_rate_hz, WINDOW_S, n_lines)
+
+
+def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
+    if len(modes) >= FEWEST_LINES:
+        return None
+    return (
+        f"found room for {len(modes)} dithered modes; expected at least {FEWEST_LINES}: the "
+        f"RTC plays {rtc.max_dither_modes} at once, at {rtc.frame_rate_hz:g} Hz, and its basis "
+        f"has {rtc.n_modes}"
+    )
 
 
 def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
@@ -209,16 +229,16 @@ def count_miss(turn: Turn, kind: RefusalKind) -> None:
 
 
 def why_not_now(state: TrackerState, policy: Policy) -> str | None:
-    """Return why an operator cannot have an acquisition now, or None."""
+    """Return why no acquisition can begin now, or None."""
     if state.rtc is None:
-        return "no RTC is there"
+        return NO_RTC
     if not policy.dither_enabled:
         return "the settings forbid any dither"
     alarm = forbidding(state, Act.SEND_NEW)
     if alarm is not None:
         return f"{alarm.name}: {alarm.text}"
-    dither = far_dither(AcquisitionStage.COARSE, state.rtc, policy, 0)
-    return dither if isinstance(dither, str) else None
+    modes, _ = _far_modes(AcquisitionStage.COARSE, state.rtc)
+    return _why_too_few(modes, state.rtc)
 
 
 def sigma_of(acquisition: Acquisition) -> str:

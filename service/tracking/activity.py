@@ -1,8 +1,7 @@
-"""What occupies the mirror or the loop now, what that allows, and what to call it.
+"""What occupies the mirror or the loop now, and what to call it.
 
-The one table of refusals for what runs; what a command needs besides is checked where it is
-carried out. What the service is in, in the words of a control room, follows from what runs and
-which alarms last.
+Which orders that allows is in :mod:`service.tracking.interlocks`. What the service is in, in the
+words of a control room, follows from what runs and which alarms last.
 """
 
 from __future__ import annotations
@@ -10,15 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import get_args
 
-from service.errors import CommandError
-from service.tracking import commands as cmd
 from service.tracking.alarms import STANDING_BY, Alarm, Severity
-from service.tracking.commands import Command
 from service.tracking.dither_request import OUR_DITHERS, OWN_DITHER
-from service.tracking.events import Event
-from service.tracking.loop import CommandState, LoopCommand, why_open
+from service.tracking.loop import NO_RTC, CommandState, LoopCommand, why_open
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Mode, TrackerState
 
@@ -44,42 +38,6 @@ class Activity(StrEnum):
     SENDING = "a reconstructor is on its way to the RTC"
 
 
-_ALL = frozenset[type](get_args(Command))
-
-_SEEN = frozenset[type]({cmd.AcknowledgeAlarm, cmd.MuteAlarm, cmd.UnmuteAlarm})
-
-_ALWAYS = _SEEN | frozenset[type](
-    {
-        cmd.AbortAcquisition,
-        cmd.GiveUp,
-        cmd.Reject,
-        cmd.Resume,
-        cmd.SetMode,
-        cmd.SetPointing,
-        cmd.SetValue,
-        cmd.StopEverything,
-        cmd.StopDither,
-    }
-)
-"""What ends something, and what disturbs nothing."""
-
-ALLOWS: dict[Activity, frozenset[type]] = {
-    Activity.STOPPED: _ALWAYS,
-    Activity.MEASURING: _ALWAYS,
-    # a swap costs it a window, and must not wait for minutes
-    Activity.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
-    Activity.RAMPING: _ALWAYS,
-    Activity.ACQUIRING: _ALWAYS,
-    # it makes way for what needs the loop, and an RTC measures under no dither
-    Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
-    Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
-    Activity.STANDING_BY: _ALWAYS - {cmd.AbortAcquisition, cmd.GiveUp, cmd.StopDither},
-    Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish},
-    Activity.SENDING: _ALL - {cmd.Measure},
-}
-"""Commands that are carried out while it runs; a gain ramp also lets the loop be opened."""
-
-
 @dataclass(frozen=True, slots=True)
 class Running:
     """Something that runs, in words."""
@@ -87,22 +45,6 @@ class Running:
     activity: Activity
     text: str
     """What runs, and what ends it."""
-
-
-def refuse_if_occupied(state: TrackerState, event: Event, now_ns: int) -> None:
-    """Refuse a command that would strand what runs, or be stranded by it.
-
-    Raises
-    ------
-    CommandError
-        If that is what an operator asks for: what runs, and how to end it.
-    """
-    if not isinstance(event, Command):
-        return
-    for running in under_way(state, now_ns):
-        opens = running.activity is Activity.RAMPING and _opens(event)
-        if type(event) not in ALLOWS[running.activity] and not opens:
-            raise CommandError(running.text)
 
 
 def under_way(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
@@ -163,10 +105,6 @@ def _of_matrices(state: TrackerState) -> Iterator[Running]:
         if record.on_its_way:
             text = f"reconstructor {record.id} is on its way to the RTC; wait for it"
             yield Running(Activity.SENDING, text)
-
-
-def _opens(command: Command) -> bool:
-    return isinstance(command, cmd.SetLoop) and command.loop == "open"
 
 
 class Operation(StrEnum):
@@ -277,7 +215,7 @@ def _occupation(state: TrackerState, now_ns: int) -> tuple[Occupation, str]:
 def _why_nothing_to_do(state: TrackerState) -> str:
     rtc = state.rtc
     if rtc is None:
-        return "no RTC is there"
+        return NO_RTC
     return "" if rtc.in_loop else why_open(rtc)
 
 

@@ -76,19 +76,15 @@ def acknowledge(turn: Turn, command: cmd.AcknowledgeAlarm) -> None:
     Raises
     ------
     CommandError
-        If there is nothing to acknowledge, or it has been worse than what was seen of it.
+        If it has been worse than what was seen of it.
     UnknownIdError
         If no alarm has this name.
     """
     notes, note = _noted(turn, command.name)
-    seen = note.acknowledged
-    if note.worst is None:
-        raise CommandError(f"{note.name} neither lasts nor is stale: nothing to acknowledge")
-    if seen is not None:
-        raise CommandError(f"{note.name} was acknowledged by {seen.by}: nothing is left to do")
-    if command.severity is not None and note.worst.above(command.severity):
+    seen, worst_yet = command.severity, note.worst
+    if seen is not None and worst_yet is not None and worst_yet.above(seen):
         raise CommandError(
-            f"{note.name} has been {note.worst}, and {command.severity} was seen of it: look again"
+            f"{note.name} has been {worst_yet}, and {seen} was seen of it: look again"
         )
     known = replace(note, acknowledged=_remark(turn, command))
     notes[note.name] = known if note.over_ns_utc is None else _done_with(note)
@@ -116,14 +112,10 @@ def unmute(turn: Turn, command: cmd.UnmuteAlarm) -> None:
 
     Raises
     ------
-    CommandError
-        If it is not muted.
     UnknownIdError
         If no alarm has this name.
     """
     notes, note = _noted(turn, command.name)
-    if note.muted is None:
-        raise CommandError(f"{note.name} is not muted")
     notes[note.name] = replace(note, muted=None)
     _keep(turn, notes)
     turn.log("alarm.unmuted", f"{note.name} {command.signed}")

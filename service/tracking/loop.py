@@ -9,8 +9,11 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import CommandError
 from service.telemetry.windows import ClosedLoop
 from service.wire import Loop, Pointing, Status
+
+NO_RTC = "no RTC is there"
 
 SAME_GAIN = 0.05
 """Relative: an RTC may follow the seeing with its gains once a second, and the gate judges with the
@@ -23,6 +26,19 @@ SAME_LEAK = 1e-6
 
 SAME_RATE = 1e-5
 """Relative: a rate that is measured, and not nominal, is told differently every time."""
+
+
+def present(rtc: Status | None) -> Status:
+    """Return the RTC, for what is done only where one is there.
+
+    Raises
+    ------
+    CommandError
+        If none is.
+    """
+    if rtc is None:
+        raise CommandError(NO_RTC)
+    return rtc
 
 
 def closed_loop(rtc: Status, cm_id: str, matrix: NDArray[np.float32]) -> ClosedLoop:

@@ -9,11 +9,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from service.errors import CommandError, UnknownIdError
+from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import ask_for, make_way
 from service.tracking.dither_request import RANDOM_TOTAL_M, check_modes, cost_of, plan_random
+from service.tracking.loop import present
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MeasurementRecord, MeasureState
@@ -62,11 +63,9 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     Raises
     ------
     CommandError
-        If none can be measured now.
+        If it names a mode that the basis does not have, or an id that was used before.
     """
-    rtc = turn.rtc
-    if rtc is None:
-        raise CommandError("no RTC is there")
+    rtc = present(turn.rtc)
     if turn.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
     record = _planned(command, rtc, turn.policy, turn.now_ns)
@@ -85,19 +84,10 @@ def give_up(turn: Turn, measurement_id: str) -> None:
     """Wait no longer for a matrix; its random signs end, a loop that it has opened is closed again.
 
     The wire has no way to end a measurement by the RTC: it may go on, and until it is done refuse.
-
-    Raises
-    ------
-    CommandError
-        If it is over.
-    UnknownIdError
-        If nobody has heard of it.
     """
     record = turn.state.measurement(measurement_id)
     if record is None:
-        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
-    if not record.under_way:
-        raise CommandError(f"{record.id} is {record.state}: there is nothing to give up")
+        return
     given_up = replace(record, state=MeasureState.GIVEN_UP)
     if record.pattern is None:
         _keep(turn, replace(given_up, reason="by the operator"))
@@ -239,11 +229,9 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
     Raises
     ------
     CommandError
-        If none can be measured now.
+        If it costs more than the budget, or names an id that was used before.
     """
-    rtc = turn.rtc
-    if rtc is None or rtc.loop == "open":
-        raise CommandError("a noisy matrix needs an RTC with its loop closed")
+    rtc = present(turn.rtc)
     if turn.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
     duration_s = command.duration_s or DURATION_S

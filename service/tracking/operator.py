@@ -24,12 +24,11 @@ from service.tracking.dither_request import (
     total_m,
     why_unusable,
 )
-from service.tracking.loop import CommandState, LoopCommand, extended_gains
+from service.tracking.loop import CommandState, LoopCommand, extended_gains, present
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MatrixState, ModeSet, ReconstructorRecord
+from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Level, Mode
 from service.tracking.turn import Turn
-from service.tracking.worth import left_behind
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
@@ -43,64 +42,28 @@ def set_mode(turn: Turn, command: cmd.SetMode) -> None:
 
 
 def approve(turn: Turn, command: cmd.Approve) -> None:
-    """Send a proposal, judged anew where need be, unless α has left what it was made for behind.
-
-    Raises
-    ------
-    CommandError
-        If it is none, or cannot be sent.
-    """
-    record, known = _proposed(turn, command.id), turn.known
-    if known is not None and not known.usable:
-        raise CommandError(f"{record.id} cannot be judged: α is invalid ({known.standing.reason})")
-    if left_behind(turn.state, record, turn.policy):
-        raise CommandError(f"{record.id} was made for another α than the present one: refit")
-    reconstructors.send_once_judged(turn, record.id)
+    """Send a proposal, judged anew where need be."""
+    reconstructors.send_once_judged(turn, command.id)
 
 
 def reject(turn: Turn, command: cmd.Reject) -> None:
-    """Discard a proposal.
-
-    Raises
-    ------
-    CommandError
-        If it is none.
-    """
-    record = _proposed(turn, command.id)
+    """Discard a proposal."""
     reconstructors.change_state(
-        turn, record.id, MatrixState.DISCARDED, command.reason or "by the operator"
+        turn, command.id, MatrixState.DISCARDED, command.reason or "by the operator"
     )
-    turn.log("reconstructor.discarded", record.id)
+    turn.log("reconstructor.discarded", command.id)
 
 
 def publish(turn: Turn, command: cmd.Publish) -> None:
-    """Offer a reconstructor again; what has never been in use only if the gate can judge it.
-
-    Raises
-    ------
-    CommandError
-        If it cannot, or no RTC is there.
-    """
-    record = reconstructors.known_record(turn.state, command.id)
-    if not record.was_used and turn.known is None:
-        raise CommandError(
-            f"{record.id} cannot be judged: α is not known yet; start a dither, wait for a window"
-        )
-    _copy(turn, record.id, f"the operator publishes {record.id} again")
+    """Offer a reconstructor again; what has never been in use only if the gate can judge it."""
+    _copy(turn, command.id, f"the operator publishes {command.id} again")
 
 
 def roll_back(turn: Turn, command: cmd.Rollback) -> None:
-    """Offer the reconstructor again that was in use before.
-
-    Raises
-    ------
-    CommandError
-        If there was none, or no RTC is there.
-    """
+    """Offer the reconstructor again that was in use before."""
     earlier = turn.state.previous
-    if earlier is None:
-        raise CommandError("no earlier reconstructor has been in use")
-    _copy(turn, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
+    if earlier is not None:
+        _copy(turn, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
 
 
 def refit(turn: Turn, command: cmd.Refit) -> None:
@@ -109,13 +72,9 @@ def refit(turn: Turn, command: cmd.Refit) -> None:
     Raises
     ------
     CommandError
-        If α is not known, no RTC is there, or it has no such number of modes.
+        If the RTC has no such number of modes.
     """
-    rtc = turn.rtc
-    if rtc is None:
-        raise CommandError("no RTC is there")
-    if turn.known is None:
-        raise CommandError("α is not known yet; start a dither and wait for a window")
+    rtc = present(turn.rtc)
     asked = command.n_modes or rtc.n_controlled
     if not 0 < asked <= rtc.n_modes:
         raise CommandError(f"found {asked} modes; expected 1 to {rtc.n_modes}")
@@ -130,9 +89,7 @@ def start_dither(turn: Turn, command: cmd.StartDither) -> None:
     CommandError
         If it cannot be played or read, or costs more than the budget.
     """
-    rtc = turn.rtc
-    if rtc is None or rtc.loop == "open":
-        raise CommandError("a dither needs an RTC with its loop closed")
+    rtc = present(turn.rtc)
     dither = _planned(turn, rtc, command)
     total, over_budget = total_m(dither.request), command.over_budget
     cost = cost_of(total, turn.policy, over_budget=over_budget)
@@ -181,8 +138,6 @@ def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
 
 def _copy(turn: Turn, source: str, why: str, *, anyway: bool = False) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
-    if turn.rtc is None:
-        raise CommandError("no RTC is there")
     reconstructors.make(turn, ev.CopyMatrix(source=source, why=why, anyway=anyway))
     hold(turn, why)
 
@@ -197,13 +152,6 @@ def hold(turn: Turn, why: str) -> None:
 def order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
     """Go on in a mode; ``of_settings`` is that of the settings, None: the same."""
     turn.state = replace(turn.state, mode=mode, settings_mode=of_settings)
-
-
-def _proposed(turn: Turn, matrix_id: str) -> ReconstructorRecord:
-    record = reconstructors.known_record(turn.state, matrix_id)
-    if record.state is not MatrixState.PROPOSED:
-        raise CommandError(f"{matrix_id} is {record.state}, not proposed")
-    return record
 
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
@@ -228,7 +176,7 @@ def set_loop(turn: Turn, command: cmd.SetLoop) -> None:
     CommandError
         If it makes no sense in this state.
     """
-    rtc = _there(turn)
+    rtc = present(turn.rtc)
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
         raise CommandError(f"found {n_controlled} modes; expected 1 to {rtc.n_modes}")
@@ -255,11 +203,9 @@ def ramp(turn: Turn, command: cmd.Ramp) -> None:
     Raises
     ------
     CommandError
-        If it makes no sense in this state.
+        If it names modes that are not controlled.
     """
-    rtc = _there(turn)
-    if rtc.loop == "open":
-        raise CommandError("found the loop open; expected it closed, to see its residual")
+    rtc = present(turn.rtc)
     groups = command.groups or _paper_groups(rtc.n_controlled)
     ranges = _ranges(groups, rtc.n_controlled)
     gains = command.gains or RAMP_GAINS
@@ -403,9 +349,3 @@ def _ask_loop(
     turn.state = replace(turn.state, loop_command=asked)
     turn.log("loop.asked", text)
     turn.ask(ev.Ask(request=request, judged=judged))
-
-
-def _there(turn: Turn) -> Status:
-    if turn.rtc is None:
-        raise CommandError("no RTC is there")
-    return turn.rtc

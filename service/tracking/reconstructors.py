@@ -14,6 +14,7 @@ from service.tracking.sending import (
     beyond_judging,
     may_follow,
     why_no_return,
+    why_refused,
     why_unread,
     why_unsendable,
 )
@@ -190,8 +191,6 @@ def send_once_judged(turn: Turn, matrix_id: str, *, wanted: bool = True) -> None
     if stale is None or (rtc.loop == "open" and record.gate is None):
         send(turn, matrix_id)
         return
-    if beyond_judging(turn.state, record):
-        raise CommandError(f"{matrix_id}: an open loop does not tell its gains: close it first")
     if rtc.loop == "open" and record.judged is not None:
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
@@ -373,9 +372,7 @@ def _sendable(
         If it cannot be sent now.
     """
     record, rtc = known_record(turn.state, matrix_id), turn.rtc
-    reason = why_unsendable(turn.state, record, swapped_ns_utc)
-    if record.gate is not None and not record.gate.accepted:
-        reason = record.gate.reason
+    reason = why_refused(turn.state, record, swapped_ns_utc)
     if rtc is None or reason is not None:
         raise CommandError(f"{matrix_id} cannot be sent: {reason}")
     return record, rtc

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import dither, offload
 from service.tracking.acquisition import inherit, left_behind
@@ -18,7 +17,7 @@ from service.tracking.operator import order
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import thinned
-from service.tracking.state import Mode, Orders, Saved, TrackerState
+from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.validity import age, restore
 
@@ -55,16 +54,7 @@ def stop(turn: Turn, command: cmd.StopEverything) -> None:
 
 
 def release(turn: Turn, command: cmd.Resume) -> None:
-    """Go on in the mode and with the dither that were ordered before, or meanwhile.
-
-    Raises
-    ------
-    CommandError
-        If nothing is stopped.
-    """
-    if not turn.state.stopped_because:
-        held = "; mode is hold: set another to go on" if turn.state.mode is Mode.HOLD else ""
-        raise CommandError(f"nothing is stopped{held}")
+    """Go on in the mode and with the dither that were ordered before, or meanwhile."""
     turn.state = replace(turn.state, stopped_because="")
     turn.calm(STOPPED)
     turn.log("resumed", command.signed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from service.tracking import alarms, worth
 from service.tracking.alarms import Act, Alarm, forbidding, forbids
+from service.tracking.loop import NO_RTC
 from service.tracking.mode_proof import why_unproven
 from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
@@ -24,7 +25,7 @@ def why_unsendable(
     swap has done, and no reason against going back.
     """
     if state.rtc is None:
-        return "no RTC is there"
+        return NO_RTC
     known, registration = _was_in_use(state, record), state.registration
     if registration is not None and not known:  # one must be able to go back
         if registration.candidate is not None:
@@ -39,6 +40,15 @@ def why_unsendable(
         return alarm.text
     unread = why_unread(state, state.rtc.cm_id)
     return unread if unread or known else why_unproven(state, record)
+
+
+def why_refused(
+    state: TrackerState, record: ReconstructorRecord, swapped_ns_utc: int | None = None
+) -> str | None:
+    """Return the same where the gate's verdict counts: one that says no comes first."""
+    if record.gate is not None and not record.gate.accepted:
+        return record.gate.reason
+    return why_unsendable(state, record, swapped_ns_utc)
 
 
 def why_no_return(state: TrackerState) -> str | None:

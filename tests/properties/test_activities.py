@@ -6,7 +6,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import ALLOWS, Activity, under_way
+from service.tracking.activity import Activity, under_way
+from service.tracking.interlocks import ALLOWS
 from service.tracking.products import MeasureState
 from service.wire import DitherStop
 from tests.unit.tracking.test_activity import (

@@ -20,7 +20,7 @@ from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
 from tests.system.cable import free_port
 from tests.unit.test_api import ALPHA, LINK, SECOND, SIGMA, STATE, VERDICT, FakeService
-from tests.unit.tracking.situations import POLICY
+from tests.unit.tracking.situations import ALL_SHOWN, POLICY
 
 N_HISTORY = 300
 JUMPED = Misregistration(
@@ -117,6 +117,8 @@ def state_of_now(registration=ALPHA):
         alarms=(),
         reconstructors=tuple(made),
         in_use=made[-1].id,
+        proven=frozenset({STATE.rtc.cm_id}),
+        mode_proof=ALL_SHOWN,
         log=tuple(
             replace(line, t_ns_utc=now_ns - (4 - k) * SECOND) for k, line in enumerate(STATE.log)
         ),
@@ -131,6 +133,7 @@ def staged(directory, port=None):
     service = StagedService(
         archive=archive,
         now=Snapshot(
+            policy=POLICY,
             tracker=state_of_now(),
             link=LINK,
             now_ns=0,

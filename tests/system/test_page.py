@@ -263,7 +263,7 @@ def test_everything_is_stopped_and_released_in_two_clicks_each(page):
     assert page.night.state["stopped_because"]
     page.says("#answer", "everything was stopped")
     page.press("r")
-    page.says("#answer", "Roll back cannot be ordered now: everything is stopped")
+    page.says("#answer", "Roll back cannot be ordered now: everything was stopped")
     page.click("#stop")
     page.click("#order [value=send]")
     page.says("#answer", "released")

@@ -344,6 +344,29 @@ def test_every_dialog_begins_at_the_reason_and_says_whether_it_is_needed(page, o
     assert page.service.commands == []
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"rtc": None}, {"registration": None}, {"stopped_because": "Ada stopped it (wind)"}],
+    ids=lambda change: next(iter(change), "followed"),
+)
+def test_a_button_says_in_the_services_words_why_it_cannot_be_used(page, change):
+    page.service.change(**change)
+    shown = page.service.now.permitted
+    orders = {"acquire": "acquire", "rollback": "rollback", "dither-start": "start_dither"}
+    for button, order in (orders | {"dither-stop": "stop_dither"}).items():
+        reason = shown[order].reason
+        words = f"cannot be used now: {reason}" if reason else ""
+        page.until(f"document.querySelector('[data-order={button}]').title === {words!r}")
+        disabled = page.js(f"document.querySelector('[data-order={button}]').ariaDisabled")
+        assert disabled == str(bool(reason)).lower()
+    page.press("r")
+    reason = shown["rollback"].reason
+    if reason:
+        page.says("#answer", f"Roll back cannot be ordered now: {reason}")
+    else:
+        page.dialog("Roll back to")
+
+
 def test_in_the_help_no_key_turns_the_page(page):
     page.press("?")
     page.until("document.querySelector('#help').open")

@@ -6,7 +6,9 @@ from service.runtime.refits import Refits
 from service.snapshot import Snapshot
 from service.tracking.commands import Refit
 from service.tracking.events import MakeMatrix
+from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
+from tests.unit.tracking.situations import POLICY
 
 
 @dataclass
@@ -19,6 +21,7 @@ class Obedient:
     refusal: Exception | None = None
     commands: list = field(default_factory=list)
     refits: Refits = field(default_factory=Refits)
+    policy: Policy = POLICY
 
     def snapshot(self):
         return Snapshot(
@@ -28,6 +31,7 @@ class Obedient:
             started_ns=0,
             ready=True,
             ready_reason="ready",
+            policy=self.policy,
         )
 
     async def submit(self, command, caller):

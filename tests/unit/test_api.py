@@ -63,6 +63,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
+from tests.unit.tracking.situations import POLICY
 
 SECOND = 1_000_000_000
 ALPHA = Misregistration(
@@ -255,6 +256,7 @@ def service(archive):
     return FakeService(
         archive=archive,
         now=Snapshot(
+            policy=POLICY,
             tracker=STATE,
             link=LINK,
             now_ns=100 * SECOND,

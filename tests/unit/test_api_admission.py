@@ -16,6 +16,7 @@ from service.routes.admission import Hosts
 from service.routes.connections import server_config
 from tests.system.pace import in_time
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
+from tests.unit.tracking.situations import POLICY
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -24,7 +25,13 @@ pytestmark = pytest.mark.timeout(60)
 def service():
     return FakeService(
         Snapshot(
-            tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
+            policy=POLICY,
+            tracker=STATE,
+            link=LINK,
+            now_ns=100,
+            started_ns=40,
+            ready=True,
+            ready_reason="ready",
         )
     )
 

@@ -15,6 +15,7 @@ from service.routes import admission, stream
 from service.routes.admission import COOKIE, Failures, Hosts, Refusal, Refusals
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.test_api_admission import serving
+from tests.unit.tracking.situations import POLICY
 
 ORIGIN = "http://127.0.0.1:8080"
 OPEN = {("GET", "/healthz"), ("GET", "/readyz"), ("DELETE", "/v1/session")}
@@ -30,7 +31,13 @@ FILES = {"/", "/docs", "/openapi.json", "/dashboard/page.js", "/docs/files/start
 def service():
     return FakeService(
         Snapshot(
-            tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
+            policy=POLICY,
+            tracker=STATE,
+            link=LINK,
+            now_ns=100,
+            started_ns=40,
+            ready=True,
+            ready_reason="ready",
         )
     )
 

@@ -10,6 +10,7 @@ from service.routes import connections
 from service.snapshot import Snapshot
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import TrackerState
+from tests.unit.tracking.situations import POLICY
 
 CM = ReconstructorRecord(id="cm-1", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=1)
 
@@ -24,7 +25,13 @@ class FakeService:
 
     def snapshot(self):
         return Snapshot(
-            tracker=self.tracker, link=None, now_ns=0, started_ns=0, ready=True, ready_reason=""
+            policy=POLICY,
+            tracker=self.tracker,
+            link=None,
+            now_ns=0,
+            started_ns=0,
+            ready=True,
+            ready_reason="",
         )
 
     async def submit(self, command, caller):

@@ -32,7 +32,13 @@ def service(archive):
     service = FakeService(
         archive=archive,
         now=Snapshot(
-            tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
+            policy=POLICY,
+            tracker=STATE,
+            link=LINK,
+            now_ns=100,
+            started_ns=40,
+            ready=True,
+            ready_reason="ready",
         ),
     )
     service.instrument = packaged_instrument("flao-lbt")

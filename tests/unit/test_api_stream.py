@@ -17,6 +17,7 @@ from service.tracking.state import Level, LogEntry
 from service.tracking.turn import LOG_LENGTH
 from tests.system.pace import patience
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot
+from tests.unit.tracking.situations import POLICY
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -31,7 +32,13 @@ def quick(monkeypatch):
 def service():
     return FakeService(
         Snapshot(
-            tracker=STATE, link=LINK, now_ns=100, started_ns=40, ready=True, ready_reason="ready"
+            policy=POLICY,
+            tracker=STATE,
+            link=LINK,
+            now_ns=100,
+            started_ns=40,
+            ready=True,
+            ready_reason="ready",
         )
     )
 

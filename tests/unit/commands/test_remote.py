@@ -27,6 +27,7 @@ from service.tracking.events import MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import AcquisitionStage, Mode
 from tests.unit.test_api import LINK, MATRIX, SECOND, STATE, FakeService
+from tests.unit.tracking.situations import POLICY
 
 BEFORE = ReconstructorRecord(
     id="cm-0", state=MatrixState.SUPERSEDED, n_modes=300, created_ns_utc=SECOND
@@ -83,6 +84,7 @@ def service(served, monkeypatch):
     monkeypatch.setattr(orders, "time", clock())
     tracker = replace(STATE, reconstructors=(BEFORE, *STATE.reconstructors))
     service.now = Snapshot(
+        policy=POLICY,
         tracker=tracker,
         link=LINK,
         now_ns=100 * SECOND,

@@ -16,11 +16,13 @@ from service.routes.views import picture
 from service.snapshot import Snapshot
 from service.tracking.state import Level, LogEntry, TrackerState
 from tests.unit.test_api import LINK, SECOND, STATE
+from tests.unit.tracking.situations import POLICY
 
 
 def told(tracker=STATE, *, ready=True, **changes):
     """What the service would answer."""
     snapshot = Snapshot(
+        policy=POLICY,
         tracker=replace(tracker, **changes),
         link=LINK,
         now_ns=100 * SECOND,

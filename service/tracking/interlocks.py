@@ -1,0 +1,330 @@
+"""Whether an order may be given now: the one place that decides it, whoever asks and however.
+
+``step`` enforces it, the state publishes it, and the page and the command line draw from that. Most
+orders are refused because something runs; some need an RTC, α, or a reconstructor besides. What an
+order holds in itself, like a mode that the basis does not have, is checked where it is carried out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final, get_args
+
+from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
+from service.tracking.acquisition_stages import why_not_now
+from service.tracking.activity import Activity, Running, under_way
+from service.tracking.alarms import ALARMS
+from service.tracking.attention import PREFIX
+from service.tracking.commands import Command
+from service.tracking.loop import NO_RTC
+from service.tracking.policy import Policy
+from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.reconstructors import known_record
+from service.tracking.sending import beyond_judging, why_refused
+from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.worth import left_behind
+
+
+@dataclass(frozen=True, slots=True)
+class Permission:
+    """Whether an order may be given now."""
+
+    allowed: bool
+    reason: str = ""
+    """What runs or is missing, and what to do first; empty: the order is allowed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moment:
+    """What an interlock decides on."""
+
+    state: TrackerState
+    policy: Policy
+    now_ns: int
+    """The service's clock, nanoseconds."""
+
+    running: tuple[Running, ...]
+    """What runs, what is exclusive first."""
+
+
+Order = type[Command] | Command
+"""A command, or the kind of it: then it is about what an operator would mean by it now."""
+
+_ALL = frozenset[type](get_args(Command))
+
+_SEEN = frozenset[type]({cmd.AcknowledgeAlarm, cmd.MuteAlarm, cmd.UnmuteAlarm})
+
+_ALWAYS = _SEEN | frozenset[type](
+    {
+        cmd.AbortAcquisition,
+        cmd.GiveUp,
+        cmd.Reject,
+        cmd.Resume,
+        cmd.SetMode,
+        cmd.SetPointing,
+        cmd.SetValue,
+        cmd.StopEverything,
+        cmd.StopDither,
+    }
+)
+"""What ends something, and what disturbs nothing."""
+
+ALLOWS: Final[dict[Activity, frozenset[type]]] = {
+    Activity.STOPPED: _ALWAYS,
+    Activity.MEASURING: _ALWAYS,
+    # a swap costs it a window, and must not wait for minutes
+    Activity.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
+    Activity.RAMPING: _ALWAYS,
+    Activity.ACQUIRING: _ALWAYS,
+    # it makes way for what needs the loop, and an RTC measures under no dither
+    Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
+    Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
+    Activity.STANDING_BY: _ALWAYS - {cmd.AbortAcquisition, cmd.GiveUp, cmd.StopDither},
+    Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish},
+    Activity.SENDING: _ALL - {cmd.Measure},
+}
+"""Orders that are carried out while it runs; a gain ramp also lets the loop be opened."""
+
+
+def permitted(state: TrackerState, order: Order, policy: Policy, now_ns: int) -> Permission:
+    """Return whether an order may be given now.
+
+    Parameters
+    ----------
+    state
+        What is known.
+    order
+        A command; or the kind of one, which is then about the reconstructor that is proposed, the
+        measurement under way, or any alarm.
+    policy
+        The user's numbers.
+    now_ns
+        The service's clock, nanoseconds.
+
+    Raises
+    ------
+    UnknownIdError
+        If a command names what does not exist.
+    """
+    return _decided(_moment(state, policy, now_ns), order)
+
+
+def permissions(state: TrackerState, policy: Policy, now_ns: int) -> Mapping[str, Permission]:
+    """Return the same of every order, by its name."""
+    moment = _moment(state, policy, now_ns)
+    return {name: _decided(moment, order) for name, order in ORDERS.items()}
+
+
+def require(state: TrackerState, command: Command, policy: Policy, now_ns: int) -> None:
+    """Refuse an order that may not be given now.
+
+    Raises
+    ------
+    CommandError
+        If so: what runs or is missing, and what to do first.
+    UnknownIdError
+        If it names what does not exist.
+    """
+    permission = permitted(state, command, policy, now_ns)
+    if not permission.allowed:
+        raise CommandError(permission.reason)
+
+
+def _moment(state: TrackerState, policy: Policy, now_ns: int) -> Moment:
+    running = under_way(state, now_ns)
+    return Moment(state=state, policy=policy, now_ns=now_ns, running=running)
+
+
+def _decided(moment: Moment, order: Order) -> Permission:
+    kind = order if isinstance(order, type) else type(order)
+    opens = isinstance(order, cmd.SetLoop) and order.loop == "open"
+    for running in moment.running:
+        ends_it = opens and running.activity is Activity.RAMPING
+        if kind not in ALLOWS[running.activity] and not ends_it:
+            return Permission(allowed=False, reason=running.text)
+    interlock = INTERLOCKS.get(kind)
+    reason = None if interlock is None else interlock(moment, _named(order))
+    return Permission(allowed=reason is None, reason=reason or "")
+
+
+def _named(order: Order) -> str:
+    """Return which reconstructor, measurement or alarm an order is about; empty: it says none."""
+    if isinstance(order, type):
+        return ""
+    name: str = getattr(order, "id", "") or getattr(order, "name", "")
+    return name
+
+
+def _needs_rtc(moment: Moment, _: str = "") -> str | None:
+    return NO_RTC if moment.state.rtc is None else None
+
+
+def _start_dither(moment: Moment, _: str) -> str | None:
+    return None if _is_closed(moment) else "a dither needs an RTC with its loop closed"
+
+
+def _measure_noisy(moment: Moment, _: str) -> str | None:
+    return None if _is_closed(moment) else "a noisy matrix needs an RTC with its loop closed"
+
+
+def _is_closed(moment: Moment) -> bool:
+    rtc = moment.state.rtc
+    return rtc is not None and rtc.loop != "open"
+
+
+def _ramp(moment: Moment, _: str) -> str | None:
+    rtc = moment.state.rtc
+    if rtc is None:
+        return NO_RTC
+    opened = "found the loop open; expected it closed, to see its residual"
+    return opened if rtc.loop == "open" else None
+
+
+def _acquire(moment: Moment, _: str) -> str | None:
+    return why_not_now(moment.state, moment.policy)
+
+
+def _abort(moment: Moment, _: str) -> str | None:
+    acquisition = moment.state.acquisition
+    interrupted = acquisition.stage is AcquisitionStage.INTERRUPTED
+    return None if acquisition.under_way or interrupted else "no acquisition is under way"
+
+
+def _resume(moment: Moment, _: str) -> str | None:
+    if moment.state.stopped_because:
+        return None
+    held = "; mode is hold: set another to go on" if moment.state.mode is Mode.HOLD else ""
+    return f"nothing is stopped{held}"
+
+
+def _refit(moment: Moment, _: str) -> str | None:
+    if moment.state.rtc is None:
+        return NO_RTC
+    unknown = "α is not known yet; start a dither and wait for a window"
+    return unknown if moment.state.registration is None else None
+
+
+def _approve(moment: Moment, matrix_id: str) -> str | None:
+    state = moment.state
+    record = _meant(state, matrix_id)
+    if record is None or record.state is not MatrixState.PROPOSED:
+        return _not_proposed(record)
+    known = state.registration
+    if known is not None and not known.usable:
+        return f"{record.id} cannot be judged: α is invalid ({known.standing.reason})"
+    if left_behind(state, record, moment.policy):
+        return f"{record.id} was made for another α than the present one: refit"
+    reason = why_refused(state, record)
+    if reason is not None:
+        return f"{record.id} cannot be sent: {reason}"
+    if known is not None and beyond_judging(state, record):
+        return f"{record.id}: an open loop does not tell its gains: close it first"
+    return None
+
+
+def _reject(moment: Moment, matrix_id: str) -> str | None:
+    record = _meant(moment.state, matrix_id)
+    proposed = record is not None and record.state is MatrixState.PROPOSED
+    return None if proposed else _not_proposed(record)
+
+
+def _meant(state: TrackerState, matrix_id: str) -> ReconstructorRecord | None:
+    """Return the reconstructor of this id; of none, the one that is proposed, if one is."""
+    if matrix_id:
+        return known_record(state, matrix_id)
+    records = reversed(state.reconstructors)
+    return next((one for one in records if one.state is MatrixState.PROPOSED), None)
+
+
+def _not_proposed(record: ReconstructorRecord | None) -> str:
+    if record is None:
+        return "no reconstructor is proposed"
+    return f"{record.id} is {record.state}, not proposed"
+
+
+def _publish(moment: Moment, matrix_id: str) -> str | None:
+    state = moment.state
+    if matrix_id:
+        record = known_record(state, matrix_id)
+        if not record.was_used and state.registration is None:
+            unknown = "α is not known yet; start a dither, wait for a window"
+            return f"{record.id} cannot be judged: {unknown}"
+    return _needs_rtc(moment)
+
+
+def _rollback(moment: Moment, _: str) -> str | None:
+    if moment.state.previous is None:
+        return "no earlier reconstructor has been in use"
+    return _needs_rtc(moment)
+
+
+def _give_up(moment: Moment, measurement_id: str) -> str | None:
+    state = moment.state
+    if not measurement_id:
+        going_on = state.measuring or state.gathering
+        return "nothing is being measured" if going_on is None else None
+    record = state.measurement(measurement_id)
+    if record is None:
+        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
+    over = f"{record.id} is {record.state}: there is nothing to give up"
+    return None if record.under_way else over
+
+
+def _acknowledge(moment: Moment, alarm: str) -> str | None:
+    notes = moment.state.notes
+    if not alarm:
+        unseen = any(note.worst is not None and note.acknowledged is None for note in notes)
+        return None if unseen else "every alarm is acknowledged"
+    note = next((note for note in notes if note.name == alarm), None)
+    if note is None and not _is_known(alarm):
+        return None  # nobody can know of it: it is looked up where that is done
+    if note is None or note.worst is None:
+        return f"{alarm} neither lasts nor is stale: nothing to acknowledge"
+    seen = note.acknowledged
+    return f"{alarm} was acknowledged by {seen.by}: nothing is left to do" if seen else None
+
+
+def _unmute(moment: Moment, alarm: str) -> str | None:
+    muted = any(note.muted for note in moment.state.notes if alarm in {"", note.name})
+    if muted or not _is_known(alarm):
+        return None
+    return f"{alarm} is not muted" if alarm else "no alarm is muted"
+
+
+def _is_known(alarm: str) -> bool:
+    return alarm in ALARMS or alarm.startswith(PREFIX) or not alarm
+
+
+INTERLOCKS: Final[dict[type, Callable[[Moment, str], str | None]]] = {
+    cmd.Resume: _resume,
+    cmd.Acquire: _acquire,
+    cmd.AbortAcquisition: _abort,
+    cmd.Refit: _refit,
+    cmd.StartDither: _start_dither,
+    cmd.Approve: _approve,
+    cmd.Reject: _reject,
+    cmd.Publish: _publish,
+    cmd.Rollback: _rollback,
+    cmd.Measure: _needs_rtc,
+    cmd.MeasureNoisy: _measure_noisy,
+    cmd.GiveUp: _give_up,
+    cmd.SetLoop: _needs_rtc,
+    cmd.Ramp: _ramp,
+    cmd.AcknowledgeAlarm: _acknowledge,
+    cmd.UnmuteAlarm: _unmute,
+}
+"""Why an order may not be given though nothing that runs forbids it; the others need nothing."""
+
+
+def _word(kind: type) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
+
+
+ORDERS: Final[Mapping[str, Order]] = {
+    **{_word(kind): kind for kind in get_args(Command)},
+    "open_loop": cmd.SetLoop(loop="open"),
+}
+"""Every order by its name; opening the loop is one of its own, because it ends a gain ramp."""

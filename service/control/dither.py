@@ -12,6 +12,7 @@ window of dither is. A table says so to begin with, then what the windows show.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations_with_replacement, pairwise
 
@@ -236,7 +237,9 @@ def _sums(one: NDArray[np.float32], other: NDArray[np.float32]) -> Array:
     return np.asarray(np.einsum("sm,sm->m", one, other), dtype=np.float64)
 
 
-def most_telling(information: Array, candidates: range, n: int, wanted: Array) -> tuple[int, ...]:
+def most_telling(
+    information: Array, candidates: Sequence[int], n: int, wanted: Array
+) -> tuple[int, ...]:
     """Return the ``n`` modes that together come closest to every wanted σ ``(4,)``.
 
     Of all sets the one whose worst ratio of σ to ``wanted`` is smallest, found by exchange: from

@@ -48,8 +48,9 @@ LONGEST_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
 MOST_STRANGE = 0.3
 """Share of columns that may be no mode of the model before all are taken for another basis."""
 
-UNLIKE_NEIGHBOURS = 2.0
-"""A mode that answers so many times as its neighbours do, or one over that, is named."""
+UNLIKE_NEIGHBOURS = 1.6
+"""A mode that answers so many times as its neighbours do, or one over that, is named: those of
+healthy telescopes are within 1.12, but for the last of a basis that has all of a mirror's."""
 
 NEIGHBOURS = 10
 """Modes on either side that a mode's response is compared with."""

@@ -58,6 +58,10 @@ class DitheredEstimate(Estimate):
     gain_sigma: NDArray[np.float64] | None = None
     """``(n,)`` 1 σ of each gain's modulus; None: not known."""
 
+    answers_as: tuple[int, ...] = ()
+    """Mode of the model whose response each mode's answer certainly is, its own where that is not
+    certain; empty: not looked at."""
+
 
 def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:
     """Return ``(4,)`` the 1 σ by which the model leads a window astray, numeric units.

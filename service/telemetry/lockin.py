@@ -208,6 +208,12 @@ _GROWN = 10.0
 _ROUNDING = 1e-7
 """Of single precision."""
 
+LIKER = 3.0
+"""Another mode explains more of a line than the line's own by this factor, if it is that mode."""
+
+CERTAIN = 6.0
+"""And more than it explains beside the line, root mean square."""
+
 MAX_LAG_FRAMES = 0.2
 """A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
 
@@ -266,6 +272,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         session=spectra.session,
         modes=spectra.plan.modes,
         gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
+        answers_as=_answers_as(spectra, matrix),
         dither_m=_total_dither_m(spectra),
         window_s=spectra.window_s,
     )
@@ -343,6 +350,24 @@ def _modulus_sigma(gains: Array, covariance: Array) -> Array:
         along = np.array([gain.real, gain.imag]) / abs(gain)
         found.append(np.sqrt(along @ covariance[part, part] @ along))
     return np.array(found)
+
+
+def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
+    """Return the mode of the model that each line's slopes are most like.
+
+    Another than the line's own only where it explains far more, and far more than beside the line.
+    """
+    slopes, own = spectra.slopes, np.array(spectra.plan.modes)
+    unit = matrix / np.maximum(np.linalg.norm(matrix, axis=0), np.finfo(np.float32).tiny)
+    size = np.abs(_apply(unit.T, slopes[:, 0]))
+    best = np.argmax(size, axis=1)
+    lines = np.arange(len(own))
+    for line in np.flatnonzero(size[lines, best] > LIKER * size[lines, own]):
+        beside = np.abs(slopes[line, 1:] @ unit[:, best[line]])
+        if size[line, best[line]] < CERTAIN * np.sqrt(np.mean(beside**2)):
+            best[line] = own[line]
+    clear = size[lines, best] > LIKER * size[lines, own]
+    return tuple(np.where(clear, best, own).tolist())
 
 
 def _total_dither_m(spectra: Spectra) -> float:

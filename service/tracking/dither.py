@@ -354,7 +354,7 @@ def _end_when_done(turn: Turn, rtc: Status, dither: Dither, wish: Wish) -> None:
     pause_s = (wish.next_ns_utc - turn.now_ns) / SECOND_NS
     done = seen and wish.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
     weak = wish.phase is DitherPhase.ACQUIRE and 2.0 * total_m(dither.request) < wish.choice.total_m
-    moved = dither_plan.why_moved(dither, rtc, turn.policy)
+    moved = dither_plan.why_moved(dither, rtc, turn.policy, wish.choice.shunned)
     if wish.phase is DitherPhase.PROVE and not proves(dither.request):
         moved = wish.reason
     if done or weak or moved:

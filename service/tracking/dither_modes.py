@@ -30,20 +30,22 @@ its size."""
 _MANY_LINES = np.linspace(*PROVING_RANGE, 100)
 
 
-def chosen_modes(rtc: Status, policy: Policy) -> tuple[int, ...]:
+def chosen_modes(
+    rtc: Status, policy: Policy, shunned: frozenset[int] = frozenset()
+) -> tuple[int, ...]:
     """Return the modes to dither: those of the settings, or the ones that tell most.
 
     These are four above the controlled modes. Where fewer are left they are four of the highest
     ``SPAN``, in the loop or not: the last of a basis tell little of a rotation, and answer least as
-    the model says. Until the model is known they are spread evenly, or the last four.
+    the model says. Until the model is known they are spread evenly, or the last four. None is
+    ``shunned``, which answers otherwise than the model says, but where there is no choice.
     """
-    fixed = _without_choice(rtc, policy)
+    fixed = _without_choice(rtc, policy, shunned)
     if fixed is not None:
         return fixed
     first = _first_free(rtc, policy)
     if policy.mode_information is not None:
-        above = range(first, min(first + SPAN, rtc.n_modes))
-        return most_telling(policy.mode_information, above, N_LINES, policy.dither_sigma)
+        return _telling(policy, first, min(first + SPAN, rtc.n_modes), shunned)
     step = max(1, min(20, (rtc.n_modes - first) // (N_LINES + 1)))
     return tuple(first + step // 2 + step * line for line in range(N_LINES))
 
@@ -89,22 +91,27 @@ def why_elsewhere(request: DitherRequest, rtc: Status, policy: Policy) -> str:
     return f"the loop controls modes {named} now: others are free"
 
 
-def _without_choice(rtc: Status, policy: Policy) -> tuple[int, ...] | None:
+def _without_choice(
+    rtc: Status, policy: Policy, shunned: frozenset[int] = frozenset()
+) -> tuple[int, ...] | None:
     """Return the modes to dither where there is no choice; None: there is."""
     if policy.dither_modes:
         return policy.dither_modes[: rtc.max_dither_modes]
     if rtc.n_modes - _first_free(rtc, policy) >= N_LINES:
         return None
-    return _highest(policy, rtc.n_modes)[: rtc.max_dither_modes]
+    if policy.mode_information is None:
+        return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
+    highest = max(rtc.n_modes - SPAN, 0)
+    return _telling(policy, highest, rtc.n_modes, shunned)[: rtc.max_dither_modes]
 
 
 @lru_cache(maxsize=4)  # of one policy; asked for with every status
-def _highest(policy: Policy, n_modes: int) -> tuple[int, ...]:
-    """Return which of the highest modes tell most of α, or the last while nobody knows."""
+def _telling(policy: Policy, first: int, stop: int, shunned: frozenset[int]) -> tuple[int, ...]:
+    """Return which of these modes tell most of α."""
     if policy.mode_information is None:
-        return tuple(range(max(n_modes - N_LINES, 0), n_modes))
-    highest = range(max(n_modes - SPAN, 0), n_modes)
-    return most_telling(policy.mode_information, highest, N_LINES, policy.dither_sigma)
+        return ()
+    among = [mode for mode in range(first, stop) if mode not in shunned]
+    return most_telling(policy.mode_information, among, N_LINES, policy.dither_sigma)
 
 
 def _first_free(rtc: Status, policy: Policy) -> int:

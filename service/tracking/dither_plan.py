@@ -16,7 +16,12 @@ from service.control.dither import (
 )
 from service.tracking import mode_proof
 from service.tracking.alarms import Act
-from service.tracking.dither_modes import controlled, expected_amplification, why_elsewhere
+from service.tracking.dither_modes import (
+    chosen_modes,
+    controlled,
+    expected_amplification,
+    why_elsewhere,
+)
 from service.tracking.dither_request import (
     OUR_DITHERS,
     OWN_DITHER,
@@ -106,7 +111,8 @@ def wanted(turn: Turn, rtc: Status) -> tuple[Wish, DitherPlan]:
     found = schedule(kappa, demand)
     plan = _plan(state, found, demand, window_s, phase)
     shown: tuple[int, ...] = ()
-    if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}:
+    early = state.dither_due_since_ns_utc is None and mode_proof.unknown_loop(state, rtc)
+    if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE} or early:
         shown = mode_proof.modes_to_show(turn, rtc, window_s)
     if shown:
         return _to_show(turn, rtc, shown, window_s), plan
@@ -144,6 +150,7 @@ def _choice(turn: Turn, total_m: float, window_s: float, lasting_s: float) -> Ch
         n_windows=max(int(lasting_s / window_s + 1e-6), 1),
         avoid_hz=(*turn.policy.dither_avoid_hz, *turn.state.vibrations_hz),
         last_hz=turn.dithering.lines_hz,
+        shunned=mode_proof.shunned_modes(turn.state),
     )
 
 
@@ -189,13 +196,17 @@ def quiet_budget_m(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) ->
     return float(min(budget_m(rtc, policy), quiet_m))
 
 
-def why_moved(dither: Dither, rtc: Status, policy: Policy) -> str:
+def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[int]) -> str:
     """Return why another dither should take the place of one that runs; empty: it is as it should.
 
-    It was asked for when fewer modes were controlled.
+    It was asked for when fewer modes were controlled, or before one of its modes was seen to
+    answer otherwise than the model says.
     """
     if proves(dither.request):
         return ""
+    odd = shunned.intersection(dither.request.modes)
+    if odd and not odd.intersection(chosen_modes(rtc, policy, shunned)):
+        return f"mode {min(odd)} has not answered as the instrument file says: others tell of α"
     elsewhere = why_elsewhere(dither.request, rtc, policy)
     if elsewhere or not controlled(dither.request.modes, rtc):
         return elsewhere

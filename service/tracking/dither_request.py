@@ -96,6 +96,9 @@ class Choice:
     lines_hz: tuple[float, ...] = ()
     """Their lines."""
 
+    shunned: frozenset[int] = frozenset()
+    """Modes that are not to be dithered to follow α."""
+
 
 def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
     """Return why the lines of a dither cannot be told apart in its windows, or None."""
@@ -127,7 +130,8 @@ def plan_dither(
     """
     asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
     proving = choice.modes and not asked
-    chosen = (modes or choice.modes or chosen_modes(rtc, policy))[: rtc.max_dither_modes]
+    chosen = modes or choice.modes or chosen_modes(rtc, policy, choice.shunned)
+    chosen = chosen[: rtc.max_dither_modes]
     lines = choice.lines_hz if proving else frequency_hz or policy.dither_frequencies_hz
     if lines is None:
         lines = clear_lines(rtc, len(chosen), choice)

@@ -15,7 +15,7 @@ from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
 from service.telemetry.lockin import MAX_LAG_FRAMES
 from service.telemetry.random_dither import RandomEstimate
 from service.telemetry.windows import RefusalKind, Why
-from service.tracking import validity
+from service.tracking import mode_proof, validity
 from service.tracking.alarms import DISAGREES, SUSPECTED, Act, forbidding
 from service.tracking.jumps import last_of
 from service.tracking.policy import SECOND_NS, Policy
@@ -334,6 +334,9 @@ def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | 
     reason = why_no_measurement(turn.state, when)
     if reason is not None:
         return RefusalKind.VOID, reason
+    odd = mode_proof.why_void(turn, estimate)
+    if odd is not None:
+        return RefusalKind.VOID, odd
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         late = f"slopes lag commands by {lag:+.2f} frame, 0 is expected"

@@ -24,6 +24,18 @@ class ModeLimit:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModeAnswer:
+    """How a mode has last answered a dither otherwise than the instrument file says."""
+
+    mode: int
+    gain: float
+    """Times the model."""
+
+    like: int
+    """Mode of the model that it answers as; its own: none certainly."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModeProof:
     """Which modes have been seen to answer as the instrument file says, apart from any matrix."""
 
@@ -38,6 +50,18 @@ class ModeProof:
 
     strange: frozenset[int] = frozenset()
     """Modes of the RTC's own matrix that could not be recognised in it."""
+
+    answers: tuple[ModeAnswer, ...] = ()
+    """Of those contrary or suspected, in order."""
+
+    uneven: frozenset[int] = frozenset()
+    """Proven, and in two windows far stronger or weaker than the modes beside them."""
+
+    perhaps_uneven: frozenset[int] = frozenset()
+    """Seen so in one window: not proven before the next one."""
+
+    own_uneven: str = ""
+    """Which modes are so by the RTC's own matrix; empty: none."""
 
     shown: frozenset[int] = frozenset()
     """Modes that a dither was asked for to see; empty: what it has shown is known."""

@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.telemetry.comb import SIDE_OFFSETS_HZ
+from service.telemetry.estimate import DitheredEstimate
 from service.telemetry.lockin import WindowEstimate
 from service.telemetry.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.dither_modes import N_LINES, PROVING_RANGE, chosen_modes
 from service.tracking.dither_request import CLEARANCES_HZ, step_of
-from service.tracking.mode_limits import ModeProof
+from service.tracking.mode_limits import ModeAnswer, ModeProof
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
 from service.tracking.turn import Turn
 from service.tracking.worth import limit_modes, settled
@@ -31,6 +33,16 @@ from service.wire import Status
 
 SIZE_RANGE = (0.4, 2.0)
 """Of a mode's response over the median of the modes dithered with it: optical gains lie within."""
+
+UNEVEN = 1.6
+"""A mode that answers certainly so many times as the modes beside it, or one over that, is named;
+it may be controlled."""
+
+CERTAIN = 3.0
+"""1 σ by which it must be so, in each of two windows."""
+
+NEIGHBOURS = 10
+"""Modes that one is compared with; a window of no more tells nothing of it."""
 
 LEAST_RESPONSE = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
@@ -70,6 +82,26 @@ def proven_modes(state: TrackerState) -> frozenset[int]:
     return proof.proven | controlled
 
 
+def shunned_modes(state: TrackerState) -> frozenset[int]:
+    """Return the modes that have answered otherwise and are not in the loop: none tells of α."""
+    return state.mode_proof.contrary - proven_modes(state)
+
+
+def why_void(turn: Turn, estimate: DitheredEstimate) -> str | None:
+    """Return why a window of these modes does not tell of α, or None.
+
+    What the loop makes of a line is fitted with the gain of the line's own mode.
+    """
+    if turn.policy.dither_modes or turn.policy.mode_information is None:
+        return None  # there is no choice of others
+    proof = turn.state.mode_proof
+    odd = (proof.contrary | proof.suspected).intersection(estimate.modes)
+    odd -= proven_modes(turn.state)
+    if not odd:
+        return None
+    return f"{_named(odd)} not answered as the instrument file says: such a window tells no α"
+
+
 def most_modes(state: TrackerState, n_modes: int) -> int:
     """Return how many modes, from the first on and at most ``n_modes``, are proven."""
     proven = proven_modes(state)
@@ -107,16 +139,32 @@ def modes_to_show(turn: Turn, rtc: Status, window_s: float) -> tuple[int, ...]:
     state, known = turn.state, turn.known
     busy = state.on_probation or state.making_since_ns_utc is not None
     on_way = any(record.on_its_way for record in state.reconstructors)
-    if known is None or not settled(known) or busy or on_way or state.mode is Mode.HOLD:
+    if known is None or busy or on_way or state.mode is Mode.HOLD:
         return ()
     if not awaits_proof(turn, rtc):
         return ()
     missing = _missing(turn, rtc)
+    if not (settled(known) or (unknown_loop(state, rtc) and _plausible(known))):
+        return ()
     at_once = max(MOST_AT_ONCE // FEWER**state.mode_proof.n_tries, N_LINES)
     most = min(len(lines_clear(turn, rtc, window_s)), at_once, rtc.max_dither_modes)
     shown = missing[:most]
-    spare = [mode for mode in chosen_modes(rtc, turn.policy) if mode not in shown]
+    telling = chosen_modes(rtc, turn.policy, shunned_modes(state))
+    spare = [mode for mode in telling if mode not in shown]
     return tuple(sorted([*shown, *spare[: max(min(N_LINES, most) - len(shown), 0)]]))
+
+
+def unknown_loop(state: TrackerState, rtc: Status) -> bool:
+    """Return whether nobody knows how the modes answer that the loop controls already.
+
+    No matrix can be sent before that is known: one window is enough to begin with.
+    """
+    return most_modes(state, rtc.n_controlled) < rtc.n_controlled
+
+
+def _plausible(known: Registration) -> bool:
+    """Return whether no window contradicts α, though there may be one only."""
+    return known.candidate is None and not known.doubt and known.usable
 
 
 def lines_clear(turn: Turn, rtc: Status, window_s: float) -> tuple[float, ...]:
@@ -155,26 +203,48 @@ def learn(turn: Turn, estimate: WindowEstimate | RandomEstimate) -> None:
     rtc, proof = turn.rtc, turn.state.mode_proof
     if rtc is None or estimate.session != rtc.session or estimate.gain_sigma is None:
         return
-    modes = np.array(estimate.modes)
-    gains = np.real(estimate.optical_gain)
+    modes, gains = np.array(estimate.modes), np.real(estimate.optical_gain)
     proven, contrary = _told(gains, np.abs(estimate.optical_gain), estimate.gain_sigma)
-    good, bad = frozenset(modes[proven].tolist()), frozenset(modes[contrary].tolist())
+    odd = proven & _uneven(modes, gains, estimate.gain_sigma)
+    good, bad, uneven = (frozenset(modes[which].tolist()) for which in (proven, contrary, odd))
     before = proof
     sure = bad & (proof.suspected | proof.contrary)
+    doubted = uneven - proof.perhaps_uneven - proof.uneven - proof.proven
+    accused = (proof.suspected | bad | proof.contrary) - good
     proof = replace(
         proof,
-        proven=(proof.proven | good) - bad,
+        proven=(proof.proven | (good - doubted)) - bad,
         contrary=(proof.contrary | sure) - good,
         suspected=(proof.suspected | bad) - good - sure,
+        answers=_answers(proof, estimate, gains, bad, accused),
+        uneven=(proof.uneven - good - bad) | (uneven & (proof.perhaps_uneven | proof.uneven)),
+        perhaps_uneven=(proof.perhaps_uneven - good - bad) | doubted,
     )
     if proof.shown and proof.shown <= frozenset(estimate.modes):
-        told = (good | bad) & proof.shown
+        told = (good | bad) & (proof.shown - before.proven)
         proof = replace(proof, n_tries=0) if told else _missed(proof)
         proof = replace(proof, shown=frozenset())
     if proof == before:
         return
     turn.state = replace(turn.state, mode_proof=proof)
-    _tell(turn, rtc, dict(zip(modes[contrary].tolist(), gains[contrary].tolist(), strict=True)))
+    _tell(turn, rtc, bad)
+    _tell_uneven(turn, before)
+
+
+def _answers(
+    proof: ModeProof,
+    estimate: WindowEstimate | RandomEstimate,
+    gains: NDArray[np.float64],
+    bad: frozenset[int],
+    accused: frozenset[int],
+) -> tuple[ModeAnswer, ...]:
+    """Return how the accused modes have answered, those of this window as it says."""
+    like = estimate.answers_as or estimate.modes
+    found = {answer.mode: answer for answer in proof.answers if answer.mode in accused}
+    for mode, gain, other in zip(estimate.modes, gains.tolist(), like, strict=True):
+        if mode in bad:
+            found[mode] = ModeAnswer(mode=mode, gain=gain, like=other)
+    return tuple(found[mode] for mode in sorted(found))
 
 
 def recognise(turn: Turn, event: ev.ModesRecognised) -> None:
@@ -184,10 +254,9 @@ def recognise(turn: Turn, event: ev.ModesRecognised) -> None:
     )
     turn.state = replace(turn.state, mode_proof=proof)
     turn.log("modes.recognised", f"{event.id}: {event.text}")
-    if event.uneven:
-        turn.alarm(alarms.MODES_UNEVEN, f"{event.uneven}: matrices allow for it")
-    else:
-        turn.calm(alarms.MODES_UNEVEN)
+    before = turn.state.mode_proof
+    turn.state = replace(turn.state, mode_proof=replace(before, own_uneven=event.uneven))
+    _tell_uneven(turn, before)
 
 
 def _told(
@@ -202,22 +271,74 @@ def _told(
     return proven, contrary & ~proven
 
 
-def _tell(turn: Turn, rtc: Status, answers: dict[int, float]) -> None:
+def _uneven(
+    modes: NDArray[np.intp], gains: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return which modes answer certainly otherwise than those beside them in the basis.
+
+    Optical gains change slowly from mode to mode; with few modes in a window nobody can tell.
+    """
+    odd = np.zeros(len(modes), dtype=bool)
+    if len(modes) <= NEIGHBOURS:
+        return odd
+    for k, mode in enumerate(modes):
+        beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : NEIGHBOURS + 1]
+        usual, spare = float(np.median(gains[beside])), CERTAIN * sigma[k]
+        odd[k] = gains[k] - spare > UNEVEN * usual or gains[k] + spare < usual / UNEVEN
+    return odd
+
+
+def _tell(turn: Turn, rtc: Status, bad: frozenset[int]) -> None:
     """Say which modes answer otherwise, and control none of them for a while."""
-    contrary = turn.state.mode_proof.contrary - proven_modes(turn.state)
+    proof = turn.state.mode_proof
+    contrary = shunned_modes(turn.state)
     in_the_way = sorted(mode for mode in contrary if mode < _target(turn, rtc))
     if not in_the_way:
         turn.calm(alarms.MODES_CONTRARY)
         return
-    seen = ", ".join(f"{answers[mode]:+.2f}" for mode in in_the_way[:_NAMED] if mode in answers)
     text = (
         f"{_named(in_the_way)} not answered the dither as the instrument file says"
-        f"{f' ({seen} times the model)' if seen else ''}: no new matrix controls more than "
-        f"{in_the_way[0]} modes"
+        f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
     turn.alarm(alarms.MODES_CONTRARY, text)
-    if any(mode in contrary for mode in answers):
+    if bad & contrary:
         limit_modes(turn, in_the_way[0], text)
+
+
+def _in_words(proof: ModeProof, modes: list[int]) -> str:
+    """Return how modes have answered, in brackets."""
+    answers = {answer.mode: answer for answer in proof.answers}
+    told = [answers[mode] for mode in modes[:_NAMED] if mode in answers]
+    said = []
+    for answer in told:
+        other = answers.get(answer.like)
+        if answer.like == answer.mode:
+            said.append(f"{answer.gain:+.2f}")
+        elif other is None or other.like != answer.mode:
+            said.append(f"{answer.mode} is in the place of {answer.like}")
+        elif answer.mode < other.mode or other not in told:
+            said.append(f"{answer.mode} and {answer.like} are exchanged")
+    times = " times the model" if any(answer.like == answer.mode for answer in told) else ""
+    return f" ({', '.join(said)}{times})" if said else ""
+
+
+def _tell_uneven(turn: Turn, before: ModeProof) -> None:
+    """Say which modes answer more or less strongly than their neighbours."""
+    proof = turn.state.mode_proof
+    if (proof.uneven, proof.own_uneven) == (before.uneven, before.own_uneven):
+        return
+    found = [f"{proof.own_uneven}: matrices allow for it"] if proof.own_uneven else []
+    if proof.uneven:
+        one = "answers" if len(proof.uneven) == 1 else "answer"
+        noun = "mode" if len(proof.uneven) == 1 else "modes"
+        found.append(
+            f"{noun} {_listed(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
+            "strongly or as weakly as the modes beside"
+        )
+    if found:
+        turn.alarm(alarms.MODES_UNEVEN, "; ".join(found))
+    else:
+        turn.calm(alarms.MODES_UNEVEN)
 
 
 def _missed(proof: ModeProof) -> ModeProof:
@@ -230,7 +351,9 @@ def give_up(turn: Turn, rtc: Status) -> None:
     proof = turn.state.mode_proof
     if proof.n_tries < TRIES:
         return
-    turn.state = replace(turn.state, mode_proof=replace(proof, shown=frozenset(), n_tries=0))
+    suspected = proof.suspected - proof.shown
+    given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
+    turn.state = replace(turn.state, mode_proof=given_up)
     text = (
         f"{_named(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows are "
         "refused, or give the dither more budget"
@@ -239,9 +362,14 @@ def give_up(turn: Turn, rtc: Status) -> None:
 
 
 def _missing(turn: Turn, rtc: Status) -> list[int]:
-    """Return the modes that are wanted now, and that nobody has seen to answer."""
-    proven = proven_modes(turn.state)
-    return [mode for mode in range(_wanted(turn, rtc)) if mode not in proven]
+    """Return the modes that are wanted now, and that nobody has seen to answer.
+
+    Those that one window has accused are shown again whatever is wanted: an accusation is named,
+    or it is none.
+    """
+    proven, wanted = proven_modes(turn.state), _wanted(turn, rtc)
+    accused = (mode for mode in turn.state.mode_proof.suspected if wanted <= mode < rtc.n_modes)
+    return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
 
 
 def _wanted(turn: Turn, rtc: Status) -> int:

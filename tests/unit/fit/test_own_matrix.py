@@ -123,6 +123,14 @@ def test_the_size_of_a_response_is_told_and_is_nothing_wrong():
     np.testing.assert_allclose(half.response, 0.5, atol=0.05)
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_mode_of_half_or_twice_the_strength_is_named(factor):
+    found = told_by(times(factor, 20))
+    assert found.wrong == ""
+    assert "matrix mode 20 " in found.uneven
+    assert found.uneven.count("mode ") == 1
+
+
 def test_a_turned_sign_of_another_size_is_still_a_turned_sign():
     assert told_by(times(-0.5, 15)).wrong == "mode 15 has the other sign by the RTC's own matrix"
 

@@ -326,3 +326,18 @@ def test_the_simulated_loop_answers_as_the_formula_says():
         np.testing.assert_allclose(
             spectra.commands[line, 0], expected, atol=1e-3 * np.abs(expected).max()
         )
+
+
+def test_a_mode_in_the_place_of_another_is_told_and_no_other_is():
+    """On the linear plant a free mode is the file's, or another in its place."""
+    here = small_model().linearise(SOMEWHERE)
+    place = np.arange(N_MODES)
+    place[[33, 39]] = [39, 33]
+    other = replace(here, matrix=here.matrix[:, place], derivatives=here.derivatives[:, :, place])
+    for spectra in bright_windows()[:6]:
+        assert fit_window(spectra, here, BRIGHT.loop).answers_as == (33, 37)
+        assert fit_window(spectra, other, BRIGHT.loop).answers_as == (39, 37)
+
+
+def test_noise_puts_no_mode_in_the_place_of_another():
+    assert {estimate.answers_as for estimate in faint_estimates()} == {(33, 37)}

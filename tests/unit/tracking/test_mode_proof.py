@@ -15,7 +15,7 @@ from service.tracking.mode_proof import TRIES, most_modes, proven_modes
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from tests.unit.tracking.situations import POLICY, estimate, foreign, of_kind
+from tests.unit.tracking.situations import N_MODES, POLICY, estimate, foreign, of_kind
 from tests.unit.tracking.world import STEP_S, WINDOW_S, World
 
 TARGET = replace(POLICY, n_modes_target=450)
@@ -24,9 +24,9 @@ TARGET = replace(POLICY, n_modes_target=450)
 class Shown(World):
     """A world in which every mode answers with 0.6 of the model but those in ``answers``."""
 
-    def __init__(self, answers=None, mode=Mode.AUTO, offered=True, **changes):
-        self.answers_of, self.offered = answers or {}, offered
-        super().__init__(mode, TARGET, **changes)
+    def __init__(self, answers=None, mode=Mode.AUTO, offered=True, policy=TARGET, **changes):
+        self.answers_of, self.offered, self.sigma_of = answers or {}, offered, {}
+        super().__init__(mode, policy, **changes)
 
     def tell(self, event, after_s=0.0):
         if isinstance(event, ev.SessionStarted):
@@ -52,7 +52,7 @@ class Shown(World):
             session=f"s{self.session}",
             modes=modes,
             optical_gain=gains,
-            gain_sigma=np.full(len(modes), 0.02),
+            gain_sigma=np.array([self.sigma_of.get(mode, 0.02) for mode in modes]),
             lag_frames=np.zeros(len(modes)),
         )
         self.tell(ev.WindowFitted(estimate=fitted))
@@ -218,3 +218,92 @@ def test_a_mode_that_the_loop_runs_with_is_not_accused_by_its_dither():
         world.tell(ev.WindowFitted(estimate=seen))
     assert most_modes(world.state, 450) == 450
     assert alarms.MODES_CONTRARY not in world.alarms
+
+
+def test_modes_that_nobody_knows_are_shown_after_one_window_where_the_loop_runs_with_them():
+    """Nothing can be sent before; where the RTC's matrix is known three windows must agree."""
+    world = Shown(offered=False).pass_(2.0 * WINDOW_S)
+    assert world.shown
+    assert not Shown().pass_(2.0 * WINDOW_S).shown
+
+
+def test_a_mode_accused_once_is_shown_again_though_fewer_are_wanted_meanwhile():
+    """Mode 30 is named first, and no more than 30 are wanted: 120 is the other half of it."""
+    world = Shown({30: 0.0, 120: 0.0}, offered=False).pass_(30.0)
+    assert world.state.mode_limit.n_modes == 30
+    assert "modes 30, 120 have" in world.state.alarm(alarms.MODES_CONTRARY).text
+
+
+def test_modes_that_were_known_already_do_not_make_a_dither_count_as_one_that_has_told():
+    world = Shown(offered=False)
+    noisy = dict.fromkeys((0, 1, 2), 0.3 + 0.0j)
+    world.answers_of, world.sigma_of = noisy, dict.fromkeys(noisy, 0.2)
+    world.pass_(60.0)
+    assert "have not been seen to answer in 3 dithers" in world.state.mode_limit.reason
+
+
+def told(world, gains, answers_as=None, first=410):
+    """One window of a dither of modes from ``first`` on."""
+    modes = tuple(range(first, first + len(gains)))
+    seen = estimate(
+        t_ns=world.now_ns,
+        session=f"s{world.session}",
+        modes=modes,
+        optical_gain=np.array(gains, dtype=complex),
+        gain_sigma=np.full(len(gains), 0.02),
+        lag_frames=np.zeros(len(gains)),
+        answers_as=answers_as or modes,
+    )
+    world.tell(ev.WindowFitted(estimate=seen))
+    return world
+
+
+def test_modes_that_answer_as_each_other_are_said_to_be_exchanged():
+    world = Shown().pass_(8.0)
+    like = (412, 411, 410, *range(413, 422))
+    for _ in range(2):
+        told(world, [0.01, 0.6, -0.01] + [0.6] * 9, like)
+    text = world.state.alarm(alarms.MODES_CONTRARY).text
+    assert "(410 and 412 are exchanged)" in text
+
+
+def test_a_mode_that_answers_as_another_is_said_to_be_in_its_place():
+    world = Shown().pass_(8.0)
+    for _ in range(2):
+        told(world, [0.01] + [0.6] * 11, (77, *range(411, 422)))
+    assert "(410 is in the place of 77)" in world.state.alarm(alarms.MODES_CONTRARY).text
+
+
+@pytest.mark.parametrize("answer", [1.1, 0.28])
+def test_a_mode_of_twice_or_half_the_strength_is_named_by_two_windows_and_controlled(answer):
+    world = Shown().pass_(8.0)
+    told(world, [0.6] * 5 + [answer] + [0.6] * 6)
+    assert 415 not in proven_modes(world.state)
+    assert alarms.MODES_UNEVEN not in world.alarms
+    told(world, [0.6] * 5 + [answer] + [0.6] * 6)
+    assert 415 in proven_modes(world.state)
+    assert "mode 415 answers the dither" in world.state.alarm(alarms.MODES_UNEVEN).text
+    told(world, [0.6] * 12)
+    assert alarms.MODES_UNEVEN not in world.alarms
+
+
+def test_optical_gains_that_change_along_the_basis_are_not_uneven():
+    world = Shown().pass_(8.0)
+    for _ in range(3):
+        told(world, np.linspace(0.3, 0.9, 40).tolist())
+    assert not world.state.mode_proof.uneven
+    assert not world.state.mode_proof.perhaps_uneven
+
+
+def test_a_mode_that_answers_otherwise_is_dithered_no_more_and_its_window_tells_no_alpha():
+    told_of = np.broadcast_to(np.eye(4), (N_MODES, 4, 4)).copy()
+    told_of[[460, 470, 480, 490]] *= 100.0
+    world = Shown({470: -0.6}, policy=replace(TARGET, mode_information=told_of))
+    world.pass_(20.0)
+    assert 470 in world.playing.request.modes or 470 in world.asked(DitherRequest)[0].modes
+    world.pass_(30.0)
+    assert 470 not in world.playing.request.modes
+    refused = [entry.text for entry in world.state.log if entry.name == "window.refused"]
+    assert any("mode 470 has not answered" in text for text in refused)
+    assert alarms.WINDOWS_REFUSED not in world.alarms
+    assert alarms.SUSPECTED not in world.alarms

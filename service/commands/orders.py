@@ -12,7 +12,7 @@ from urllib.parse import quote
 from service.commands.options import named
 from service.commands.reading import reconstructor_lines, understood
 from service.commands.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request
-from service.commands.rest import Document, Service
+from service.commands.rest import Document, RefusedError, Service
 from service.commands.terminal import login, print_document, print_lines
 from service.errors import ConfigurationError, say, shown
 
@@ -50,6 +50,8 @@ def carry_out(service: Service, request: Request, options: argparse.Namespace) -
         As of the service.
     """
     headers = {}
+    if (request.needs_why and not options.why) or (request.asks and not options.yes):
+        _refuse_early(service, request)
     if request.decides_on:
         headers["If-Match"] = _show(service, request, options)
     why = options.why or (_asked(request, "why", "--why") if request.needs_why else "")
@@ -78,6 +80,18 @@ def carry_out(service: Service, request: Request, options: argparse.Namespace) -
     if request.then:
         say(request.then)
     return _follow(service, request, options) if follows else DONE
+
+
+def _refuse_early(service: Service, request: Request) -> None:
+    """Refuse what the service would refuse, before somebody is asked for a reason."""
+    if not request.permitted:
+        return
+    state = service.get("/v1/state").document
+    with understood(service):
+        permission = state["permitted"][request.permitted]
+        reason = "" if permission["allowed"] else str(permission["reason"])
+    if reason:
+        raise RefusedError(reason)
 
 
 def path_of(path: str, options: argparse.Namespace) -> str:

@@ -54,6 +54,9 @@ class Request(NamedTuple):
     """What somebody at a terminal has to agree to before; empty: nothing."""
 
     needs_why: bool = False
+    permitted: str = ""
+    """Name of the order in the state's ``permitted``; only where somebody is asked something."""
+
     then: str = ""
     """What to do afterwards."""
 
@@ -150,6 +153,7 @@ REQUESTS = (
         f"POST {_ONE}/approve",
         *(_CANDIDATE, _NO_WAIT),
         decides_on=_ONE,
+        permitted="approve",
         asks="send it to the RTC",
         follows=_ONE,
     ),
@@ -159,6 +163,7 @@ REQUESTS = (
         f"POST {_ONE}/reject",
         _CANDIDATE,
         decides_on=_ONE,
+        permitted="reject",
         needs_why=True,
     ),
     _orders(
@@ -167,6 +172,7 @@ REQUESTS = (
         f"POST {_ONE}/publish",
         *(_ID, _NO_WAIT),
         decides_on=_ONE,
+        permitted="publish",
         asks="send it to the RTC again",
         follows=RECONSTRUCTORS,
     ),
@@ -178,6 +184,7 @@ REQUESTS = (
         _NO_WAIT,
         body="anyway",
         decides_on=RECONSTRUCTORS,
+        permitted="rollback",
         asks="go back to the one before; mode becomes hold",
         needs_why=True,
         then=_RESUMES,
@@ -248,6 +255,7 @@ REQUESTS = (
         "POST /v1/acquisition",
         _NO_WAIT,
         always={"action": "start"},
+        permitted="acquire",
         asks="open the loop and dither strongly; the image is lost for tens of seconds",
         needs_why=True,
         follows="/v1/state",
@@ -260,6 +268,7 @@ REQUESTS = (
         words("--n-average N", "pushes, and pulls, of each", type=int),
         *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
         body="pattern n_average modes amplitude_m frequency_hz duration_s",
+        permitted="measure",
         asks="have the RTC measure; all patterns but sine open the loop",
         follows="/v1/measurements/{id}",
     ),

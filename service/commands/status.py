@@ -5,6 +5,9 @@ from __future__ import annotations
 from service.commands.rest import Document
 from service.commands.terminal import span
 
+FEW = 2
+"""So many orders, and fewer, may be refused for one reason in any quiet minute."""
+
 _ALPHA = {
     "shift_x_subap": ("shift x", "+.4f", "subap"),
     "shift_y_subap": ("shift y", "+.4f", "subap"),
@@ -116,7 +119,17 @@ def _doing(state: Document) -> list[str]:
         lines.append(f"doing    {state['measuring']['id']} is being measured")
     if state["gathering"] is not None:
         lines.append(f"doing    {state['gathering']['id']}, a noisy matrix, is under way")
-    return lines
+    return [*lines, *_refused(state)]
+
+
+def _refused(state: Document) -> list[str]:
+    """Return what refuses several orders now, and what to do first."""
+    orders: dict[str, list[str]] = {}
+    for name, permission in state["permitted"].items():
+        if not permission["allowed"]:
+            orders.setdefault(permission["reason"], []).append(name.replace("_", " "))
+    several = (item for item in orders.items() if len(item[1]) > FEW)
+    return [f"refused  {', '.join(names)}: {reason}" for reason, names in several]
 
 
 def _number(value: float | None, form: str) -> str:

@@ -27,7 +27,7 @@ from service.tracking.events import MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import AcquisitionStage, Mode
 from tests.unit.test_api import LINK, MATRIX, SECOND, STATE, FakeService
-from tests.unit.tracking.situations import POLICY
+from tests.unit.tracking.situations import ALL_SHOWN, POLICY
 
 BEFORE = ReconstructorRecord(
     id="cm-0", state=MatrixState.SUPERSEDED, n_modes=300, created_ns_utc=SECOND
@@ -82,7 +82,12 @@ def service(served, monkeypatch):
     service, url = served
     monkeypatch.setenv("PYRCAL_URL", url)
     monkeypatch.setattr(orders, "time", clock())
-    tracker = replace(STATE, reconstructors=(BEFORE, *STATE.reconstructors))
+    tracker = replace(
+        STATE,
+        reconstructors=(BEFORE, *STATE.reconstructors),
+        proven=frozenset({STATE.rtc.cm_id}),
+        mode_proof=ALL_SHOWN,
+    )
     service.now = Snapshot(
         policy=POLICY,
         tracker=tracker,
@@ -323,6 +328,23 @@ def test_a_refit_is_followed_until_there_is_a_reconstructor(
     told = capsys.readouterr().out
     assert "cm-7, 300 modes" in told
     assert "pole radius 0.9" in told
+
+
+@pytest.mark.parametrize("words", [["approve"], ["rollback"], ["acquire"], ["measure"]])
+def test_what_may_not_be_ordered_now_is_refused_before_anybody_is_asked(
+    capsys, service, monkeypatch, words
+):
+    monkeypatch.setattr(orders, "_asked", lambda *_: pytest.fail("somebody was asked"))
+    service.change(stopped_because="everything was stopped by Ada (wind)")
+    assert main(words) == 1
+    reason = service.now.permitted[words[0]].reason
+    assert reason == "everything was stopped by Ada (wind); release the stop first"
+    assert f"pyrcal: {words[0]}: {reason}" in capsys.readouterr().err
+    assert service.commands == []
+    main(["status"])
+    shown = capsys.readouterr().out
+    assert "refused  " in shown
+    assert shown.count(reason) >= 1
 
 
 def test_what_nobody_has_heard_of_is_a_refusal(capsys, service):

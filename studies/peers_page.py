@@ -106,13 +106,10 @@ def _rows(header: str, rows: Iterable[Sequence[str]]) -> str:
 
 def _matrix_table(matrices: Sequence[tuple[Case, Measured]]) -> str:
     return _rows(
-        "matrix | slopes | its columns, rows in the pupil | x, y (subap)"
-        " | rotation (deg) | magnification | seconds",
+        "matrix | x, y (subap) | rotation (deg) | magnification | seconds",
         (
             (
                 case.name,
-                str(len(measured.matrix)),
-                _axes(measured),
                 "{:+.2f}, {:+.2f}".format(*in_degrees(case.alpha)[:2]),
                 f"{in_degrees(case.alpha)[2]:+.1f}",
                 f"{case.alpha.magnification:.3f}",
@@ -121,15 +118,6 @@ def _matrix_table(matrices: Sequence[tuple[Case, Measured]]) -> str:
             for case, measured in matrices
         ),
     )
-
-
-def _axes(measured: Measured) -> str:
-    """Return which way along the pupil the detector's columns and rows run."""
-    names = []
-    for row in measured.detector_from_pupil:
-        axis = int(np.argmax(np.abs(row)))
-        names.append(f"{'+' if row[axis] > 0 else '-'}{'xy'[axis]}")
-    return ", ".join(names)
 
 
 def _table(answers: Sequence[Answer]) -> str:

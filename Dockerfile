@@ -14,7 +14,8 @@ FROM ${BASE}
 WORKDIR /opt/pyrcal
 COPY pyproject.toml build_backend.py constraints.txt README.md LICENSE ./
 COPY service service
-COPY --from=manual /opt/manual service/manual
+COPY pyrcal pyrcal
+COPY --from=manual /opt/manual service/web/manual
 COPY check_rtc check_rtc
 COPY sim_rtc sim_rtc
 COPY cacao_bridge cacao_bridge

@@ -6,7 +6,7 @@
 PYTHON ?= python3
 PY := .venv/bin/python
 STAMP := .venv/.installed-for
-MANUAL := service/manual/index.html
+MANUAL := service/web/manual/index.html
 # A hundred processes that each compile the service anew cost a minute.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(PY) -m pytest
 
@@ -44,7 +44,7 @@ paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--
 	@$(PY) -m studies.heritier2018 $(ARGS)
 
 clean: ## remove what make made; never var/, which holds calibration products
-	rm -rf .venv build dist service/manual *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
+	rm -rf .venv build dist service/web/manual *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \
 	    .import_linter_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

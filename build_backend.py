@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 ROOT = Path(__file__).parent
-MANUAL = ROOT / "service" / "manual"
+MANUAL = ROOT / "service" / "web" / "manual"
 SPHINX = ["sphinx>=8.2", "myst-parser>=4.0"]
 
 Settings = dict[str, str | list[str] | None] | None

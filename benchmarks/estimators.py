@@ -20,11 +20,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.model.instrument import Mirror
-from service.model.modes import karhunen_loeve_basis
-from service.telemetry import comb, loopcheck, passive
-from service.telemetry.frames import FrameBlock
-from service.telemetry.health import (
+from service.estimation import comb, loopcheck, passive
+from service.estimation.frames import FrameBlock
+from service.estimation.health import (
     Actuators,
     EdgeHealth,
     EdgeWatch,
@@ -34,11 +32,13 @@ from service.telemetry.health import (
     observe,
     observe_edge,
 )
-from service.telemetry.lockin import LockIn, LockInPlan
-from service.telemetry.loopcheck import LoopCheck
-from service.telemetry.passive import Passive
-from service.telemetry.random_dither import RandomDither, RandomPlan
-from service.telemetry.windows import ClosedLoop
+from service.estimation.lockin import LockIn, LockInPlan
+from service.estimation.loopcheck import LoopCheck
+from service.estimation.passive import Passive
+from service.estimation.random_dither import RandomDither, RandomPlan
+from service.estimation.windows import ClosedLoop
+from service.model.instrument import Mirror
+from service.model.modes import karhunen_loeve_basis
 
 N_SLOPES, N_MODES, N_CONTROLLED = 1408, 594, 400
 RATE_HZ = 1000.0

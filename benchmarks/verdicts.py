@@ -24,16 +24,16 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.loop import ControlLoop
 from service.control.reconstructor import Recipe, reconstruct
+from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.lockin import LockInPlan, Spectra, fit_window
+from service.estimation.windows import ClosedLoop
+from service.files.prepared import usual_folder
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from service.prepared import usual_folder
-from service.telemetry.comb import SIDE_OFFSETS_HZ
-from service.telemetry.lockin import LockInPlan, Spectra, fit_window
-from service.telemetry.windows import ClosedLoop
+from service.runtime.worker import Compute, Conditions, OpticsWorker
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S
-from service.worker import Compute, Conditions, OpticsWorker
 from studies.campaign.observatory import Observatory
 
 N_MODES = 594

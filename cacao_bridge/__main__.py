@@ -20,8 +20,8 @@ from typing_extensions import override
 from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
-from service.commands.program import leave, log_to_terminal, status_of, told_to_stop
-from service.commands.terminal import print_lines
+from pyrcal.terminal import print_lines
+from service.cli.program import leave, log_to_terminal, status_of, told_to_stop
 from service.wire import FrameHeader, Keys, encode
 from service.wire.frames import encode_frames
 from sim_rtc.computer.feed import Background

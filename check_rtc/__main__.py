@@ -6,10 +6,10 @@ import argparse
 import signal
 from collections.abc import Callable, Sequence
 
-from service.commands.offline_arguments import seconds
-from service.commands.options import add, words
-from service.commands.program import imported_and_run, leave
-from service.commands.service_arguments import OneLineParser
+from pyrcal.offline.arguments import seconds
+from pyrcal.options import add, words
+from service.cli.arguments import OneLineParser
+from service.cli.program import imported_and_run, leave
 
 _EPILOG = """
 One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it

@@ -23,17 +23,17 @@ from check_rtc.talk import Talk
 from check_rtc.watch import Watch
 from service.config import load_instrument, packaged_instrument
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
-from service.fit.dialect import Dialect, of_reconstructor
+from service.estimation.dialect import Dialect, of_reconstructor
+from service.estimation.lockin import Spectra, WindowEstimate
+from service.estimation.windows import ClosedLoop, WindowRefused
+from service.files.prepared import Prepared, usual_folder
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
 from service.model.slopes import likely_kind
-from service.prepared import Prepared, usual_folder
-from service.telemetry.lockin import Spectra, WindowEstimate
-from service.telemetry.windows import ClosedLoop, WindowRefused
 
 if TYPE_CHECKING:
-    from service.worker import OpticsWorker
+    from service.runtime.worker import OpticsWorker
 
 KEPT, BROKEN = 0, 1
 
@@ -175,8 +175,8 @@ def registering(instrument: Instrument) -> Registered:
 
     @functools.cache
     def worker() -> OpticsWorker:
-        from service.worker import OpticsWorker
-        from service.worker.records import Compute
+        from service.runtime.worker import OpticsWorker
+        from service.runtime.worker.records import Compute
 
         return OpticsWorker(instrument, Compute(cache=usual_folder(os.environ)))
 

@@ -25,8 +25,8 @@ from check_rtc.moving import (
 from check_rtc.offload import STEP, Registered, offload
 from check_rtc.talk import TOTAL_M, Talk, dither, dithered_modes, replies
 from service.errors import LinkError, WireError
-from service.fit.dialect import Dialect
-from service.telemetry.windows import WindowRefused
+from service.estimation.dialect import Dialect
+from service.estimation.windows import WindowRefused
 from service.wire import Status
 
 _SWAPS: Final = ("commit", "chunks", "rejection")

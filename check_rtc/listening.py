@@ -13,8 +13,8 @@ import numpy as np
 
 from check_rtc.articles import Checked, fine, seen, skipped, wrong
 from check_rtc.watch import Arrival, Watch, in_order, of_session
-from service.fit.dialect import Dialect
-from service.fit.orientation import setting_written
+from service.estimation.dialect import Dialect
+from service.estimation.orientation import setting_written
 from service.runtime.waiting import MOST_STATUSES_HZ
 from service.wire import Keys, Manifest, Status
 

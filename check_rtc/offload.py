@@ -13,11 +13,11 @@ from check_rtc.articles import Checked, fine, seen, skipped, wrong
 from check_rtc.ear import ANSWER_S
 from check_rtc.talk import REPLY_S, TOTAL_M, Talk, stopped
 from service.errors import LinkError, WireError
+from service.estimation.estimate import Estimate
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.windows import ClosedLoop, WindowRefused
 from service.model.misregistration import BOUNDARY_SCALE
-from service.telemetry.estimate import Estimate
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra
-from service.telemetry.windows import ClosedLoop, WindowRefused
 from service.tracking.loop import closed_loop
 from service.wire import (
     CommandKind,

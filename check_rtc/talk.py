@@ -15,8 +15,8 @@ from check_rtc.articles import Checked, fine, seen, skipped, wrong
 from check_rtc.ear import ANSWER_S, Ear
 from check_rtc.watch import Watch
 from service.errors import LinkError, WireError
-from service.telemetry.frames import FrameBlock
-from service.telemetry.played import Asked, Finding, Meter, measured
+from service.estimation.frames import FrameBlock
+from service.estimation.played import Asked, Finding, Meter, measured
 from service.wire import (
     CommandKind,
     DitherKind,

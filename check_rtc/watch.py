@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from check_rtc.ear import Heard, Topic
 from service.errors import WireError
+from service.estimation import loopcheck, looplaw
+from service.estimation.frames import FrameBlock
+from service.estimation.loopcheck import LoopCheck, Obedience
+from service.estimation.looplaw import FoundLaw, LoopLaw
+from service.estimation.windows import ClosedLoop
 from service.link.intake import Intake
 from service.link.session import Endpoint
-from service.telemetry import loopcheck, looplaw
-from service.telemetry.frames import FrameBlock
-from service.telemetry.loopcheck import LoopCheck, Obedience
-from service.telemetry.looplaw import FoundLaw, LoopLaw
-from service.telemetry.windows import ClosedLoop
 from service.tracking.loop import closed_loop, last_seq, same_loop
 from service.wire import (
     Acknowledgement,

@@ -1,28 +1,22 @@
-"""The command line. What a command needs is imported when it is known which is meant."""
+"""``python -m service``: the service's own commands, run and key; ``pyrcal`` has the rest."""
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 
-from service.commands.arguments import OTHER_PROGRAMS, command_line, with_negative_numbers
-from service.commands.offline_arguments import check_files
-from service.commands.program import run_command
+from service.cli.arguments import OneLineParser, check_settings, declare
+from service.cli.program import run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit status.
-
-    0 done, 1 failed, 2 refused at the start, 3 a service that was to be asked is not reached.
-    """
+    """Run the command line; return the exit status: 0 done, 1 failed, 2 refused at the start."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words and words[0] in OTHER_PROGRAMS:
-        program, _ = OTHER_PROGRAMS[words[0]]
-        os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])
+    parser = OneLineParser(prog="service", description="Calibration service of a telescope.")
+    declare(parser.add_subparsers(dest="command", required=True, metavar="COMMAND"))
     return run_command(
-        lambda: command_line().parse_args(with_negative_numbers(words)),
-        check_files,
+        lambda: parser.parse_args(words),
+        check_settings,
         own_process=arguments is None,
         serves=words[:1] == ["run"],
     )

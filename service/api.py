@@ -17,8 +17,9 @@ from starlette.routing import BaseRoute
 from typing_extensions import override
 
 from service import __version__
-from service.keys import KeyFile
-from service.routes import (
+from service.runtime.supervisor import Supervisor
+from service.runtime.uploads import FitQueue
+from service.web import (
     archive,
     commands,
     fits,
@@ -36,11 +37,10 @@ from service.routes import (
     trends,
     views,
 )
-from service.routes.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
-from service.routes.connections import Once, Traced, server_config
-from service.routes.unchanged import NOT_MODIFIED, Unchanged
-from service.runtime.supervisor import Supervisor
-from service.runtime.uploads import FitQueue
+from service.web.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
+from service.web.connections import Once, Traced, server_config
+from service.web.keys import KeyFile
+from service.web.unchanged import NOT_MODIFIED, Unchanged
 
 REQUESTS_WITHIN_S = 2
 """Requests under way when the service is asked to stop may take this long: an upload would take

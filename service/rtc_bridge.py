@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import LinkError, UnknownIdError, WireError
+from service.estimation.frames import FrameBlock
 from service.files.last_telemetry import Arrived, LastTelemetry
 from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind
@@ -28,7 +29,6 @@ from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
 from service.link.rivals import Standby
 from service.link.session import Endpoint
 from service.link.statistics import LinkStatistics
-from service.telemetry.frames import FrameBlock
 
 if TYPE_CHECKING:
     import zenoh

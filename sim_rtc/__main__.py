@@ -11,7 +11,7 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from service.commands.program import leave, log_to_terminal, status_of, told_to_stop
+from service.cli.program import leave, log_to_terminal, status_of, told_to_stop
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.recorder import RecordingWriter

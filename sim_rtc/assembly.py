@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
+from service.files.prepared import Prepared, usual_folder
 from service.model.described import KarhunenLoeve
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import Normalisation
 from service.model.modes import ModalBasis, analytic_basis, mirror_surface
 from service.model.slopes import Orientation
-from service.prepared import Prepared, usual_folder
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer

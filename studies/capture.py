@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
+from pyrcal.offline.methods import SAME, land
 from service.config import load_instrument
-from service.fit.matrix import Fit, FitOptions, fit_matrix
-from service.fit.methods import SAME, land
-from service.fit.models import FitModels
-from service.fit.reference import Reference, Target, target_of
+from service.estimation.models import FitModels
+from service.estimation.reference import Reference, Target, target_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -22,13 +22,13 @@ from service.config import load_instrument
 from service.control.gate import edge_motion_m
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
+from service.estimation.frames import FrameBlock
+from service.estimation.health import Actuators, EdgeHealth, edge_watch, observe_edge
 from service.files import parse_alpha
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry.frames import FrameBlock
-from service.telemetry.health import Actuators, EdgeHealth, edge_watch, observe_edge
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.loop import LoopTerms, ModalLoop

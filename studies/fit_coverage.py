@@ -22,9 +22,9 @@ import scipy
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.matrix import FitOptions, fit_matrix
 from service.config import load_instrument
-from service.fit.matrix import FitOptions, fit_matrix
-from service.fit.reference import Reference
+from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import reference_slopes
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.matrix import fit_matrix
 from service.config.mirrors import grid
-from service.fit.matrix import fit_matrix
-from service.fit.reference import Reference
+from service.estimation.reference import Reference
 from service.model.described import KarhunenLoeve
 from service.model.detector_windows import frame_windows, slopes_from_frames, slopes_per_unit
 from service.model.instrument import FrameWindows, Instrument, Mirror, Pyramid

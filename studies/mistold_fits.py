@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.matrix import fit_matrix
 from service.errors import PyrcalError
-from service.fit.matrix import fit_matrix
-from service.fit.reference import Reference
+from service.estimation.reference import Reference
 from service.model.described import InfluenceShape, KarhunenLoeve
 from service.model.instrument import Instrument, Mirror, Pyramid
 from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.figures import PAPER_MODES, check_plots
 from service.errors import MatrixError
-from service.files.figures import PAPER_MODES, check_plots
 from service.model.instrument import Instrument
 from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import as_maps, to_conventions

@@ -20,9 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from service.archive import Archive
 from service.config import load_instrument
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.estimates import work_out
-from service.telemetry.random_dither import (
+from service.estimation.random_dither import (
     Correlated,
     RandomDither,
     RandomEstimate,
@@ -30,10 +28,12 @@ from service.telemetry.random_dither import (
     joined,
     noisy_matrix,
 )
-from service.telemetry.windows import WindowRefused
+from service.estimation.windows import WindowRefused
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.runtime.estimates import work_out
+from service.runtime.worker import Compute, OpticsWorker
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.wire import DitherKind, DitherRequest
-from service.worker import Compute, OpticsWorker
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead
 from sim_rtc.computer.real_time_computer import RealTimeComputer

@@ -71,7 +71,7 @@ def house() -> str:
         "# Which file has what",
         "Written by `python -m studies.pages` from the first line of each file; change those.",
     ]
-    for top in ("service", "check_rtc", "sim_rtc", "cacao_bridge"):
+    for top in ("service", "pyrcal", "check_rtc", "sim_rtc", "cacao_bridge"):
         # packages: the built manual holds copies of the examples
         folders = sorted(path.parent for path in (ROOT / top).rglob("__init__.py"))
         for folder in folders:

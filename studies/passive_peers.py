@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from OOPAO.Atmosphere import Atmosphere
 
 from service.config import load_instrument
+from service.estimation import passive
+from service.estimation.frames import FrameBlock
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.telemetry import passive
-from service.telemetry.frames import FrameBlock
 from studies.peers_cases import mirror_points
 from studies.peers_oopao import Oopao
 from studies.peers_pushpull import Bench

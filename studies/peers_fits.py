@@ -127,7 +127,7 @@ def _ask_turned(case: Case, measured: Measured, folder: Path) -> Answer:
 
 
 def _answer(case: Case, question: Question, toml: Path, reference: Path, *more: str) -> Answer:
-    command = [sys.executable, "-m", "service", "fit", str(toml), str(reference), "--json", *more]
+    command = [sys.executable, "-m", "pyrcal", "fit", str(toml), str(reference), "--json", *more]
     done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
     if done.returncode not in _ACCEPTED_OR_REFUSED:
         raise RuntimeError(f"{case.name}, {question}: pyrcal fit: {done.stderr.strip()}")

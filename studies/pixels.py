@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.matrix import Fit, fit_matrix
 from service.config import load_instrument
-from service.fit.matrix import Fit, fit_matrix
-from service.fit.reference import Reference
+from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel, reference_slopes
 from service.model.kinds import SignalKind

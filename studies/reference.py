@@ -10,7 +10,7 @@ from itertools import chain
 from typing import Any
 
 from check_rtc.__main__ import check_parser
-from service.commands.arguments import OTHER_PROGRAMS, command_line
+from pyrcal.arguments import OTHER_PROGRAMS, command_line
 from service.config.instrument_schema import WHOLE
 from service.config.settings import Settings
 from service.config.sources import Table

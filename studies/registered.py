@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import load_instrument
-from service.fit.solver import Columns, Projection
+from service.estimation.solver import Columns, Projection
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern

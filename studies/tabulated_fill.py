@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.matrix import Fit, fit_matrix
 from service.config.instrument import load_instrument
-from service.fit.matrix import Fit, fit_matrix
-from service.fit.reference import Reference
+from service.estimation.reference import Reference
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop

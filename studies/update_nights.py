@@ -18,10 +18,10 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.gate import FORGIVING_LEAK
+from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
-from service.worker import Compute, OpticsWorker
 from studies.campaign.observatory import Observatory
 from studies.campaign.system_measures import wavefront_rms_nm
 

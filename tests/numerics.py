@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from service.config.instrument import load_instrument
 from service.config.mirrors import rings
 from service.control.reconstructor import invert
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockInPlan
+from service.estimation.windows import ClosedLoop
+from service.files.prepared import Prepared, usual_folder
 from service.model.described import InfluenceShape, KarhunenLoeve
 from service.model.instrument import Instrument, Mirror, Pyramid
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.prepared import Prepared, usual_folder
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockInPlan
-from service.telemetry.windows import ClosedLoop
 
 Array = NDArray[Any]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from service.archive.retention import Keeping
 from service.config.settings import OffloadTable, Settings
 from service.control.reconstructor import InversionMethod
+from service.files.prepared import usual_folder
 from service.model.misregistration import BOUNDARY_SCALE
-from service.prepared import usual_folder
+from service.runtime.worker import Compute, Sampling
 from service.tracking.alarms import Act, Severity
 from service.tracking.policy import Offloading, Policy, Rule
-from service.worker import Compute, Sampling
 
 FLAT = (0.004, 0.01, 0.001)
 """Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid

@@ -1,7 +1,7 @@
 """Measured matrices in files, and what was found in them as JSON, text and figures.
 
-The fit itself is ``service.fit``; nothing here decides anything about it. This module looks at what
-a user asks of one, in the words of the command line and of REST, and at what a file cannot be,
+The fit itself is ``pyrcal.offline``; nothing here decides anything about it. This module looks at
+what a user asks of one, in the words of the command line and of REST, and at what a file cannot be,
 before anything large is imported: a mistake is told at once.
 """
 

@@ -14,12 +14,12 @@ from typing import Final
 
 from service import wire
 from service.errors import WireError
+from service.estimation.frames import FrameBlock
 from service.link.matrices import LinkEvent
 from service.link.ring import COUNTED, LEAP, FrameRing
 from service.link.rivals import SessionWatch
 from service.link.session import Endpoint
 from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
-from service.telemetry.frames import FrameBlock
 from service.tracking import events as ev
 from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
 from service.tracking.state import Level

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry.frames import FrameBlock
+from service.estimation.frames import FrameBlock
 from service.wire import FrameBatch, FrameHeader
 
 MISSING: Final = 0

@@ -20,6 +20,7 @@ from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.runtime.estimates import NoisySums
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
+from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Act, forbidding
 from service.tracking.events import Effect, Event
@@ -32,7 +33,6 @@ from service.tracking.products import (
 )
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
-from service.worker import Conditions, OpticsWorker
 
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""

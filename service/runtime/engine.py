@@ -13,6 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import Spectra
+from service.estimation.passive import Passive
+from service.estimation.played import LOUDER, Finding
+from service.estimation.random_dither import Correlated
+from service.estimation.windows import WindowRefused
 from service.model.slopes import likely_kind
 from service.runtime.looks import taken
 from service.runtime.streams import (
@@ -24,12 +30,7 @@ from service.runtime.streams import (
     with_matrix,
     with_rtc,
 )
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import Spectra
-from service.telemetry.passive import Passive
-from service.telemetry.played import LOUDER, Finding
-from service.telemetry.random_dither import Correlated
-from service.telemetry.windows import WindowRefused
+from service.runtime.worker import Description
 from service.tracker import step
 from service.tracking import alarms
 from service.tracking import events as ev
@@ -40,7 +41,6 @@ from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import Level, TrackerState
 from service.wire import Status
-from service.worker import Description
 
 TOLD_S = 8.0
 """A window that was accepted since then has told where the mirror is."""

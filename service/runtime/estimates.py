@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
-from service.fit.orientation import setting_written
+from service.estimation import lockin, random_dither
+from service.estimation.lockin import Spectra, WindowEstimate
+from service.estimation.openloop import FarEstimate
+from service.estimation.orientation import setting_written
+from service.estimation.passive import Passive
+from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
+from service.estimation.windows import ClosedLoop, Telemetry, WindowRefused
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
-from service.telemetry import lockin, random_dither
-from service.telemetry.lockin import Spectra, WindowEstimate
-from service.telemetry.openloop import FarEstimate
-from service.telemetry.passive import Passive
-from service.telemetry.random_dither import Correlated, RandomEstimate, noisy_matrix
-from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
+from service.runtime.worker import OpticsWorker, run_job
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
 from service.tracking.events import Event
@@ -35,7 +36,6 @@ from service.tracking.products import (
 )
 from service.tracking.state import Level, TrackerState
 from service.wire import checksum
-from service.worker import OpticsWorker, run_job
 
 MatrixOf = Callable[[str], NDArray[np.float32]]
 """Returns a reconstructor ``(n_modes, n_slopes)`` by id; UnknownIdError if nobody has it."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.estimation import passive
+from service.estimation.passive import Passive
 from service.runtime.streams import Streams
-from service.telemetry import passive
-from service.telemetry.passive import Passive
 from service.tracking.loop import why_open
 
 WATCH_INTERVAL_S = 4.0

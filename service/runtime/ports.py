@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
+from service.runtime.worker import Done, OpticsWorker
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.wire import Command, Manifest, Reply
-from service.worker import Done, OpticsWorker
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry import loopcheck, looplaw, passive, probation
-from service.telemetry.frames import FrameBlock
-from service.telemetry.health import (
+from service.estimation import loopcheck, looplaw, passive, probation
+from service.estimation.frames import FrameBlock
+from service.estimation.health import (
     EdgeHealth,
     EdgeWatch,
     LoopHealth,
@@ -19,16 +19,17 @@ from service.telemetry.health import (
     observe,
     observe_edge,
 )
-from service.telemetry.lockin import LockIn, Spectra
-from service.telemetry.loopcheck import ENOUGH_SAMPLES, SAMPLES_PER_S, LoopCheck, Obedience
-from service.telemetry.looplaw import LoopLaw
-from service.telemetry.passive import Passive
-from service.telemetry.played import Finding, Meter, asked_anew, measured
-from service.telemetry.probation import Comparison
-from service.telemetry.random_dither import Correlated, RandomDither
-from service.telemetry.rejection import Rejection
-from service.telemetry.standstill import Standstill
-from service.telemetry.windows import ClosedLoop, Telemetry, WindowRefused
+from service.estimation.lockin import LockIn, Spectra
+from service.estimation.loopcheck import ENOUGH_SAMPLES, SAMPLES_PER_S, LoopCheck, Obedience
+from service.estimation.looplaw import LoopLaw
+from service.estimation.passive import Passive
+from service.estimation.played import Finding, Meter, asked_anew, measured
+from service.estimation.probation import Comparison
+from service.estimation.random_dither import Correlated, RandomDither
+from service.estimation.rejection import Rejection
+from service.estimation.standstill import Standstill
+from service.estimation.windows import ClosedLoop, Telemetry, WindowRefused
+from service.runtime.worker import Description
 from service.tracking.dither_request import SETTLING_S, Dither, asked_of, lock_in_plan, random_plan
 from service.tracking.loop import (
     closed_loop,
@@ -38,7 +39,6 @@ from service.tracking.loop import (
     same_rate,
 )
 from service.wire import DitherKind, Status
-from service.worker import Description
 
 PASSIVE_MEMORY_S = 10.0
 

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from service.archive import Archive, AuditEntry
 from service.archive.retention import EVERYTHING, Keeping
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import Spectra
+from service.estimation.random_dither import Correlated
 from service.link.matrices import MeasuredMatrix
 from service.link.statistics import LinkStatistics
 from service.model.instrument import Instrument
@@ -30,6 +33,7 @@ from service.runtime.keeping import TelemetryKeeper
 from service.runtime.looks import WATCH_INTERVAL_S
 from service.runtime.recording import Caller, Recorder, ids_of
 from service.runtime.refits import Refits
+from service.runtime.snapshot import Snapshot
 from service.runtime.streams import Streams, Window
 from service.runtime.trends import TrendSampler
 from service.runtime.waiting import (
@@ -41,11 +45,8 @@ from service.runtime.waiting import (
     state_message,
     waiting_for,
 )
+from service.runtime.worker import Description, OpticsWorker
 from service.runtime.workers import PaceMeter, WorkerPool
-from service.snapshot import Snapshot
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import Spectra
-from service.telemetry.random_dither import Correlated
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Waiting
@@ -57,7 +58,6 @@ from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState
 from service.tracking.turn import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
-from service.worker import Description, OpticsWorker
 
 GATHER_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.archive.trends import TREND_S, TrendSample
 from service.errors import PyrcalError
-from service.telemetry.frames import FrameBlock
+from service.estimation.frames import FrameBlock
 from service.tracking.state import TrackerState
 
 LOOKED_AT = 100

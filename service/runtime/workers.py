@@ -14,12 +14,12 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
-from service.processes import Worker
-from service.snapshot import Pace
+from service.runtime.processes import Worker
+from service.runtime.snapshot import Pace
+from service.runtime.worker import Done, OpticsWorker, run_job
 from service.tracking import events as ev
 from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
 from service.tracking.state import TrackerState
-from service.worker import Done, OpticsWorker, run_job
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.control.gate import FORGIVING_LEAK
-from service.telemetry.windows import RefusalKind
+from service.estimation.windows import RefusalKind
 from service.tracking import acquisition_stages as stages
 from service.tracking import commands as cmd
 from service.tracking import events as ev

@@ -16,7 +16,7 @@ from service.control.dither import (
     lines_of,
     modes_of,
 )
-from service.telemetry.windows import RefusalKind
+from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity

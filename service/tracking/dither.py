@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.dither import forgetting_mean, measured_ratio
-from service.telemetry.lockin import WindowEstimate
-from service.telemetry.random_dither import RandomEstimate
+from service.estimation.lockin import WindowEstimate
+from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms, dither_plan, mode_proof
 from service.tracking import commands as cmd
 from service.tracking import events as ev

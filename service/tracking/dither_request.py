@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from service.control.dither import Schedule, clear_of
 from service.errors import CommandError, ModelError
-from service.telemetry.comb import SIDE_OFFSETS_HZ
-from service.telemetry.lockin import LockInPlan
-from service.telemetry.played import Asked
-from service.telemetry.random_dither import FRAMES_PER_MODE, RandomPlan
+from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.lockin import LockInPlan
+from service.estimation.played import Asked
+from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet

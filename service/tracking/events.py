@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
+from service.estimation.comparison import ProbationFinding
+from service.estimation.lockin import WindowEstimate
+from service.estimation.openloop import FarEstimate
+from service.estimation.passive import PassiveEstimate
+from service.estimation.random_dither import RandomEstimate
+from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
-from service.telemetry.comparison import ProbationFinding
-from service.telemetry.lockin import WindowEstimate
-from service.telemetry.openloop import FarEstimate
-from service.telemetry.passive import PassiveEstimate
-from service.telemetry.random_dither import RandomEstimate
-from service.telemetry.windows import WindowRefused
 from service.tracking.commands import Command
 from service.tracking.products import (
     Judged,

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation import kalman
+from service.estimation.kalman import Joint
+from service.estimation.passive import PassiveEstimate
+from service.estimation.random_dither import RandomEstimate
+from service.estimation.windows import RefusalKind
 from service.model.misregistration import Misregistration, step_text
-from service.telemetry import kalman
-from service.telemetry.kalman import Joint
-from service.telemetry.passive import PassiveEstimate
-from service.telemetry.random_dither import RandomEstimate
-from service.telemetry.windows import RefusalKind
 from service.tracking import alarms, filtering, jumps, refusals, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_stages import count_miss

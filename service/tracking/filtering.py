@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
+from service.estimation.estimate import DitheredEstimate, model_error
+from service.estimation.kalman import Drift, Joint, begin_joint, predicted
+from service.estimation.lockin import MAX_LAG_FRAMES
+from service.estimation.random_dither import RandomEstimate
+from service.estimation.windows import RefusalKind, Why
 from service.model.misregistration import Misregistration
-from service.telemetry.estimate import DitheredEstimate, model_error
-from service.telemetry.kalman import Drift, Joint, begin_joint, predicted
-from service.telemetry.lockin import MAX_LAG_FRAMES
-from service.telemetry.random_dither import RandomEstimate
-from service.telemetry.windows import RefusalKind, Why
 from service.tracking import mode_proof, validity
 from service.tracking.alarms import DISAGREES, SUSPECTED, Act, forbidding
 from service.tracking.jumps import last_of

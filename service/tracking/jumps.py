@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation.kalman import JUMP_THRESHOLD, Joint
+from service.estimation.passive import BIAS_FLOOR
 from service.model.misregistration import Misregistration
-from service.telemetry.kalman import JUMP_THRESHOLD, Joint
-from service.telemetry.passive import BIAS_FLOOR
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Earlier, Reading, Registration, Seen
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import CommandError
-from service.telemetry.windows import ClosedLoop
+from service.estimation.windows import ClosedLoop
 from service.wire import Loop, Pointing, Status
 
 NO_RTC = "no RTC is there"

@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.telemetry.comb import SIDE_OFFSETS_HZ
-from service.telemetry.estimate import DitheredEstimate
-from service.telemetry.lockin import WindowEstimate
-from service.telemetry.random_dither import RandomEstimate
+from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.estimate import DitheredEstimate
+from service.estimation.lockin import WindowEstimate
+from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.dither_modes import N_LINES, PROVING_RANGE, chosen_modes

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.telemetry.comparison import Verdict
-from service.telemetry.probation import WITHIN_S
+from service.estimation.comparison import Verdict
+from service.estimation.probation import WITHIN_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from service.control.expected_gain import ExpectedGain
 from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
+from service.estimation.comparison import ProbationFinding
 from service.model.misregistration import Misregistration, at_boundary
-from service.telemetry.comparison import ProbationFinding
 from service.wire import (
     ControlLaw,
     Manifest,

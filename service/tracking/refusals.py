@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.telemetry.windows import RefusalKind
+from service.estimation.windows import RefusalKind
 from service.tracking import alarms
 from service.tracking.activity import ramping
 from service.tracking.alarms import Act

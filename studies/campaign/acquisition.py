@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_settings
 from service.config.policy import policy_of
+from service.estimation.openloop import FarEstimate
 from service.model.misregistration import BOUNDARY_SCALE
-from service.telemetry.openloop import FarEstimate
 from service.tracking.events import FarFitted
 from service.tracking.state import AcquisitionStage, Mode
 from studies.campaign.acquisition_table import table

@@ -12,6 +12,7 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.control.reconstructor import Recipe, reconstruct
 from service.errors import LinkError, PyrcalError
+from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
@@ -20,7 +21,6 @@ from service.tracking.products import MatrixState, MeasurementRecord, MeasureSta
 from service.tracking.state import Mode, TrackerState
 from service.wire import Acknowledgement, DitherRequest, Reply
 from service.wire import Command as Order
-from service.worker import OpticsWorker
 from studies.campaign.golden import Entry, Teller
 from studies.campaign.golden_codec import encoded
 from studies.campaign.observatory import Observatory

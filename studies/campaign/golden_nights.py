@@ -16,7 +16,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.worker import Compute, OpticsWorker
+from service.runtime.worker import Compute, OpticsWorker
 from studies.campaign.golden import FOLDER, INSTRUMENT, read, replayed, retold, written
 from studies.campaign.golden_night import GoldenNight
 from studies.campaign.golden_orders import COMMANDED, MEASURING

@@ -23,9 +23,9 @@ from service.config.policy import policy_of
 from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import SlopeOrder
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
+from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode
 from service.wire import LoopRequest, Status
-from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile
 from studies.campaign.strange_rtc import Dialect, StrangeDome, StrangeLink

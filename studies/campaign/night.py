@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.estimation.lockin import Spectra, WindowEstimate
+from service.estimation.random_dither import Correlated, RandomEstimate
+from service.estimation.windows import ClosedLoop, WindowRefused
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.telemetry.lockin import Spectra, WindowEstimate
-from service.telemetry.random_dither import Correlated, RandomEstimate
-from service.telemetry.windows import ClosedLoop, WindowRefused
-from service.worker import Compute, OpticsWorker, Sampling
+from service.runtime.worker import Compute, OpticsWorker, Sampling
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead
 from sim_rtc.options import parse_options

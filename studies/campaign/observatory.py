@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
+from service.estimation.lockin import Spectra
+from service.estimation.random_dither import Correlated
 from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog, fitted, listened, watched
 from service.runtime.looks import WATCH_INTERVAL_S
 from service.runtime.ports import StorePort
+from service.runtime.worker import OpticsWorker
 from service.runtime.workers import PATIENCE_S
-from service.telemetry.lockin import Spectra
-from service.telemetry.random_dither import Correlated
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.commands import Command
@@ -36,7 +37,6 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
 from service.wire import CHUNK_LIMIT, Manifest, Status, checksum
-from service.worker import OpticsWorker
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
 from studies.campaign.observatory_link import OwnHands, Shelf, ShortLink

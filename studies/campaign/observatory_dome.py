@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.config import load_instrument
+from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import FrameBlock
 from service.wire import Command, Reply, Status, decode, encode
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, Block

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
+from service.runtime.worker import Done, OpticsWorker
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
-from service.worker import Done, OpticsWorker
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from studies.campaign.observatory_dome import Dome
 

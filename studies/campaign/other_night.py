@@ -13,10 +13,10 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.recording import SAVE_INTERVAL_S, has_news, is_urgent, leave, taken_up
+from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.events import Event
 from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
-from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Observatory
 from studies.campaign.other_truth import OtherDome, OtherLink, Truth
 

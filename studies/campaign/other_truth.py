@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import LinkError
+from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import FrameBlock
 from service.wire import Manifest, checksum, layout_of
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import Block

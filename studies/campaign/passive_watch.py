@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from service.config import load_settings
 from service.config.policy import policy_of
-from service.model.misregistration import Misregistration
-from service.runtime.streams import PASSIVE_MEMORY_S
-from service.telemetry.kalman import (
+from service.estimation.kalman import (
     PASSIVE,
     Drift,
     Joint,
@@ -21,9 +19,11 @@ from service.telemetry.kalman import (
     corrected,
     predicted,
 )
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra
-from service.telemetry.passive import Passive, accumulate
-from service.telemetry.windows import WindowRefused
+from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.passive import Passive, accumulate
+from service.estimation.windows import WindowRefused
+from service.model.misregistration import Misregistration
+from service.runtime.streams import PASSIVE_MEMORY_S
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.real_time_computer import RealTimeComputer

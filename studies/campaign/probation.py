@@ -26,9 +26,9 @@ from typing_extensions import override
 
 from service.control.loop import pole_radius
 from service.control.reconstructor import Recipe, reconstruct
+from service.estimation.comparison import ProbationFinding, Verdict
+from service.estimation.probation import Comparison, observe
 from service.model.misregistration import Misregistration
-from service.telemetry.comparison import ProbationFinding, Verdict
-from service.telemetry.probation import Comparison, observe
 from service.wire import DitherKind, DitherRequest, DitherStop, LoopRequest
 from sim_rtc.computer.telemetry import Batch
 from sim_rtc.telescope.diffractive import DiffractiveOptics

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 
 from service.config import load_instrument
-from service.worker import Compute, OpticsWorker, Sampling
+from service.runtime.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Latencies
 
 SMALL = "tests/system/small.toml"

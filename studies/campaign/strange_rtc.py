@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from service.estimation.frames import FrameBlock
 from service.model.interaction import valid_subapertures
-from service.telemetry.frames import FrameBlock
 from service.wire import (
     Acknowledgement,
     Command,

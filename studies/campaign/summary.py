@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.telemetry.estimate import model_error
+from service.estimation.estimate import model_error
 from studies.campaign.rows import UNITS, Row, four, heading, line
 
 Array = NDArray[np.float64]

@@ -19,9 +19,9 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
+from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from service.worker import Compute, OpticsWorker, Sampling
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_dome import replayed
 from studies.campaign.rows import Row, RowFile, floats, played, range_of, tell, words

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra
-from service.telemetry.random_dither import Correlated, RandomDither, RandomPlan
-from service.telemetry.windows import WindowRefused
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.random_dither import Correlated, RandomDither, RandomPlan
+from service.estimation.windows import WindowRefused
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.real_time_computer import RealTimeComputer

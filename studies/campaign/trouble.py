@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from service.telemetry.frames import FrameBlock
+from service.estimation.frames import FrameBlock
 from service.wire import Loop, LoopRequest
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
-from service.commands.arguments import with_negative_numbers
-from service.commands.program import imported_and_run
+from pyrcal.arguments import with_negative_numbers
+from service.cli.program import imported_and_run
 from studies.demo.arguments import demo_parser
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.reference import Reference
+from service.estimation.reference import Reference
 from service.model.misregistration import Misregistration
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.strokes import PushPull, Regression, frames_per_shape, modal

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
 from service.errors import PyrcalError
-from service.fit.matrix import Fit, FitOptions, fit_matrix
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation

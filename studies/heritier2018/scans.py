@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from service.fit.methods import N_LEFT_OUT
+from pyrcal.offline.methods import N_LEFT_OUT
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from studies.heritier2018 import page, paper, telescope

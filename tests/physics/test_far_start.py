@@ -5,8 +5,8 @@ import os
 import numpy as np
 
 from service.config import packaged_instrument
+from service.files.prepared import Prepared, usual_folder
 from service.model.interaction import InteractionModel
-from service.prepared import Prepared, usual_folder
 from sim_rtc.computer.reconstructors import truncated_inverse
 from sim_rtc.options import FAR_MODES, USUAL_MODES, parse_options
 from sim_rtc.telescope.registration import far_registration

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.telemetry import kalman, lockin
-from service.telemetry.health import LoopHealth, observe
+from service.estimation import kalman, lockin
+from service.estimation.health import LoopHealth, observe
 from tests.numerics import block_of, part, sines
 
 PLAN = lockin.LockInPlan(

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 
 from service.errors import CommandError
-from service.telemetry.windows import WindowRefused
+from service.estimation.windows import WindowRefused
 from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking import events as ev

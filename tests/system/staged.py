@@ -13,7 +13,7 @@ from service.api import create_app
 from service.archive import Archive
 from service.config import packaged_instrument
 from service.model.misregistration import Misregistration
-from service.snapshot import Snapshot
+from service.runtime.snapshot import Snapshot
 from service.tracking.alarms import Alarm
 from service.tracking.attention import note_of
 from service.tracking.products import MatrixState, ReconstructorRecord

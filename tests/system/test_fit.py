@@ -29,7 +29,7 @@ little of that: a few per cent of the matrix, about as much of these."""
 def pyrcal(*words, folder):
     """Run a command in an empty folder, as a shell would."""
     return subprocess.run(
-        [sys.executable, "-m", "service", *map(str, words)],
+        [sys.executable, "-m", "pyrcal", *map(str, words)],
         capture_output=True,
         text=True,
         timeout=patience(120.0),

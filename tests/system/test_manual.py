@@ -54,7 +54,7 @@ ASKED = {"status", "reconstructors", "export", "audit", "dither", "stop", "resum
 
 def pyrcal(words, folder, data, **environment):
     return subprocess.run(
-        [sys.executable, "-m", "service", *words],
+        [sys.executable, "-m", "pyrcal", *words],
         cwd=folder,
         capture_output=True,
         text=True,

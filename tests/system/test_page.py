@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.keys import KeyFile, KeyScope
+from service.web.keys import KeyFile, KeyScope
 from tests.system.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, WIDE, Page, a_browser
 from tests.system.night import a_night
 from tests.system.pace import patience

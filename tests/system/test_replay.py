@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
+from service.estimation.lockin import WindowEstimate
+from service.estimation.windows import ClosedLoop as FitLoop
 from service.files.recording import RecordedKind, Recording
 from service.link.intake import Intake
 from service.link.session import Endpoint
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.engine import Engine
-from service.telemetry.lockin import WindowEstimate
-from service.telemetry.windows import ClosedLoop as FitLoop
+from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import events as ev
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
 from service.wire import DitherRequest, Manifest, decode
-from service.worker import Compute, OpticsWorker
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
 from tests.unit.tracking.situations import dither_answered

@@ -48,15 +48,15 @@ def test_a_wheel_has_the_manual_inside(wheel):
     names = set(wheel.namelist())
     docs = ROOT / "docs"
     pages = [path.relative_to(docs).with_suffix(".html") for path in docs.rglob("*.md")]
-    assert {f"service/manual/{page.as_posix()}" for page in pages} <= names
-    assert "service/manual/searchindex.js" in names
+    assert {f"service/web/manual/{page.as_posix()}" for page in pages} <= names
+    assert "service/web/manual/searchindex.js" in names
     assert any(name.endswith("tracking.png") for name in names)
 
 
 def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
     expected = [
         *(ROOT / "service" / "instruments").glob("*.toml"),
-        *(ROOT / "service" / "dashboard").iterdir(),
+        *(ROOT / "service" / "web" / "dashboard").iterdir(),
         ROOT / "service" / "tracking" / "alarms.toml",
     ]
     names = set(wheel.namelist())

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from service.runtime.refits import Refits
-from service.snapshot import Snapshot
+from service.runtime.snapshot import Snapshot
 from service.tracking.commands import Refit
 from service.tracking.events import MakeMatrix
 from service.tracking.policy import Policy

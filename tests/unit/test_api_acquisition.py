@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
-from service.routes.views import picture
 from service.tracking.commands import AbortAcquisition, Acquire
 from service.tracking.state import Acquisition, AcquisitionStage
+from service.web.views import picture
 from tests.unit.obedient import Obedient
 from tests.unit.tracking.situations import ALPHA
 

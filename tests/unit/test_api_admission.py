@@ -11,9 +11,9 @@ import pytest
 import uvicorn
 
 from service.api import create_app
-from service.routes import connections
-from service.routes.admission import Hosts
-from service.routes.connections import server_config
+from service.web import connections
+from service.web.admission import Hosts
+from service.web.connections import server_config
 from tests.system.pace import in_time
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.tracking.situations import POLICY

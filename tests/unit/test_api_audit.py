@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from service.archive import Archive, AuditEntry
-from service.routes import archive as kept
+from service.web import archive as kept
 
 SECOND = 1_000_000_000
 N_ENTRIES = 12

@@ -10,9 +10,9 @@ import pytest
 from fastapi import Request
 
 from service.api import create_app
-from service.keys import KeyFile, KeyScope
-from service.routes import admission, stream
-from service.routes.admission import COOKIE, Failures, Hosts, Refusal, Refusals
+from service.web import admission, stream
+from service.web.admission import COOKIE, Failures, Hosts, Refusal, Refusals
+from service.web.keys import KeyFile, KeyScope
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.test_api_admission import serving
 from tests.unit.tracking.situations import POLICY

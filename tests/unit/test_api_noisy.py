@@ -8,10 +8,10 @@ import pytest
 
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
-from service.routes.views import GATHERING, picture
 from service.tracking.commands import GiveUp, MeasureNoisy
 from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
 from service.tracking.state import TrackerState
+from service.web.views import GATHERING, picture
 from tests.unit.obedient import Obedient
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"

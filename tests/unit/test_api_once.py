@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, StorageError
-from service.routes import connections
-from service.snapshot import Snapshot
+from service.runtime.snapshot import Snapshot
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import TrackerState
+from service.web import connections
 from tests.unit.tracking.situations import POLICY
 
 CM = ReconstructorRecord(id="cm-1", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=1)

@@ -10,7 +10,7 @@ import pytest
 from service.config import packaged_instrument
 from service.model.instrument import TabulatedModes
 from service.model.misregistration import PARAMETERS
-from service.routes.page import FILES
+from service.web.page import FILES
 from tests.unit.test_api import (
     ALPHA,
     LINK,

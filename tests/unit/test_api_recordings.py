@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from service.__main__ import main
+from pyrcal.__main__ import main
 from service.archive.retention import Keeping, due, items
 from service.files.recording import RecordedKind, Recording
 from service.runtime import keeping

@@ -19,12 +19,12 @@ from service.api import create_app
 from service.archive import Archive
 from service.errors import WorkerError
 from service.files.fit_folder import FitRequest
-from service.keys import KeyFile, KeyScope
-from service.routes import admission
-from service.routes.admission import Hosts
 from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
+from service.web import admission
+from service.web.admission import Hosts
+from service.web.keys import KeyFile, KeyScope
 from tests.unit.runtime.handmade import STATE, Clock, HandmadeBridge
 from tests.unit.runtime.small import small_instrument
 from tests.unit.test_api import LINK

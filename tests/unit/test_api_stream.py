@@ -11,10 +11,10 @@ import pytest
 import uvicorn
 
 from service.api import create_app
-from service.routes import stream
-from service.routes.connections import server_config
 from service.tracking.state import Level, LogEntry
 from service.tracking.turn import LOG_LENGTH
+from service.web import stream
+from service.web.connections import server_config
 from tests.system.pace import patience
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot
 from tests.unit.tracking.situations import POLICY

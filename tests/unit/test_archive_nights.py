@@ -15,9 +15,9 @@ from service.archive import nights as of_nights
 from service.archive.nights import DAY_NS, HOUR_NS, MarkKind
 from service.errors import ArchiveError, StorageError, TooLargeError
 from service.model.misregistration import Misregistration
-from service.routes.reading import thinned
 from service.tracking.registration import HistoryEntry, Source
 from service.tracking.state import TrackerState
+from service.web.reading import thinned
 
 SECOND = 1_000_000_000
 NOON = 20_000 * DAY_NS + 12 * HOUR_NS

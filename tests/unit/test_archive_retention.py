@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.__main__ import main
+from pyrcal.__main__ import main
 from service.api import create_app
 from service.archive import Archive, Pin, retention
 from service.archive.nights import DAY_NS

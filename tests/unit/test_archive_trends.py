@@ -11,10 +11,10 @@ from service.archive.trends import TREND_S, TrendSample
 from service.control.expected_gain import ExpectedGain
 from service.control.gains import ModeGain
 from service.errors import ArchiveError
+from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
 from service.runtime import trends as of_moments
 from service.runtime.trends import TrendSampler, residual_of, sample_of
-from service.telemetry.frames import FrameBlock
 from service.tracking.products import Assessment
 from service.wire import Pointing
 from tests.unit.test_api import ALPHA, SECOND, SIGMA, STATE, service

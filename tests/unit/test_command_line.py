@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from pyrcal.__main__ import main
+from pyrcal.arguments import command_line
+from pyrcal.offline.matrix import FitOptions
 from service import __version__
-from service.__main__ import main
-from service.commands.arguments import command_line
 from service.config import Settings, load_settings
 from service.control.reconstructor import MAX_CONDITION, Recipe
 from service.control.reconstructor import InversionMethod as MakeMethod
-from service.fit.matrix import FitOptions
 from service.model.kinds import Method as FitMethod
 from service.tracking.state import Mode
 from service.wire import CHUNK_LIMIT
@@ -162,7 +162,7 @@ def test_a_host_that_is_not_ours_is_refused_in_one_line(capsys):
 
 def test_the_simulator_is_reached_through_the_same_program():
     found = subprocess.run(
-        [sys.executable, "-m", "service", "sim", "--alpha", "nonsense"],
+        [sys.executable, "-m", "pyrcal", "sim", "--alpha", "nonsense"],
         capture_output=True,
         text=True,
         timeout=60,
@@ -192,7 +192,7 @@ def processor_s(*words, enough_s):
     spent = []
     while len(spent) < 3 and min(spent, default=enough_s) >= enough_s:
         process = subprocess.Popen(
-            [sys.executable, "-m", "service", *words],
+            [sys.executable, "-m", "pyrcal", *words],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -227,7 +227,7 @@ AT_ONCE = [
 
 IN_TURN = """
 import json, sys
-from service.__main__ import main
+from pyrcal.__main__ import main
 def status(words):
     try:
         return main(words)
@@ -286,7 +286,7 @@ def test_the_command_line_offers_what_the_program_has():
 def test_a_start_imports_no_more_than_it_needs():
     """Each of these takes a tenth of a second or more, and a start is to take two."""
     code = (
-        "import sys, service.commands.serve; from service.config import load_instrument; "
+        "import sys, service.cli.serve; from service.config import load_instrument; "
         "load_instrument('flao-lbt'); "
         "late = ('scipy.linalg', 'scipy.spatial', 'scipy.ndimage', 'scipy.interpolate', "
         "'scipy.sparse', 'scipy.special', 'matplotlib', 'astropy', 'fastapi', 'uvicorn'); "

@@ -9,7 +9,7 @@ import subprocess
 
 import pytest
 
-from service.routes.page import FILES
+from service.web.page import FILES
 
 NODE = shutil.which("node")
 

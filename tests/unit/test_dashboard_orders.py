@@ -10,8 +10,8 @@ import subprocess
 
 import pytest
 
-from service.routes.page import FILES
 from service.tracking.interlocks import ORDERS, permissions
+from service.web.page import FILES
 from tests.unit.tracking.moments import MOMENTS
 
 NODE = shutil.which("node")

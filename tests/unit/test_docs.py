@@ -17,11 +17,11 @@ import pytest
 from cacao_bridge.__main__ import arguments_parser
 from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
+from pyrcal.arguments import command_line, with_negative_numbers
 from service.api import create_app
-from service.commands.arguments import command_line, with_negative_numbers
 from service.config import load_instrument, load_settings
-from service.routes import page
 from service.tracking.alarms import ALARMS
+from service.web import page
 from sim_rtc.options import parse_options
 from studies.demo.arguments import demo_parser
 from tests.unit.test_api import assert_problem, service
@@ -198,9 +198,13 @@ def test_the_layout_in_the_readme_is_that_of_the_code():
     (layout,) = re.findall(
         r"^## Layout\n```\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.M | re.S
     )
-    drawn, folders = re.split(r"\n(?=check_rtc/)", layout)
+    drawn, folders = re.split(r"\n(?=pyrcal/)", layout)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
-    (contract,) = [c for c in project["tool"]["importlinter"]["contracts"] if c["type"] == "layers"]
+    (contract,) = [
+        c
+        for c in project["tool"]["importlinter"]["contracts"]
+        if c["type"] == "layers" and c["containers"] == ["service"]
+    ]
     layers = [set(re.split(r" [:|] ", layer)) for layer in contract["layers"]]
     assert [
         set(layer.split(", ")) for layer in re.sub(r"service/|\s+", " ", drawn).strip().split(" > ")

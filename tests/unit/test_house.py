@@ -15,7 +15,7 @@ import service
 from service.tracking.alarms import ALARMS
 
 ROOT = Path(service.__file__).parent.parent
-HELD = ("service", "check_rtc")
+HELD = ("service", "pyrcal", "check_rtc")
 
 LONG = set()
 """Files that want to be divided."""

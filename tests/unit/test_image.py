@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-from service.commands.arguments import OTHER_PROGRAMS
+from pyrcal.arguments import OTHER_PROGRAMS
 
 ROOT = Path(__file__).parents[2]
 

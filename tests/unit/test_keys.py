@@ -9,14 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from service.__main__ import main
+from pyrcal.__main__ import main
+from pyrcal.terminal import login
 from service.archive import Archive
-from service.commands import key as key_command
-from service.commands.running import announced, running_services
-from service.commands.terminal import login
+from service.cli import key as key_command
+from service.cli.running import announced, running_services
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
-from service.keys import KeyFile, KeyScope, is_loopback
+from service.web.keys import KeyFile, KeyScope, is_loopback
 
 
 @pytest.fixture(autouse=True)
@@ -252,7 +252,7 @@ def test_the_service_does_not_start_beside_keys_that_it_cannot_read(capsys, tmp_
 def test_making_a_key_loads_nothing_that_takes_long(tmp_path):
     """What it takes is 0.2 s of processor time; a test of seconds would fail under load."""
     words = "['key', 'add', 'ada', '--scope', 'read']"
-    code = f"import json, sys; from service.__main__ import main; main({words})\n"
+    code = f"import json, sys; from pyrcal.__main__ import main; main({words})\n"
     code += "print(json.dumps(sorted(sys.modules)))"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
     loaded = set(json.loads(told.stdout.splitlines()[-1]))

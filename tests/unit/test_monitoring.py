@@ -9,7 +9,7 @@ import structlog
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.commands.serve import log_to_the_terminal
+from service.cli.serve import log_to_the_terminal
 from service.runtime.recording import ids_of
 from service.tracking.alarms import ALARMS, ARCHIVE_FAILED, WORKER_BEHIND, Alarm, Party, Waiting
 from service.tracking.registration import Validity

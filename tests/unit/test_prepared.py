@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service import prepared
+from service.files import prepared
+from service.files.prepared import Prepared, usual_folder
 from service.model.modes import modal_basis
-from service.prepared import Prepared, usual_folder
 from tests.numerics import small_instrument
 
 PARTS = ("mode_to_actuator", "coefficients", "variance_m2")
@@ -135,7 +135,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from service.config import load_instrument
-from service.prepared import Prepared
+from service.files.prepared import Prepared
 instrument, kept = load_instrument(sys.argv[2]), Prepared(Path(sys.argv[1]))
 for k in range(60):
     found = kept.arrays(instrument, ("numbers",), lambda: {"numbers": np.full(50_000, 7.0)})

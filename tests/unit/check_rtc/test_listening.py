@@ -9,7 +9,7 @@ from check_rtc.articles import ARTICLES, Outcome
 from check_rtc.ear import Heard, Topic
 from check_rtc.examine import Examination, examine
 from service.errors import LinkError, WireError
-from service.fit.dialect import Dialect
+from service.estimation.dialect import Dialect
 from service.model.slopes import Orientation, SlopeRecipe
 from tests.unit.check_rtc.pretend import Pretend
 from tests.vectors import PAGE, anchors_of

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from pyrcal.offline.report import KnownFit, Provenance
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import (
     Prior,
@@ -15,7 +16,6 @@ from service.control.reconstructor import (
     invert_with_prior,
     reconstruct,
 )
-from service.files.report import KnownFit, Provenance
 from tests.numerics import N_CONTROLLED, N_MODES, SOMEWHERE, small_basis, small_linearisation
 
 MATRIX = small_linearisation().matrix

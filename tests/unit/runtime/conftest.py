@@ -3,8 +3,8 @@
 import pytest
 
 from service.runtime.actions import Actions, Publishing
+from service.runtime.worker import start_worker
 from service.runtime.workers import WorkerPool
-from service.worker import start_worker
 from tests.unit.runtime.handmade import Clock, HandmadeBridge
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
@@ -12,7 +12,7 @@ from tests.unit.runtime.small import COMPUTE, small_instrument
 @pytest.fixture
 def light_processes(monkeypatch):
     """Processes that import no optics before their work, which is of these tests."""
-    monkeypatch.setattr("service.processes.ITS_WORK", "tests.unit.runtime.jobs")
+    monkeypatch.setattr("service.runtime.processes.ITS_WORK", "tests.unit.runtime.jobs")
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,8 @@ import numpy as np
 
 from service.config import load_instrument
 from service.control.loop import ControlLoop
-from service.prepared import usual_folder
-from service.worker import Compute, Conditions
+from service.files.prepared import usual_folder
+from service.runtime.worker import Compute, Conditions
 
 INSTRUMENT = Path(__file__).with_name("small.toml")
 COMPUTE = Compute(threads=1, nice=0, cache=usual_folder(os.environ))

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation import passive
 from service.runtime.estimates import Backlog, watched
-from service.telemetry import passive
+from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.loop import loop_numbers
 from service.tracking.state import Mode
-from service.worker import OpticsWorker
 from tests.numerics import block_of
-from tests.unit.telemetry.test_lockin import run, telemetry
+from tests.unit.estimation.test_lockin import run, telemetry
 from tests.unit.tracking.situations import ALPHA, Story
 from tests.unit.tracking.test_watchdog import watched as look
 

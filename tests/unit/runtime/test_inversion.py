@@ -9,7 +9,7 @@ import numpy as np
 from service.config.settings import load_settings
 from service.control.reconstructor import InversionMethod, Prior, invert, invert_with_prior
 from service.model.misregistration import Misregistration
-from service.worker import OpticsWorker
+from service.runtime.worker import OpticsWorker
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,

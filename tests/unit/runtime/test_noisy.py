@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, UnknownIdError
+from service.estimation.frames import FrameBlock
+from service.estimation.random_dither import RandomDither, RandomPlan
 from service.model.misregistration import Misregistration
 from service.runtime.actions import Actions, Publishing
 from service.runtime.estimates import NoisySums
-from service.telemetry.frames import FrameBlock
-from service.telemetry.random_dither import RandomDither, RandomPlan
+from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
-from service.worker import OpticsWorker
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc
 

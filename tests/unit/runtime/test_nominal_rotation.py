@@ -11,10 +11,10 @@ from service.model.misregistration import Misregistration
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
+from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
-from service.worker import OpticsWorker, start_worker
 from studies.campaign.observatory import Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 from tests.unit.runtime.test_supervisor import running

@@ -8,14 +8,14 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_settings
 from service.config.policy import policy_of
+from service.estimation.health import LOW_MODES
 from service.runtime.engine import shape_mismatch
 from service.runtime.looks import taken
 from service.runtime.streams import Streams, fed, with_rtc
-from service.telemetry.health import LOW_MODES
+from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking.registration import Source
 from service.tracking.state import Mode
-from service.worker import OpticsWorker
 from studies.campaign.observatory import Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 from tests.unit.runtime.test_streams import DESCRIPTION, MANY, N_MANY, RING, driven

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, ModelError
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockIn
+from service.estimation.random_dither import Correlated
+from service.estimation.windows import WindowRefused
 from service.runtime.streams import Streams, fed, with_dither, with_rtc
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn
-from service.telemetry.random_dither import Correlated
-from service.telemetry.windows import WindowRefused
+from service.runtime.worker import Description
 from service.tracking.dither_request import Dither, plan_random
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest
-from service.worker import Description
 from tests.unit.tracking.situations import POLICY, rtc
 
 N_SLOPES, N_MODES = 6, 8

@@ -12,11 +12,11 @@ from service.config.policy import policy_of
 from service.runtime.engine import Engine
 from service.runtime.estimates import Backlog
 from service.runtime.recording import has_news, is_urgent, leave, taken_up
+from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.resume import restored
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
-from service.worker import Compute, OpticsWorker
 from studies.campaign.acquisition import Start
 from studies.campaign.observatory import Observatory
 from tests.unit.tracking.situations import START_NS

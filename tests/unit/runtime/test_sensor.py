@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from service.control.gate import judge
+from service.estimation.windows import ClosedLoop
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.turbulence import working_point
-from service.telemetry.windows import ClosedLoop
-from service.worker import OpticsWorker, sensor
-from service.worker.sensor import FOLLOWED, STRENGTHS
+from service.runtime.worker import OpticsWorker, sensor
+from service.runtime.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.estimation.frames import FrameBlock
+from service.estimation.health import LOW_MODES, Actuators
+from service.estimation.lockin import Spectra
+from service.estimation.windows import RefusalKind, WindowRefused
 from service.runtime.engine import STEADY_GATHER_S, Engine, news, shape_mismatch, troubles
 from service.runtime.looks import taken
 from service.runtime.streams import Streams, fed, with_dither, with_matrix, with_rtc
-from service.telemetry.frames import FrameBlock
-from service.telemetry.health import LOW_MODES, Actuators
-from service.telemetry.lockin import Spectra
-from service.telemetry.windows import RefusalKind, WindowRefused
+from service.runtime.worker import Description
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.dither_request import Dither
 from service.tracking.products import MatrixState
 from service.tracking.state import TrackerState
 from service.wire import DitherKind, DitherRequest
-from service.worker import Description
+from tests.unit.estimation import test_loopcheck as loops
 from tests.unit.runtime import handmade
-from tests.unit.telemetry import test_loopcheck as loops
 from tests.unit.tracking.situations import POLICY, START_NS, foreign, rtc
 
 N_SLOPES, N_MODES = 6, 8

@@ -18,12 +18,12 @@ from service.runtime.actions import (
     loop_to_judge,
     modes_that_hold,
 )
+from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
 from service.tracking.worth import fewer_than
 from service.wire import LoopRequest
-from service.worker import OpticsWorker
 from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, conditions, small_instrument
 from tests.unit.tracking.situations import START_NS, rtc

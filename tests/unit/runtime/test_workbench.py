@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation import passive
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.telemetry import passive
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan, Spectra
-from service.telemetry.windows import ClosedLoop, RefusalKind, WindowRefused
-from service.worker import OpticsWorker, run_job
+from service.runtime.worker import OpticsWorker, run_job
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,

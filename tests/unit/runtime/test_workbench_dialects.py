@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.estimation.windows import RefusalKind
 from service.model.instrument import FrameWindows
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
-from service.telemetry.windows import RefusalKind
-from service.worker import OpticsWorker
+from service.runtime.worker import OpticsWorker
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
+from service.estimation.frames import FrameBlock
+from service.estimation.lockin import LockIn, LockInPlan
+from service.estimation.openloop import FarEstimate
+from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
-from service.telemetry.frames import FrameBlock
-from service.telemetry.lockin import LockIn, LockInPlan
-from service.telemetry.openloop import FarEstimate
-from service.telemetry.windows import WindowRefused
-from service.worker import OpticsWorker
-from tests.unit.fit.lamps import counts_of
+from service.runtime.worker import OpticsWorker
+from tests.unit.estimation.lamps import counts_of
 from tests.unit.runtime.small import COMPUTE, small_instrument
 
 FAR = Misregistration(

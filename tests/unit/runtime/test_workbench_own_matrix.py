@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.model.misregistration import Misregistration
-from service.worker import OpticsWorker
+from service.runtime.worker import OpticsWorker
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,

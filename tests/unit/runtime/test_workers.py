@@ -8,10 +8,10 @@ from functools import partial
 import pytest
 
 from service.errors import WorkerError
-from service.processes import Worker
 from service.runtime import workers as crew_module
+from service.runtime.processes import Worker
+from service.runtime.worker import OpticsWorker, run_job, start_worker
 from service.runtime.workers import WorkerPool
-from service.worker import OpticsWorker, run_job, start_worker
 from tests.system.pace import in_time
 from tests.unit.runtime.jobs import (
     asleep,

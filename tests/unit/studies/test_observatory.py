@@ -9,12 +9,12 @@ from threadpoolctl import threadpool_limits
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import CommandError
+from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from service.worker import OpticsWorker
 from studies.campaign.observatory import Latencies, Observatory
 from studies.campaign.observatory_checks import Outcome, Swap, published, true_radius
 from studies.campaign.observatory_dome import START_NS, Dome, replayed

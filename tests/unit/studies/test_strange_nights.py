@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.telemetry.frames import FrameBlock
+from service.estimation.frames import FrameBlock
 from studies.campaign.observatory_dome import Moment
 from studies.campaign.strange_nights import _plan, beyond, deeds_of
 from studies.campaign.strange_rtc import DIALECTS, Mischief, dialect_of

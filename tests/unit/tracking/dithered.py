@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.dither import tabulated
-from service.telemetry.passive import PassiveEstimate
+from service.estimation.passive import PassiveEstimate
 from service.tracking import events as ev
 from service.tracking.dither_request import SETTLING_S, total_m
 from service.tracking.state import Mode

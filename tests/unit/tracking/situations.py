@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.commands.remote import REQUESTS
+from pyrcal.client.remote import REQUESTS
 from service.control.gate import GateVerdict
 from service.errors import CommandError
+from service.estimation.lockin import WindowEstimate
 from service.model.misregistration import Misregistration
-from service.telemetry.lockin import WindowEstimate
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.dither_request import Dither

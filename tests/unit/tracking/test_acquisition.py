@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.estimation.openloop import FarEstimate
+from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
-from service.telemetry.openloop import FarEstimate
-from service.telemetry.windows import RefusalKind, WindowRefused
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import PATIENCE_S

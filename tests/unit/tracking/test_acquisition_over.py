@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.telemetry.windows import RefusalKind
+from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import ENOUGH_WINDOWS

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
-from service.telemetry.windows import RefusalKind, WindowRefused
+from service.estimation.windows import RefusalKind, WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from service.errors import CommandError
-from service.telemetry.openloop import FarEstimate
+from service.estimation.openloop import FarEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState

@@ -4,9 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation.estimate import MODEL_ERROR
+from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
-from service.telemetry.estimate import MODEL_ERROR
-from service.telemetry.windows import RefusalKind, WindowRefused
 from service.tracking import events as ev
 from service.tracking.filtering import HISTORY_LENGTH
 from service.tracking.state import Level, Mode

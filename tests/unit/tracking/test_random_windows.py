@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.telemetry.random_dither import RandomEstimate
+from service.estimation.random_dither import RandomEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.telemetry.windows import RefusalKind, WindowRefused
+from service.estimation.windows import RefusalKind, WindowRefused
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.activity import Operation, operating

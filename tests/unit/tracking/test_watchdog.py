@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
-from service.telemetry.passive import PassiveEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.evidence import fit_begins_at

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.telemetry.comparison import ProbationFinding, Verdict
+from service.estimation.comparison import ProbationFinding, Verdict
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, ProbationState

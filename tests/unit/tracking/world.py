@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from service.telemetry.openloop import FarEstimate
+from service.estimation.openloop import FarEstimate
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasureState, NoisyFinding
 from service.tracking.state import Mode

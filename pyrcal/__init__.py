@@ -1,0 +1,53 @@
+"""pyrcal, as people import it: the optical model, fits of measured matrices, reconstructors.
+
+Nothing is imported before it is asked for.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from service import __version__
+from service.errors import PyrcalError
+
+if TYPE_CHECKING:
+    from pyrcal.offline.fit_file import fit_file
+    from pyrcal.offline.matrix import FitOptions
+    from pyrcal.offline.report import read_fit
+    from service.config.instrument import load_instrument
+    from service.control.reconstructor import Recipe, reconstruct
+    from service.model.interaction import RtcInteractionModel
+    from service.model.misregistration import Misregistration
+    from service.model.modes import modal_basis
+
+__all__ = [
+    "FitOptions",
+    "Misregistration",
+    "PyrcalError",
+    "Recipe",
+    "RtcInteractionModel",
+    "__version__",
+    "fit_file",
+    "load_instrument",
+    "modal_basis",
+    "read_fit",
+    "reconstruct",
+]
+
+_HOMES = {
+    "FitOptions": "pyrcal.offline.matrix",
+    "Misregistration": "service.model.misregistration",
+    "Recipe": "service.control.reconstructor",
+    "RtcInteractionModel": "service.model.interaction",
+    "fit_file": "pyrcal.offline.fit_file",
+    "load_instrument": "service.config.instrument",
+    "modal_basis": "service.model.modes",
+    "read_fit": "pyrcal.offline.report",
+    "reconstruct": "service.control.reconstructor",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import what is asked for."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)

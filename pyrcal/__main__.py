@@ -1,0 +1,32 @@
+"""The command line. What a command needs is imported when it is known which is meant."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from pyrcal.arguments import OTHER_PROGRAMS, command_line, with_negative_numbers
+from pyrcal.offline.arguments import check_files
+from service.cli.program import run_command
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit status.
+
+    0 done, 1 failed, 2 refused at the start, 3 a service that was to be asked is not reached.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words and words[0] in OTHER_PROGRAMS:
+        program, _ = OTHER_PROGRAMS[words[0]]
+        os.execv(sys.executable, [sys.executable, "-m", program, *words[1:]])
+    return run_command(
+        lambda: command_line().parse_args(with_negative_numbers(words)),
+        check_files,
+        own_process=arguments is None,
+        serves=words[:1] == ["run"],
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""The command line of ``pyrcal``: help and errors come at once, for nothing here takes long."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from typing import NoReturn
+
+from typing_extensions import override
+
+from pyrcal.client import remote
+from pyrcal.offline import arguments as offline_arguments
+from service import __version__
+from service.cli import arguments as service_arguments
+from service.cli.arguments import OneLineParser
+
+OTHER_PROGRAMS = {
+    "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
+    "sim": ("sim_rtc", "the simulated RTC"),
+    "check-rtc": ("check_rtc", "whether an RTC keeps the contract"),
+    "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
+    "campaign": ("studies.campaign", "many simulated nights"),
+}
+"""Module and purpose of what is run in this program's place, with options of its own."""
+
+
+def command_line() -> argparse.ArgumentParser:
+    """Return what reads ``pyrcal``'s command line; ``command`` names the command that is meant."""
+    parser = OneLineParser(
+        prog="pyrcal", description="Calibration service of an adaptive telescope."
+    )
+    parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
+    parser.add_argument(
+        "--completion",
+        action=_Completion,
+        choices=("bash", "zsh", "fish", "tcsh"),
+        help="print what teaches a shell these words: source <(pyrcal --completion bash)",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    service_arguments.declare(commands)
+    remote.declare(commands)
+    offline_arguments.declare(commands)
+    for name, (_, purpose) in OTHER_PROGRAMS.items():
+        commands.add_parser(name, help=f"{purpose}: pyrcal {name} --help", add_help=False)
+    return parser
+
+
+class _Completion(argparse.Action):
+    """Prints the completion of this command line, and ends the program."""
+
+    @override
+    def __call__(
+        self, parser: argparse.ArgumentParser, _options: object, shell: object, *_: object
+    ) -> NoReturn:
+        import shtab
+
+        print(shtab.complete(parser, str(shell)))
+        parser.exit()
+
+
+_NEGATIVE = re.compile(r"-[\d.][-+\d.eE]*,.*")
+
+
+def with_negative_numbers(given: Sequence[str]) -> list[str]:
+    """Return command-line words such that argparse takes ``-0.3,0.1,65,1`` for a value.
+
+    It takes it for an option; a word with a blank in it, never.
+    """
+    return [f" {word}" if _NEGATIVE.fullmatch(word) else word for word in given]

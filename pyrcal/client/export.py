@@ -1,0 +1,132 @@
+"""``pyrcal export``: what a service has kept, to a file that is whole or not there."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+from urllib.parse import quote, urlencode
+
+from pyrcal.client.reading import understood
+from pyrcal.client.remote import DONE, Request
+from pyrcal.client.rest import Document, Service, chunks
+from pyrcal.options import named
+from pyrcal.terminal import print_document, print_lines
+from service.errors import ConfigurationError
+
+_MATRIX = ("npy", "raw", "hdf5", "fits")
+_SOURCES = {
+    "alpha": ("/v1/alpha/history", ("csv", "jsonl")),
+    "audit": ("/v1/audit", ("csv", "jsonl")),
+    "reconstructor": ("/v1/reconstructors/{id}/matrix", _MATRIX),
+    "measurement": ("/v1/measurements/{id}/matrix", _MATRIX),
+    "noisy-matrix": ("/v1/noisy-matrix/{id}/file", ("hdf5",)),
+    "recording": ("/v1/recordings/{id}/file", ("hdf5",)),
+}
+"""Path of REST, and formats, the usual one first."""
+
+_ENDINGS = {"hdf5": "h5", "raw": "f4"}
+
+_PAGE = 1000
+
+SENT_WITHIN_S = 60.0
+"""A service reads a matrix from its disk before the first byte of it comes."""
+
+
+def carry_out(service: Service, _request: Request, options: argparse.Namespace) -> int:
+    """Write the file; return the exit status.
+
+    Raises
+    ------
+    ConfigurationError
+        If id or format make no sense, or the file is there already, or cannot be written.
+    RefusedError, UnreachableError
+        As of the service.
+    """
+    path, formats = _SOURCES[options.what]
+    form = options.format or formats[0]
+    if form not in formats:
+        known = ", ".join(formats)
+        raise ConfigurationError(f"--format: found {form!r}, expected for {options.what} {known}")
+    if ("{id}" in path) != (options.id is not None):
+        what = "an id" if "{id}" in path else "no id"
+        raise ConfigurationError(f"export {options.what}: expected {what}")
+    words = [options.what, *([options.id] if options.id else [])]
+    plain = "".join(c if c.isalnum() or c in "-._" else "_" for c in "-".join(words))
+    target = options.output or Path(f"{plain}.{_ENDINGS.get(form, form)}")
+    part = target.with_name(f"{target.name}.part")
+    path = path.replace("{id}", quote(options.id or "", safe=""))
+    query = named(options, ("since", "until"))
+    if target.exists():
+        raise ConfigurationError(f"{target}: found a file, expected a new name (--output)")
+    if not target.absolute().parent.is_dir():
+        raise ConfigurationError(f"{target}: found no folder {target.parent}, expected it to exist")
+    write = _history if options.what == "alpha" else _sent
+    try:
+        with part.open("wb") as file:
+            for each in write(service, path, form, query):
+                _write(file, each, target)
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
+    size = target.stat().st_size
+    if options.json:
+        print_document({"file": str(target), "n_bytes": size})
+    else:
+        print_lines([f"{target}: {size} bytes"])
+    return DONE
+
+
+def _write(file: BinaryIO, content: bytes, target: Path) -> None:
+    """Write to the disk, whose errors are not the connection's."""
+    try:
+        file.write(content)
+    except OSError as error:
+        raise ConfigurationError(f"{target}: cannot be written: {error.strerror}") from error
+
+
+def _sent(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
+    """Yield what the service writes itself."""
+    asked = f"{path}?{urlencode({'format': form, **query})}"
+    with service.answered("GET", asked, within_s=None, silent_s=SENT_WITHIN_S) as response:
+        yield from chunks(response)
+
+
+def _history(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
+    """Yield the history of alpha, page by page, as lines or as a table with a head."""
+    after, head = 0, True
+    while True:
+        document = service.get(path, **query, after=after, limit=_PAGE).document
+        with understood(service):
+            entries = [dict(entry) for entry in document["entries"]]
+            lines = _written(entries, form, head=head)
+            now = int(entries[-1]["t_ns_utc"]) if entries else 0
+        if now <= after:
+            return
+        yield lines
+        after, head = now, False
+
+
+def _written(entries: list[Document], form: str, *, head: bool) -> bytes:
+    if form == "jsonl":
+        return "".join(json.dumps(entry) + "\n" for entry in entries).encode()
+    rows = [_flat(entry) for entry in entries]
+    buffer = io.StringIO()
+    table = csv.DictWriter(buffer, list(rows[0]) if rows else [], extrasaction="ignore")
+    if head:
+        table.writeheader()
+    table.writerows(rows)
+    return buffer.getvalue().encode()
+
+
+def _flat(entry: Document, before: str = "") -> Document:
+    """Return the fields, those of a field named after both."""
+    found: Document = {}
+    for name, value in entry.items():
+        inside = isinstance(value, dict)
+        found |= _flat(value, f"{before}{name}.") if inside else {f"{before}{name}": value}
+    return found

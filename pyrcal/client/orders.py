@@ -1,0 +1,204 @@
+"""Orders over REST: what is decided on is shown, what came of it printed, long work followed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import uuid
+from typing import NamedTuple
+from urllib.parse import quote
+
+from pyrcal.client.reading import reconstructor_lines, understood
+from pyrcal.client.remote import DONE, NOT_DONE, RECONSTRUCTORS, Request
+from pyrcal.client.rest import Document, RefusedError, Service
+from pyrcal.options import named
+from pyrcal.terminal import login, print_document, print_lines
+from service.errors import ConfigurationError, say, shown
+
+LOOK_S = 0.5
+"""Between two looks at work under way."""
+
+SENT_WITHIN_S = 30.0
+"""A matrix that is not applied by then is left to the service."""
+
+_ON_ITS_WAY = {"proposed", "published", "staged"}
+_UNDER_WAY = _ON_ITS_WAY | {"waiting", "asked", "running", "finishing"}
+_WELL = {"applied", "superseded", "stored", "made"}
+
+
+class Step(NamedTuple):
+    """How far something is."""
+
+    text: str
+    under_way: bool
+    well: bool
+    """Whether it has come to a good end."""
+
+    lasts_s: float | None = None
+    """How long it takes, seconds; None: nobody knows."""
+
+
+def carry_out(service: Service, request: Request, options: argparse.Namespace) -> int:
+    """Show what is decided on, give the order, say what came of it; return the exit status.
+
+    Raises
+    ------
+    ConfigurationError
+        If a reason or somebody's consent is missing and nobody is there to be asked.
+    RefusedError, UnreachableError
+        As of the service.
+    """
+    headers = {}
+    if (request.needs_why and not options.why) or (request.asks and not options.yes):
+        _refuse_early(service, request)
+    if request.decides_on:
+        headers["If-Match"] = _show(service, request, options)
+    why = options.why or (_asked(request, "why", "--why") if request.needs_why else "")
+    agreed = (
+        not request.asks
+        or options.yes
+        or _asked(request, f"{request.asks}? [y/N]", "--yes").lower() in {"y", "yes"}
+    )
+    if not agreed or (request.needs_why and not why):
+        say(f"pyrcal: {request.name}: nothing was ordered")
+        return NOT_DONE
+    if request.method == "POST":
+        headers["Idempotency-Key"] = str(uuid.uuid4())
+    who = login() if options.who is None else options.who
+    given = named(options, request.body.split())
+    body = {**given, **request.always, "reason": why, "by": who}
+    answer = service.order(request.method, path_of(request.path, options), body, headers).document
+    with understood(service):
+        text = str(answer["text"])
+        options.id = answer.get("id", getattr(options, "id", None))
+    follows = request.follows and not options.no_wait
+    if not options.json:
+        print_lines([text])
+    elif not follows:
+        print_document(answer)
+    if request.then:
+        say(request.then)
+    return _follow(service, request, options) if follows else DONE
+
+
+def _refuse_early(service: Service, request: Request) -> None:
+    """Refuse what the service would refuse, before somebody is asked for a reason."""
+    if not request.permitted:
+        return
+    state = service.get("/v1/state").document
+    with understood(service):
+        permission = state["permitted"][request.permitted]
+        reason = "" if permission["allowed"] else str(permission["reason"])
+    if reason:
+        raise RefusedError(reason)
+
+
+def path_of(path: str, options: argparse.Namespace) -> str:
+    """Return a path with the id that is meant."""
+    return path.replace("{id}", quote(str(getattr(options, "id", "")), safe=""))
+
+
+def _show(service: Service, request: Request, options: argparse.Namespace) -> str:
+    """Show what an order decides on, and return its ETag; ``options.id`` becomes its own."""
+    document, tag = service.get(path_of(request.decides_on, options))
+    about = document
+    if "id" not in options:
+        about, tag = service.get(f"{request.decides_on}/previous")
+    options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
+    with understood(service):
+        lines = list(reconstructor_lines(about))
+        options.source = str(about["id"])
+        if "id" in options:
+            options.id = str(document["id"])
+    for line in lines:
+        say(line)
+    return tag
+
+
+def _reconstructors(service: Service) -> dict[str, Document]:
+    """Return what is known of each, by id, oldest first."""
+    document = service.get(RECONSTRUCTORS).document
+    with understood(service):
+        return {one["id"]: one for one in document["reconstructors"]}
+
+
+def _looked_at(service: Service, request: Request, options: argparse.Namespace) -> Document:
+    """Return how far the work is; a reconstructor that goes out again does so as a copy."""
+    if request.follows != RECONSTRUCTORS:
+        return service.get(path_of(request.follows, options)).document
+    every = _reconstructors(service).items()
+    copies = [
+        one for name, one in every if name not in options.known and one["parent"] == options.source
+    ]
+    judged = {"id": options.source, "state": "proposed", "reason": "judged before it is sent again"}
+    return copies[-1] if copies else judged
+
+
+def _asked(request: Request, question: str, option: str) -> str:
+    """Return what somebody at the terminal answers."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigurationError(
+            f"{request.name}: found no {option} and nobody to ask, expected {option}"
+        )
+    sys.stderr.write(f"{question} ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip()
+
+
+def _follow(service: Service, request: Request, options: argparse.Namespace) -> int:
+    """Show how far it is until it has ended; return the exit status."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console, n_looks = Console(stderr=True), 0
+    columns = (
+        SpinnerColumn(),
+        TimeElapsedColumn(),
+        BarColumn(bar_width=20),
+        TextColumn("{task.description}", markup=False),
+    )
+    began_s, told = time.monotonic(), ""
+    try:
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task("", total=None)
+            while True:
+                document, n_looks = _looked_at(service, request, options), n_looks + 1
+                lasted_s = time.monotonic() - began_s
+                with understood(service):
+                    step = _step(document, lasted_s)
+                bar.update(
+                    task, description=shown(step.text), completed=lasted_s, total=step.lasts_s
+                )
+                if not step.under_way:
+                    break
+                if step.text != told and not console.is_terminal:
+                    say(step.text)
+                told = step.text
+                time.sleep(LOOK_S)
+    except KeyboardInterrupt:
+        say("it goes on; pyrcal watch shows how far it is")
+        raise
+    if options.json:
+        print_document(document)
+    elif n_looks > 1 or not step.well:  # else the answer has said so
+        print_lines([step.text])
+    return DONE if step.well else NOT_DONE
+
+
+def _step(document: Document, lasted_s: float) -> Step:
+    """Return how far the work is that a document tells of."""
+    if "acquisition" in document:
+        work = document["acquisition"]
+        text = f"acquisition, {work['stage']}: {work['text']}"
+        return Step(text, work["under_way"], work["stage"] == "tracking")
+    state = document["state"]
+    why = f": {document['reason']}" if document["reason"] else ""
+    too_long = state in _ON_ITS_WAY and lasted_s > SENT_WITHIN_S
+    text = f"{document['id']} is {state}{why}"
+    return Step(
+        f"{text}, still; pyrcal watch shows what comes of it" if too_long else text,
+        state in _UNDER_WAY and not too_long,
+        state in _WELL,
+        document.get("duration_s"),
+    )

@@ -1,0 +1,121 @@
+"""What a running service knows, as text: the screen of each command that changes nothing."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from urllib.parse import quote
+
+from pyrcal.client.remote import DONE, NOT_DONE, Request
+from pyrcal.client.rest import Document, Service
+from pyrcal.client.status import alarm_line, registration_lines, status_lines, verdict, worst_first
+from pyrcal.options import named
+from pyrcal.terminal import clock, print_document, print_lines, span, table
+
+
+def carry_out(service: Service, request: Request, options: argparse.Namespace) -> int:
+    """Ask, print, and return the exit status.
+
+    Raises
+    ------
+    RefusedError, UnreachableError
+        As of the service.
+    """
+    one = getattr(options, "id", None)
+    path = request.path if one is None else f"{request.path}/{quote(one, safe='')}"
+    document = service.get(path, **named(options, ("since", "until", "limit"))).document
+    lines = _SCREENS["reconstructor" if one else request.name]
+    with understood(service):
+        told = [] if options.json else list(lines(document))
+        well = request.name != "status" or (document["ready"] and not document["alarms"])
+    if options.json:
+        print_document(document)
+    print_lines(told)
+    return DONE if well else NOT_DONE
+
+
+@contextmanager
+def understood(service: Service) -> Iterator[None]:
+    """Tell of an answer that this version of pyrcal does not understand.
+
+    Raises
+    ------
+    UnreachableError
+        Instead of what goes wrong with it.
+    """
+    try:
+        yield
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise service.stranger(f"{error!r}; --json shows it") from error
+
+
+def reconstructor_lines(one: Document) -> Iterator[str]:
+    """Yield all that somebody wants to know who decides about a reconstructor."""
+    yield f"{one['id']}: {one['state']}, {one['n_modes']} modes, made {clock(one['created_utc'])}"
+    if one["reason"]:
+        yield f"because      {one['reason']}"
+    yield f"gate         {verdict(one['gate'])}"
+    if one["alpha"] is not None:
+        yield "made for"
+        yield from (f"  {line}" for line in registration_lines(one))
+
+
+def _reconstructors(document: Document) -> Iterator[str]:
+    rows = [
+        (
+            "*" if one["id"] == document["in_use"] else "",
+            one["id"],
+            one["state"],
+            f"{one['n_modes']} modes",
+            clock(one["created_utc"]),
+            one["reason"] or verdict(one["gate"]),
+        )
+        for one in document["reconstructors"]
+    ]
+    yield from table(rows)
+    yield "* in use" if any(row[0] for row in rows) else "which is in use is not known"
+
+
+def _alpha(document: Document) -> Iterator[str]:
+    why = f": {document['validity_reason']}" if document["validity_reason"] else ""
+    yield f"{document['validity']}{why}"
+    yield from registration_lines(document)
+    yield f"last telemetry in it {span(document['age_s'])} ago, of {document['n_windows']} windows"
+    if document["valid_until_utc"]:
+        yield f"valid until {clock(document['valid_until_utc'])}"
+
+
+def _alarms(state: Document) -> Iterator[str]:
+    lasting, gone, muted = worst_first(state), state["stale_alarms"], state["muted_alarms"]
+    for alarm in lasting:
+        yield alarm_line(alarm, state)
+        yield f"    do: {alarm['do']}"
+    for alarm in gone:
+        yield f"{alarm['name']} ({alarm['worst_severity']}) is over, and was not acknowledged:"
+        yield f"    {alarm['text']}"
+    for note in muted:
+        who, until = note["muted"]["by"] or "nobody named", clock(note["muted"]["until_utc"])
+        yield f"{note['name']} is muted until {until} by {who}"
+    counts = ((lasting, "to be seen to"), (gone, "over, unseen"), (muted, "muted"))
+    yield ", ".join(f"{len(some)} {word}" for some, word in counts if some) or "no alarm lasts"
+
+
+def _audit(document: Document) -> Iterator[str]:
+    for one in document["entries"]:
+        why = f" (because: {one['why']})" if one["why"] else ""
+        whence = f", {one['whence']}" if one["whence"] else ""
+        yield (
+            f"{clock(one['t_utc'])}  {one['who']}{whence}: {one['name']}: "
+            f"{one['answer'] or one['text']}{why}"
+        )
+
+
+_SCREENS = {
+    "status": status_lines,
+    "alpha": _alpha,
+    "reconstructors": _reconstructors,
+    "reconstructor": reconstructor_lines,
+    "alarms": _alarms,
+    "audit": _audit,
+}

@@ -1,0 +1,368 @@
+"""The commands that ask a running service: each declared once, here. Nothing heavy is imported.
+
+What the service answers to an order is printed as it says it; what it refuses, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pyrcal.options import Words, add, words
+from service.errors import ConfigurationError, say
+
+DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
+"""Exit statuses; 2 is that of a command line that makes no sense."""
+
+USUAL_URL = "http://127.0.0.1:8080"
+URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
+"""Variables of the environment."""
+
+_EPILOG = """
+Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a command
+line that makes no sense, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for
+--url and the key's file.
+"""
+
+
+class Request(NamedTuple):
+    """A command that asks a running service."""
+
+    name: str
+    purpose: str
+    module: str
+    """Of this package; its ``carry_out`` does the work."""
+
+    call: str
+    """Method and path of REST; words in braces are options."""
+
+    words: tuple[Words, ...] = ()
+    body: str = ""
+    """Options that the body of an order says; ``reason`` and ``by`` are of every one."""
+
+    always: Mapping[str, str] = {}
+    """What the body says besides."""
+
+    decides_on: str = ""
+    """Path of what is shown before, and named in ``If-Match``; empty: nothing."""
+
+    asks: str = ""
+    """What somebody at a terminal has to agree to before; empty: nothing."""
+
+    needs_why: bool = False
+    permitted: str = ""
+    """Name of the order in the state's ``permitted``; only where somebody is asked something."""
+
+    then: str = ""
+    """What to do afterwards."""
+
+    follows: str = ""
+    """Path of what is looked at until the work is done, of all reconstructors: the copy that goes
+    out; empty: the answer is the end."""
+
+    @property
+    def method(self) -> str:
+        """Of REST."""
+        return self.call.partition(" ")[0]
+
+    @property
+    def path(self) -> str:
+        """Of REST; words in braces are options."""
+        return self.call.partition(" ")[2]
+
+
+def _reads(name: str, purpose: str, path: str, *every: Words, by: str = "reading") -> Request:
+    return Request(name, purpose, by, f"GET {path}", every)
+
+
+def _orders(name: str, purpose: str, call: str, *every: Words, **more: Any) -> Request:  # noqa: ANN401
+    return Request(name, purpose, "orders", call, every, **more)
+
+
+def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's own
+    """Return what reads ``3,5,9``, or one of the words that the service knows."""
+
+    def read(text: str) -> object:
+        try:
+            return [kind(part) for part in text.split(",")]
+        except ValueError:
+            if kind is int and text in {"controlled", "all"}:
+                return text
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected numbers with commas")
+
+    return read
+
+
+_ID = words("id ID", "a reconstructor, or in-use, previous, candidate")
+_ALARM = words("id ALARM", "its name: pyrcal alarms")
+_CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default="candidate")
+_MODES = words("--modes N,...|controlled|all", "of the basis", type=_numbers(int))
+_RECORDING = words("id ID", "of a recording: pyrcal archive list")
+_LASTS = words("--duration-s S", "how long", type=float)
+_EACH = words("--amplitude-m M", "RMS of each mode, metres OPD", type=float)
+_LINES = words("--frequency-hz HZ,...", "a line for each", type=_numbers(float))
+_TOTAL = words("--total-amplitude-m M", "RMS of all random signs", type=float)
+_OVER = words("--over-budget", "more than it is meant", default=None)
+_NO_WAIT = words("--no-wait", "do not wait for its end")
+_SINCE = words("--since TIME", "RFC 3339, like 2026-03-01T20:00:00Z")
+_UNTIL = words("--until TIME", "up to this time")
+
+RECONSTRUCTORS = "/v1/reconstructors"
+_ONE = f"{RECONSTRUCTORS}/{{id}}"
+_RESUMES = "pyrcal mode propose, or auto, ends it"
+
+REQUESTS = (
+    _reads("status", "what the service does, on one screen", "/v1/state"),
+    _reads("alpha", "where the mirror is, and how sure that is", "/v1/alpha"),
+    _reads(
+        "reconstructors",
+        "the reconstructors, or all about one",
+        "/v1/reconstructors",
+        words("id ID", "one, or in-use, previous, candidate", nargs="?"),
+    ),
+    _reads("alarms", "the alarms that last, and what to do", "/v1/state"),
+    _reads(
+        "audit",
+        "who ordered what, why, and what came of it",
+        "/v1/audit",
+        *(_SINCE, _UNTIL, words("--limit N", "newest entries; 200", type=int)),
+    ),
+    _reads("watch", "what it does, live, until Ctrl-C", "/v1/stream", by="watch"),
+    _reads(
+        "export",
+        "the history of alpha, the audit trail or a matrix, to a file",
+        "",
+        words(
+            "what",
+            "alpha: what the service remembers of it; the others: from its archive",
+            choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix", "recording"),
+        ),
+        words("id ID", "of a matrix; or in-use, previous", nargs="?"),
+        words("--format F", "alpha, audit: csv, jsonl; matrices: npy, hdf5..."),
+        words("--output FILE", "default: a name of its own, here", type=Path),
+        *(_SINCE, _UNTIL),
+        by="export",
+    ),
+    _orders(
+        "approve",
+        "send the reconstructor that is proposed",
+        f"POST {_ONE}/approve",
+        *(_CANDIDATE, _NO_WAIT),
+        decides_on=_ONE,
+        permitted="approve",
+        asks="send it to the RTC",
+        follows=_ONE,
+    ),
+    _orders(
+        "reject",
+        "discard the reconstructor that is proposed",
+        f"POST {_ONE}/reject",
+        _CANDIDATE,
+        decides_on=_ONE,
+        permitted="reject",
+        needs_why=True,
+    ),
+    _orders(
+        "publish",
+        "send a known reconstructor again",
+        f"POST {_ONE}/publish",
+        *(_ID, _NO_WAIT),
+        decides_on=_ONE,
+        permitted="publish",
+        asks="send it to the RTC again",
+        follows=RECONSTRUCTORS,
+    ),
+    _orders(
+        "rollback",
+        "go back to the reconstructor before; mode becomes hold",
+        "POST /v1/rollback",
+        words("--anyway", "even if the gate refuses it: alpha may be what is wrong", default=None),
+        _NO_WAIT,
+        body="anyway",
+        decides_on=RECONSTRUCTORS,
+        permitted="rollback",
+        asks="go back to the one before; mode becomes hold",
+        needs_why=True,
+        then=_RESUMES,
+        follows=RECONSTRUCTORS,
+    ),
+    _orders(
+        "hold",
+        "only measure: make and send nothing by itself",
+        "PUT /v1/mode",
+        always={"mode": "hold"},
+        then=_RESUMES,
+    ),
+    _orders(
+        "mode",
+        "how much it may do by itself",
+        "PUT /v1/mode",
+        words("mode", choices=("auto", "propose", "hold")),
+        body="mode",
+    ),
+    _orders(
+        "stop",
+        "stop everything: dither off, nothing made or sent",
+        "POST /v1/stop",
+        then="pyrcal resume releases it",
+    ),
+    _orders(
+        "resume",
+        "release what pyrcal stop has stopped (hold is ended by pyrcal mode)",
+        "POST /v1/resume",
+    ),
+    _orders(
+        "acknowledge",
+        "say that an alarm is known of; it stays for as long as it lasts",
+        "POST /v1/alarms/{id}/acknowledge",
+        _ALARM,
+    ),
+    _orders(
+        "mute",
+        "show an alarm no more for a time; it is counted",
+        "POST /v1/alarms/{id}/mute",
+        *(_ALARM, words("for_s SECONDS", "twelve hours at most", type=float)),
+        body="for_s",
+    ),
+    _orders("unmute", "show an alarm again", "POST /v1/alarms/{id}/unmute", _ALARM),
+    _orders(
+        "dither",
+        "start or stop the dither",
+        "POST /v1/dither",
+        words("action", choices=("start", "stop")),
+        words("--kind", "binary: random signs", choices=("sine", "binary")),
+        *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
+        body="action kind modes amplitude_m frequency_hz total_amplitude_m duration_s over_budget",
+    ),
+    _orders(
+        "refit",
+        "compute a reconstructor for the alpha of now",
+        "POST /v1/refit",
+        *(words("--n-modes N", "to control; default: as many as now", type=int), _NO_WAIT),
+        body="n_modes",
+        follows="/v1/refits/{id}",
+    ),
+    _orders(
+        "abort", "end an acquisition under way", "POST /v1/acquisition", always={"action": "abort"}
+    ),
+    _orders(
+        "acquire",
+        "find alpha from nothing: open the loop, look, close it step by step",
+        "POST /v1/acquisition",
+        _NO_WAIT,
+        always={"action": "start"},
+        permitted="acquire",
+        asks="open the loop and dither strongly; the image is lost for tens of seconds",
+        needs_why=True,
+        follows="/v1/state",
+    ),
+    _orders(
+        "measure",
+        "have the RTC measure an interaction matrix; all but a sine open the loop",
+        "POST /v1/measurements",
+        words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
+        words("--n-average N", "pushes, and pulls, of each", type=int),
+        *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
+        body="pattern n_average modes amplitude_m frequency_hz duration_s",
+        permitted="measure",
+        asks="have the RTC measure; all patterns but sine open the loop",
+        follows="/v1/measurements/{id}",
+    ),
+    _orders(
+        "measure-noisy",
+        "measure a noisy interaction matrix on sky, by random signs",
+        "POST /v1/noisy-matrix",
+        *(_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
+        body="modes total_amplitude_m duration_s over_budget",
+        follows="/v1/noisy-matrix/{id}",
+    ),
+    _orders(
+        "record",
+        "keep the telemetry that comes from now on, byte for byte; a minute if not told otherwise",
+        "POST /v1/recordings",
+        *(_LASTS, words("--before-s S", "of what came before, 60 at most", type=float), _NO_WAIT),
+        body="duration_s before_s",
+        follows="/v1/recordings/{id}",
+    ),
+    _orders(
+        "end-recording",
+        "keep no more of it; what there is stays",
+        "POST /v1/recordings/{id}/end",
+        _RECORDING,
+    ),
+    _orders(
+        "remove-recording",
+        "remove telemetry that was kept, for good",
+        "DELETE /v1/recordings/{id}",
+        _RECORDING,
+        asks="remove it for good",
+    ),
+    _orders(
+        "give-up",
+        "wait no longer for a matrix that is measured",
+        "DELETE /v1/measurements/{id}",
+        words("id ID", "of the measurement"),
+    ),
+)
+"""What there is, in the order of ``pyrcal --help``."""
+
+
+def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
+    """Add these commands to a command line."""
+    for request in REQUESTS:
+        parser = commands.add_parser(
+            request.name, help=request.purpose, description=request.purpose, epilog=_EPILOG
+        )
+        parser.set_defaults(request=request, module=__name__)
+        add(parser, *request.words)
+        if request.module == "orders":
+            add(parser, words("--why WHY", "kept in the audit trail", default=""))
+            add(parser, words("--who WHO", "your name; default: the login name"))
+        if request.asks:
+            add(parser, words("--yes", "do it without asking"))
+        add(
+            parser,
+            words("--json", "print what REST answers"),
+            words("--url URL", f"of the service, default {URL}, else {USUAL_URL}"),
+            words("--key-file FILE", f"default {KEY}", type=Path),
+        )
+
+
+def main(options: argparse.Namespace) -> int:
+    """Ask, print, and return the exit status.
+
+    Raises
+    ------
+    ConfigurationError
+        If the address or the key is none.
+    """
+    # HTTP takes longer to import than all the commands are told with
+    from pyrcal.client.rest import RefusedError, Service, UnreachableError
+
+    request: Request = options.request
+    service = Service(options.url or os.environ.get(URL) or USUAL_URL, _key(options.key_file))
+    try:
+        status: int = import_module(f"{__package__}.{request.module}").carry_out(
+            service, request, options
+        )
+    except RefusedError as error:
+        say(f"pyrcal: {request.name}: {error}")
+        return NOT_DONE
+    except UnreachableError as error:
+        say(f"pyrcal: {error}")
+        return UNREACHABLE
+    return status
+
+
+def _key(file: Path | None) -> str:
+    """Return the API key; empty: there is none."""
+    if file is None:
+        return os.environ.get(KEY, "").strip()
+    try:
+        return file.read_text(encoding="ascii").strip()
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"--key-file {file}: {error}") from error

@@ -1,0 +1,206 @@
+"""``pyrcal watch``: the state and the log in a terminal, live, and never older than they look."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from http.client import HTTPResponse
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+from pyrcal.client.reading import understood
+from pyrcal.client.remote import DONE, Request
+from pyrcal.client.rest import Document, RefusedError, Service, UnreachableError
+from pyrcal.client.status import status_lines
+from pyrcal.terminal import clock, print_document, print_lines, span
+from service.errors import say, shown
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+SILENT_S = 15.0
+"""The stream shows a sign of life every 10 s; without one for so long it is cut."""
+
+AGAIN_S = 1.0
+"""Between two attempts to connect."""
+
+DRAWN_S = 0.25
+_LOG_LENGTH = 200
+_LONGEST = 10_000_000
+"""Bytes of a line: a state has a thousandth of that."""
+
+Event = tuple[str, Document]
+"""Its name and its data."""
+
+_GROWS = {"age_s", "window_age_s", "frame_age_s", "uptime_s"}
+
+
+@dataclass
+class Latest:
+    """What the stream has told, and when."""
+
+    state: Document | None = None
+    at_s: float = 0.0
+    """When the state came, monotonic."""
+
+    log: tuple[Document, ...] = ()
+    last: str = ""
+    """Id of the last line of the log."""
+
+    lost: str = "not connected yet"
+    """Why nothing comes; empty: the stream is open."""
+
+
+def carry_out(service: Service, request: Request, options: argparse.Namespace) -> int:
+    """Show what comes until Ctrl-C; return the exit status.
+
+    Raises
+    ------
+    RefusedError, UnreachableError
+        If there is no stream at the first attempt; later ones go on for ever.
+    """
+    heard = Latest()
+    coming = events(service, request.path, heard)
+    coming = chain([next(coming)], coming)
+    try:
+        if options.json:
+            _print_events(coming)
+        elif not sys.stdout.isatty():
+            _print_log(coming)
+        else:
+            _draw(coming, heard)
+    except KeyboardInterrupt:
+        return DONE
+    return DONE
+
+
+def events(service: Service, path: str, heard: Latest) -> Iterator[Event]:
+    """Yield the name and the data of each event; ``lost`` with the reason where the stream ends."""
+    ever = False
+    while True:
+        headers = {"Last-Event-ID": heard.last} if heard.last else {}
+        try:
+            with service.answered("GET", path, headers=headers, silent_s=SILENT_S) as response:
+                for name, data in _read(service, response, heard):
+                    ever = True
+                    if name == "reset":
+                        data = service.get("/v1/events", limit=_LOG_LENGTH).document
+                        with understood(service):
+                            heard.log = tuple(map(dict, data["log"]))
+                    elif name == "log":
+                        heard.log = (*heard.log, data)[-_LOG_LENGTH:]
+                    else:
+                        heard.state, heard.at_s, heard.lost = data, time.monotonic(), ""
+                    yield name, data
+            heard.lost = "the service has ended the stream"
+        except (RefusedError, UnreachableError) as error:
+            if not ever:
+                raise
+            heard.lost = str(error)
+        yield "lost", {"text": heard.lost}
+        time.sleep(AGAIN_S)
+
+
+def _read(service: Service, response: HTTPResponse, heard: Latest) -> Iterator[Event]:
+    """Yield the events of a stream; remember the ids of the log's lines.
+
+    Raises
+    ------
+    UnreachableError
+        If it is no stream of pyrcal's.
+    """
+    if not response.headers.get("Content-Type", "").startswith("text/event-stream"):
+        raise service.stranger("no stream of events")
+    fields: dict[str, str] = {}
+    while raw := response.readline(_LONGEST):
+        name, _, value = raw.decode(errors="replace").rstrip("\r\n").partition(":")
+        if name or value:
+            fields[name] = value.removeprefix(" ")
+            continue
+        if "data" in fields:
+            with understood(service):
+                data = dict(json.loads(fields["data"]))
+            heard.last = fields.get("id", heard.last)
+            yield fields.get("event", ""), data
+        fields = {}
+
+
+def _print_events(coming: Iterator[Event]) -> None:
+    for name, data in coming:
+        print_document({"event": name, "data": data}, indent=None)
+
+
+def _print_log(coming: Iterator[Event]) -> None:
+    """Print the log, and when nothing comes: there is no screen to draw on."""
+    for name, data in coming:
+        if name == "lost":
+            say(f"DISCONNECTED: {data['text']}; trying again")
+        for line in data["log"] if name == "reset" else [data] if name == "log" else ():
+            print_lines([_of_log(line)])
+
+
+def _of_log(line: Document) -> str:
+    times = f" ({line['n_times']} times)" if line["n_times"] > 1 else ""
+    return f"{clock(line['t_utc'])}  {line['level']:7}  {line['text']}{times}"
+
+
+def _draw(coming: Iterator[Event], heard: Latest) -> None:
+    """Draw what is known, and how old it is, while it comes in a thread of its own."""
+    from rich.console import Console
+    from rich.live import Live
+
+    listener = threading.Thread(target=lambda: any(False for _ in coming), daemon=True)
+    listener.start()
+    with Live(console=Console(), screen=True, auto_refresh=False) as live:
+        while listener.is_alive():
+            live.update(screen(heard, time.monotonic()), refresh=True)
+            time.sleep(DRAWN_S)
+
+
+def screen(heard: Latest, now_s: float) -> Group:
+    """Return what there is to see at a time, the newest lines of the log first."""
+    from rich.console import Group
+    from rich.text import Text
+
+    age_s, lost = now_s - heard.at_s, heard.lost
+    head = Text(f"connected, the state came {span(age_s)} ago; Ctrl-C ends this", style="green")
+    if lost:
+        old = f"; what is below is {span(age_s)} old" if heard.state else ""
+        head = Text(shown(f"DISCONNECTED: {lost}; trying again{old}"), style="bold white on red")
+    try:
+        told = [] if heard.state is None else status_lines(_aged(heard.state, age_s))
+        log = [(_of_log(line)[11:], _LEVELS.get(line["level"], "")) for line in reversed(heard.log)]
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        told, log = [f"NOT this version of pyrcal: {error!r}"], []
+    return Group(
+        head,
+        *(Text(shown(line), style=_style(line, lost)) for line in ["", *told, ""]),
+        *(
+            Text(shown(line), style="dim" if lost else style, no_wrap=True, overflow="ellipsis")
+            for line, style in log
+        ),
+    )
+
+
+_LEVELS = {"warning": "yellow", "alarm": "bold red"}
+
+
+def _style(line: str, lost: str) -> str:
+    if lost:
+        return "dim"
+    return "bold red" if line.startswith("ALARM") or "NOT READY" in line else ""
+
+
+def _aged(value: Any, by_s: float) -> Any:  # noqa: ANN401 - as JSON has it
+    """Return a state in which all ages have grown since it came."""
+    if not isinstance(value, dict):
+        return value
+    return {
+        name: one + by_s if name in _GROWS and one is not None else _aged(one, by_s)
+        for name, one in value.items()
+    }

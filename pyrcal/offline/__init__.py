@@ -1,0 +1,1 @@
+"""Files in, answers out, no service: fits of measured matrices, reconstructors, exports."""

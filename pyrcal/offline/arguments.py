@@ -1,0 +1,226 @@
+"""What the commands understand that read and write files. Nothing here takes long to import.
+
+What the program calls methods and data sets stands here as text; a test compares it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pyrcal.options import add, words
+from service.cli.arguments import check_settings, such, whole
+from service.errors import ConfigurationError
+from service.files import kind_of, numbers_in, parse_alpha, parse_modes
+
+if TYPE_CHECKING:
+    from pyrcal.offline.light_rotation import Arms
+
+_count = such(whole, lambda n: n > 0, "a whole number above 0")
+seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 3600")
+
+
+def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
+    """Add these commands to a command line."""
+    _describe_archive(commands.add_parser("archive", help="what is kept, and is it sound?"))
+    _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
+    _describe_reconstruct(
+        commands.add_parser("reconstruct", help="a reconstructor for a known registration")
+    )
+
+
+_OF_A_FOLDER = (
+    words("--config FILE", "the service's settings, TOML", type=Path),
+    words("--data-dir DIR", "the service's data_dir, default var"),
+)
+"""What commands that work in a service's folder have in common."""
+
+
+def _describe_archive(archive: argparse.ArgumentParser) -> None:
+    archive.set_defaults(module="pyrcal.offline.archive")
+    archive.description = (
+        "Look through the matrices in a service's data_dir, check them, remove what is old. Reads "
+        "beside a running service; prune refuses, for the service does it by itself."
+    )
+    archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
+    aot = (
+        words("output FILE.fits", type=Path),
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--recording FILE", "of pyrcal sim --record", type=Path),
+        words("--skip S", "of the recording", type=seconds, default=0.0),
+        words("--seconds S", "of it, default %(default)g", type=seconds, default=10.0),
+        words("--night DATE", "of the evening, UTC; else of the recording"),
+    )
+    actions = archive.add_subparsers(dest="action", required=True)
+    for action, purpose, more in (
+        ("list", "all, oldest first, and why one stays", ()),
+        ("show", "what is known of one", (words("id ID"),)),
+        ("verify", "read all of them and compare checksums", ()),
+        ("aot", "α and telemetry as an AOT FITS file", aot),
+        ("prune", "remove what [archive] lets go", (words("--dry-run", "only say what would go"),)),
+    ):
+        parser = actions.add_parser(action, help=purpose)
+        add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+
+
+_FIT = """
+Find where the mirror lies on the sensor from a measured interaction matrix: shift, rotation and
+magnification with 1 sigma, the gain of every mode, what is left over, and whether to believe it.
+"""
+
+_FIT_EPILOG = """
+REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
+the array 'interaction_matrix' or the one that --dataset names. What is printed on standard output
+is the answer; progress goes to standard error. Exit status: 0 accepted, 1 fitted but refused (the
+verdict says why), 2 input that cannot be used. OOPAO's metre is (n - 1)/n of ours for a pupil of n
+points: its mirror comes out that much smaller. docs/integrate/fitting.md explains format,
+orientation and verdicts.
+"""
+
+_RECONSTRUCT = """
+Compute the noise-free interaction matrix for a registration, invert it, and write both with
+everything they were made of. As many modes as the basis has may be controlled, however few were
+measured.
+"""
+
+_INSTRUMENT = words("instrument INSTRUMENT", "TOML file, or a packaged name")
+
+
+def _describe_fit(fit: argparse.ArgumentParser) -> None:
+    fit.set_defaults(module="pyrcal.offline.fit")
+    fit.description, fit.epilog = _FIT, _FIT_EPILOG
+    methods = (
+        "joint: all four together (default); paper: one at a time, with parabolas; "
+        "sensitivity: projection on sensitivity matrices"
+    )
+    modes = "basis indices to use, like 0:400 (400 is not) or 3,5,9; default all"
+    start = "where to begin: subapertures, degrees, ratio"
+    flux = "mean counts of the four pupil images, array flux (4, n, n): the model is lit as it says"
+    reference = "a flux map of another day: by how much the light is turned since is told"
+    arms = (
+        "the spider's arms at rotation 0: the rotation is told that their shadows in the "
+        "flux map have"
+    )
+    add(
+        fit,
+        _INSTRUMENT,
+        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("--dataset NAME", "of the matrix, default interaction_matrix"),
+        words("--method", methods, choices=("joint", "paper", "sensitivity"), default="joint"),
+        words("--modes FIRST:END", modes, type=_read_by(parse_modes)),
+        words("--start X,Y,ROT,MAG", start, type=_read_by(parse_alpha)),
+        words("--flux-map FILE", flux, type=Path),
+    )
+    add(
+        fit.add_mutually_exclusive_group(),
+        words("--flux-reference FILE", reference, type=Path),
+        words("--arms WIDTH:DEG,DEG...", arms, type=_read_by(parse_arms)),
+    )
+    cores = os.cpu_count() or 1
+    add(
+        fit,
+        words("--gain-map", "fit a gain over the pupil, too"),
+        words("--anamorphosis", "fit a stretched image, too"),
+        words("--json", "print one JSON object, not a table"),
+        words("--plot FILE.png", "write the paper's figures", type=Path),
+        words("--output FILE.h5", "write all that was found", type=Path),
+        words("--threads N", "default: one for every core", type=_count, default=cores),
+    )
+
+
+def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
+    make.set_defaults(module="pyrcal.offline.reconstruct")
+    make.description = _RECONSTRUCT
+    make.epilog = "Exit status: 0 written, 2 input that cannot be used."
+    alpha = (
+        "X,Y,ROT,MAG (subapertures, degrees, ratio), or a file that pyrcal fit wrote with "
+        "--json or --output"
+    )
+    methods = (
+        "svd: least squares, weak singular values left out (default); map: with noise and "
+        "turbulence as priors"
+    )
+    noise = "of map: 1 sigma of one slope in one frame, default %(default)g"
+    gains = "leave the columns as the model has them; by default they take the gains of the fit"
+    condition = words(
+        "--max-condition MAX_CONDITION", "of svd, default %(default)g", type=float, default=100.0
+    )
+    add(
+        make,
+        _INSTRUMENT,
+        words("alpha ALPHA", alpha),
+        words("--modes N", "the first N modes", type=_count, required=True),
+        words("--output FILE.h5", type=Path, required=True),
+        words("--method", methods, choices=("svd", "map"), default="svd"),
+        condition,
+        words("--slope-noise RMS", noise, type=float, default=0.05),
+        words("--no-gains", gains),
+        words("--flux-map FILE", "as of pyrcal fit: the model is lit like it", type=Path),
+        words("--reference FILE", "the measured matrix, for its checksum", type=Path),
+    )
+
+
+def parse_arms(text: str) -> Arms:
+    """Return the spider's arms ``WIDTH:DEG,DEG,...``: subapertures, degrees from +x towards +y.
+
+    Raises
+    ------
+    ValueError
+        If it is not a width above 0 and at least one finite angle.
+    """
+    first, _, rest = text.partition(":")
+    width, angles = numbers_in(first), numbers_in(rest)
+    if not angles or len(width) != 1 or width[0] <= 0.0:
+        expected = "expected WIDTH:DEG,DEG,... of the spider's arms, like 0.9:90,210,330"
+        raise ValueError(f"found {text.strip()!r}, {expected}")
+    from pyrcal.offline.light_rotation import Arms
+
+    return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
+
+
+def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
+    """Return a function that reads a text; what it refuses argparse prints as it is."""
+
+    def read(text: str) -> object:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read
+
+
+def check_files(options: argparse.Namespace) -> None:
+    """Refuse files that cannot be what they are given as, before anything large is imported.
+
+    Raises
+    ------
+    PyrcalError
+        One line that names the file.
+    """
+    check_settings(options)
+    if options.command in {"fit", "reconstruct"}:
+        from service.config.instrument_schema import read_instrument_file
+
+        read_instrument_file(options.instrument)
+    for path in _paths(options, "output", "plot"):
+        if not path.absolute().parent.is_dir():
+            raise ConfigurationError(f"{path}: found no folder {path.parent}, expected it to exist")
+    measured = ("reference",) if options.command == "fit" else ()
+    for path in _paths(options, "flux_map", "flux_reference", *measured):
+        kind_of(path)
+    if options.command == "reconstruct" and not Path(options.alpha).is_file():
+        try:
+            parse_alpha(options.alpha)
+        except ValueError as error:
+            raise ConfigurationError(f"ALPHA: no such file, and {error}") from error
+
+
+def _paths(options: argparse.Namespace, *names: str) -> list[Path]:
+    """Return the files of these names that were given."""
+    found = [getattr(options, name, None) for name in names]
+    return [path for path in found if path is not None]

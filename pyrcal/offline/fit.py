@@ -1,0 +1,78 @@
+"""``pyrcal fit``: from a measured interaction matrix on disk to a registration and a verdict."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from pyrcal.offline.figures import check_plots, write_sheet
+from pyrcal.offline.fit_file import fit_file
+from pyrcal.offline.light import Light, read_light
+from pyrcal.offline.light_rotation import Arms
+from pyrcal.offline.matrix import FitOptions
+from pyrcal.offline.report import document, fill_fit, table
+from pyrcal.terminal import show_progress
+from service.archive.store import write_whole
+from service.config import load_instrument
+from service.errors import ConfigurationError, say
+from service.model.instrument import Instrument
+from service.model.kinds import Method
+
+ACCEPTED, REFUSED = 0, 1
+
+
+def main(options: argparse.Namespace) -> int:
+    """Fit, say what was found, and return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used.
+    """
+    if options.plot is not None:
+        check_plots()
+    instrument = load_instrument(options.instrument)
+    light = _light(options, instrument)
+    asked = FitOptions(
+        method=Method(options.method),
+        modes=options.modes,
+        start=options.start,
+        gain_map=options.gain_map,
+        anamorphosis=options.anamorphosis,
+        illumination=None if light is None else light.illumination,
+    )
+    report = fit_file(
+        instrument,
+        options.reference,
+        asked,
+        dataset=options.dataset,
+        threads=options.threads,
+        progress=show_progress,
+    )
+    if light is not None:
+        report = replace(report, notes=(*report.notes, light.note))
+    if options.json:
+        print(json.dumps(document(report), allow_nan=False))
+        for note in report.notes:
+            say(f"note: {note}")
+    else:
+        print(table(report))
+    if options.output is not None:
+        write_whole(options.output, partial(fill_fit, report=report))
+    if options.plot is not None:
+        write_sheet(report, instrument, options.plot)
+    return ACCEPTED if report.fit.accepted else REFUSED
+
+
+def _light(options: argparse.Namespace, instrument: Instrument) -> Light | None:
+    reference: Path | Arms | None = options.flux_reference or options.arms
+    if options.flux_map is not None:
+        return read_light(options.flux_map, instrument, reference)
+    if reference is not None:
+        raise ConfigurationError(
+            "found a reference for the light and no light, expected --flux-map beside it"
+        )
+    return None

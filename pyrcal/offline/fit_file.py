@@ -1,0 +1,128 @@
+"""From a file and an instrument to a fit: the same way for the command line and for REST."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.report import FitReport
+from service.errors import MatrixError
+from service.estimation.reference import Reference
+from service.files.container import FLUX_FRAME, Recorded, read_recorded
+from service.model.detector_windows import frame_windows, slopes_from_frames
+from service.model.instrument import FrameWindows, Instrument, instrument_sha256
+
+Progress = Callable[[str], None]
+
+
+def fit_file(
+    instrument: Instrument,
+    path: Path,
+    options: FitOptions,
+    *,
+    dataset: str | None = None,
+    threads: int = 2,
+    progress: Progress | None = None,
+) -> FitReport:
+    """Return the fit of the measured matrix in a file.
+
+    Raises
+    ------
+    MatrixError
+        If the file or the matrix cannot be used.
+    ModelError
+        If the optical model cannot work with the instrument or the options.
+    """
+    recorded = read_recorded(path, dataset)
+    reference, notes = reference_of(recorded, instrument)
+    begun = time.perf_counter()
+    # BLAS keeps to one thread: nested threading made a fit seven times slower
+    with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
+        try:
+            fit = fit_matrix(instrument, reference, options, mapper=pool.map, progress=progress)
+        except MatrixError as error:
+            said = str(error).removeprefix("reference: ")
+            raise MatrixError(f"{recorded.where}: {said}") from error
+    return FitReport(
+        fit=fit,
+        method=options.method,
+        instrument=instrument.name,
+        instrument_sha256=instrument_sha256(instrument),
+        reference=recorded.where,
+        reference_sha256=recorded.sha256,
+        double_pass=reference.double_pass,
+        seconds=time.perf_counter() - begun,
+        notes=(*notes, *fit.remarks),
+    )
+
+
+def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:
+    """Return what is fitted, and what was decided on the way.
+
+    Raises
+    ------
+    MatrixError
+        If the file holds frames and the instrument slopes, or the other way round.
+    """
+    notes = list(instrument.remarks)
+    double_pass = instrument.double_pass
+    if recorded.double_pass is not None and recorded.double_pass is not double_pass:
+        double_pass = recorded.double_pass
+        notes.append(
+            f"double pass: {'yes' if double_pass else 'no'}, as the measured file says; the "
+            "instrument file says otherwise"
+        )
+    if recorded.modes is not None:
+        notes.append(f"columns belong to the {len(recorded.modes)} modes the measured file names")
+    frames = recorded.values.ndim == 3
+    if frames and recorded.noise is not None:
+        notes.append("the noise in the measured file is of frames, not of slopes: not used")
+    matrix = _slopes(recorded, instrument)
+    if instrument.frames is not None and recorded.flux_frame is not None:
+        notes.extend(_windows_note(instrument, instrument.frames, recorded.flux_frame))
+    reference = Reference(
+        matrix=matrix,
+        modes=recorded.modes,
+        noise=None if frames else recorded.noise,
+        double_pass=double_pass,
+    )
+    return reference, tuple(notes)
+
+
+def _windows_note(
+    instrument: Instrument, frames: FrameWindows, flux_frame: NDArray[np.float64]
+) -> Iterator[str]:
+    """Yield where the pupil images were found, where the instrument does not tell."""
+    if frames.centres_px is None:
+        centres = frame_windows(instrument, flux_frame).centres_px.reshape(4, 2)
+        words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
+        yield f"shifts count from the pupil images as found: pupil_centres_px = [{words}]"
+
+
+def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
+    """Return the measured slopes, cut from detector frames where that is what was measured."""
+    found = f"{recorded.where}: found shape {recorded.values.shape}"
+    if instrument.frames is None:
+        if recorded.values.ndim == 3:
+            raise MatrixError(
+                f"{found}, expected (n_slopes, n_modes): detector frames need "
+                'wfs.input = "frames" in the instrument file'
+            )
+        return recorded.values
+    if recorded.values.ndim != 3:
+        raise MatrixError(
+            f'{found}, expected detector frames (n_modes, ny, nx): wfs.input is "frames"'
+        )
+    if recorded.flux_frame is None:
+        raise MatrixError(
+            f"{recorded.where}: found no {FLUX_FRAME} beside it, expected a mean detector frame "
+            "(ny, nx) in the same counts"
+        )
+    return slopes_from_frames(instrument, recorded.values, recorded.flux_frame)

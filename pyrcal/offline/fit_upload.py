@@ -1,0 +1,212 @@
+"""Fits of uploads: what came, which of its files is what, and the fit."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tomllib
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from pyrcal.offline.figures import numbers
+from pyrcal.offline.fit_file import fit_file
+from pyrcal.offline.matrix import FitOptions
+from pyrcal.offline.report import document
+from service.config import load_instrument, packaged_instrument
+from service.errors import ConfigurationError, MatrixError, PyrcalError
+from service.files import parse_alpha, parse_modes
+from service.files.container import check_sealed
+from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, STAGES, UPLOAD, FitRequest
+from service.model.instrument import Instrument, instrument_sha256
+from service.model.kinds import Method
+
+MOST_FILES = 32
+
+_ZIP_BEGINS = b"PK\x03\x04"
+
+_REFERENCE = re.compile(r"(.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::.*)?|(.+):/.+", re.IGNORECASE)
+"""``file.fits``, ``file.fits:EXTNAME`` or ``file.h5:/dataset``, as an instrument file says it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parcel:
+    """What was uploaded, on disk."""
+
+    reference: Path
+    """The measured matrix."""
+
+    instrument: Path | None
+    """The instrument file; None: it came alone."""
+
+
+def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes: int) -> Parcel:
+    """Return what an upload consists of; a zip archive is unpacked into the empty ``folder``.
+
+    Parameters
+    ----------
+    upload
+        The file as it came.
+    folder
+        Where files of an archive go.
+    reference
+        Name of the measured file in an archive; None: the only one that can be it.
+    most_bytes
+        Of all files of an archive together.
+
+    Raises
+    ------
+    MatrixError, ConfigurationError
+        If an archive is damaged, too large, has other folders than one, or leaves open which file
+        is what; if its instrument file refers to files that are not in it; or if an HDF5 file
+        reaches beyond itself.
+    """
+    with upload.open("rb") as file:
+        packed = file.read(4) == _ZIP_BEGINS
+    if not packed:
+        check_sealed(upload)
+        return Parcel(reference=upload, instrument=None)
+    try:
+        with zipfile.ZipFile(upload) as archive:
+            names = _unpack(archive, folder, most_bytes)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
+        raise MatrixError(f"upload: damaged zip archive: {error}") from error
+    for name in names:
+        check_sealed(folder / name)
+    instrument = folder / _only_toml(names)
+    referred = set(_referred(instrument))
+    for name in sorted(referred - set(names)):
+        raise ConfigurationError(
+            f"{instrument.name}: refers to {name}, expected a file of the archive: "
+            f"{', '.join(names)}"
+        )
+    left = [name for name in names if name not in referred and name != instrument.name]
+    return Parcel(reference=folder / _measured(left, names, reference), instrument=instrument)
+
+
+def _only_toml(names: list[str]) -> str:
+    tomls = [name for name in names if name.endswith(".toml")]
+    if len(tomls) != 1:
+        raise MatrixError(f"upload: found {len(tomls)} .toml files in the archive, expected one")
+    return tomls[0]
+
+
+def _measured(left: list[str], names: list[str], reference: str | None) -> str:
+    """Return the name of the measured file: the one asked for, or the only one ``left``."""
+    chosen = reference if reference is not None else left[0] if len(left) == 1 else None
+    if chosen is None or chosen not in names:
+        raise MatrixError(
+            f"upload: found {reference or 'several files or none'} as the measured one, expected "
+            f"?reference= and one of {', '.join(n for n in names if not n.endswith('.toml'))}"
+        )
+    return chosen
+
+
+def _unpack(archive: zipfile.ZipFile, folder: Path, most_bytes: int) -> list[str]:
+    """Write the files of an archive and return their names."""
+    entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+    size = sum(entry.file_size for entry in entries)
+    if len(entries) > MOST_FILES or size > most_bytes:
+        raise MatrixError(
+            f"upload: found {len(entries)} files of {size / 1e6:.0f} MB in the archive, expected "
+            f"at most {MOST_FILES} of {most_bytes / 1e6:.0f} MB"
+        )
+    names = []
+    for entry in entries:
+        name = PurePosixPath(entry.filename).name
+        if name in names or name != entry.filename:
+            raise MatrixError(
+                f"upload: found {entry.filename} in the archive, expected files without folders, "
+                "as zip -j packs them"
+            )
+        with archive.open(entry) as source, (folder / name).open("wb") as target:
+            shutil.copyfileobj(source, target)
+        names.append(name)
+    return names
+
+
+def _referred(instrument: Path) -> Iterator[str]:
+    """Yield the file of everything in an instrument file that refers to one."""
+    try:
+        tables = tomllib.loads(instrument.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return  # whoever loads it says what is wrong
+    for text in _texts(tables):
+        match = _REFERENCE.fullmatch(text)
+        if match is not None:
+            yield match[1] or match[2]
+
+
+def _texts(value: object) -> Iterator[str]:
+    """Yield every text in a TOML file's values, however deep."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts(part)
+
+
+def fit_upload(folder: Path, request: FitRequest) -> None:
+    """Fit what was uploaded into the folder, and write there what came of it.
+
+    Raises
+    ------
+    MatrixError
+        If something in the upload cannot be used, said without the service's own paths.
+    """
+    unpacked = folder / "unpacked"
+    unpacked.mkdir()
+
+    def tell(stage: str) -> None:
+        (folder / STAGE).write_text(stage, encoding="utf-8")
+
+    tell(STAGES[0])
+    asked = request.asked
+    try:
+        parcel = opened_parcel(folder / UPLOAD, unpacked, asked["reference"], request.most_bytes)
+        instrument, remarks = _instrument_of(parcel, request)
+        report = fit_file(
+            instrument,
+            parcel.reference,
+            _options(asked),
+            dataset=asked["dataset"],
+            threads=request.threads,
+            progress=tell,
+        )
+    except PyrcalError as error:
+        said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
+        raise MatrixError(said) from error
+    tell(STAGES[-1])
+    report = replace(report, notes=(*report.notes, *remarks))
+    own = asked["instrument"] is None and parcel.instrument is None and not remarks
+    _write(folder / FIGURES, {"own_instrument": own, **numbers(report.fit)})
+    _write(folder / DOCUMENT, document(report))
+
+
+def _instrument_of(parcel: Parcel, request: FitRequest) -> tuple[Instrument, tuple[str, ...]]:
+    """Return the instrument that is meant, and what whoever reads the fit should know of it."""
+    if request.asked["instrument"] is not None:
+        return packaged_instrument(request.asked["instrument"]), ()
+    if parcel.instrument is not None:
+        return load_instrument(parcel.instrument), ()
+    own = load_instrument(request.own_instrument)
+    if instrument_sha256(own) == request.own_sha256:
+        return own, ()
+    return own, ("the instrument file has changed since the service began: read as it is now",)
+
+
+def _options(asked: Mapping[str, Any]) -> FitOptions:
+    return FitOptions(
+        method=Method(asked["method"]),
+        modes=None if asked["modes"] is None else parse_modes(asked["modes"]),
+        start=None if asked["start"] is None else parse_alpha(asked["start"]),
+        gain_map=asked["gain_map"],
+        anamorphosis=asked["anamorphosis"],
+    )
+
+
+def _write(path: Path, found: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(found, allow_nan=False), encoding="utf-8")

@@ -1,0 +1,194 @@
+"""What a matrix says of its instrument: the other stop, the coupling of the mirror, the modulation.
+
+The registration is fitted together with the last two; what is found is held against the file. Of
+what is the one or the other (stop, normalisation, kind of influence) the other is tried as well,
+and so are other pupils.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.methods import Settled, spread
+from pyrcal.offline.pupil_checks import Few, other_pupils
+from pyrcal.offline.uncertainty import Uncertainty
+from service.estimation.models import BETTER, CHEAP, FitModels, Optic, Other
+from service.estimation.solver import refine
+from service.model.misregistration import Misregistration
+
+Array = NDArray[np.float64]
+
+FITTED_KEYS = ("coupling", "modulation_lambda_over_d")
+"""Of the instrument file, for the width of influence functions and the modulation."""
+
+NOTABLE = 0.03
+"""A logarithm of the instrument's that differs by less from the file's is not worth a word."""
+
+NOTABLE_SIGMA = 3.0
+"""... nor one that differs by less than this many of its own σ."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rival:
+    """Another instrument that the matrix might come from."""
+
+    change: Other
+    """What to write into the file."""
+
+    share: float
+    """χ² that it leaves, over what this one leaves."""
+
+    moved: Array
+    """``(4,)`` by how much the registration would be another, where the matrix cannot tell the two
+    instruments apart, numeric units; 0 where it can."""
+
+    @property
+    def believed(self) -> bool:
+        """Whether it is the instrument, rather than the one of the file."""
+        return self.share < self.change.believed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundOptic:
+    """A number of the instrument that was fitted beside the registration."""
+
+    optic: Optic
+    """Which."""
+
+    change: float
+    """Found over told, as a logarithm."""
+
+    sigma: float
+    """1 σ of it."""
+
+    found: float | None
+    """Coupling, or radius in λ/D; None: a width of influence functions without a coupling."""
+
+    told: float | None
+    """The same in the instrument file; None as above, or said to be unknown."""
+
+    @property
+    def found_sigma(self) -> float:
+        """1 σ of what was found, in its own unit; of a width as its logarithm."""
+        if self.found is None:
+            return self.sigma
+        if self.optic is Optic.MODULATION:
+            return self.found * self.sigma
+        return -2.0 * self.found * float(np.log(self.found)) * self.sigma
+
+    @property
+    def key(self) -> str:
+        """Of the instrument file."""
+        return FITTED_KEYS[self.optic is Optic.MODULATION]
+
+    @property
+    def found_words(self) -> str:
+        """What was found, as the file would say it."""
+        if self.found is None:
+            wider = np.expm1(self.change)
+            side = "wider" if wider > 0.0 else "narrower"
+            return f"influence functions {abs(wider):.0%} {side}"
+        return f"{self.key} = {self.found:.3g}"
+
+    @property
+    def told_words(self) -> str:
+        """What the file says."""
+        if self.told is None:
+            return "than the instrument file's" if self.found is None else "the file does not say"
+        return f"the instrument file says {self.told:.3g}"
+
+    @property
+    def notable(self) -> bool:
+        """Whether the file is wrong, as far as the matrix tells."""
+        unknown = self.found is not None and self.told is None
+        return not unknown and abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AsTold:
+    """The fit in which nothing of the instrument is unknown."""
+
+    share: float
+    """χ² left now, over what it leaves."""
+
+    moved: Array
+    """``(4,)`` by how much its registration is another, numeric units."""
+
+
+def rivals(settled: Settled) -> tuple[Rival, ...]:
+    """Return other instruments, the one that explains the matrix best first.
+
+    Each is allowed its own registration, coupling and modulation, to first order about those found;
+    where the matrix cannot tell, it is fitted as well.
+    """
+    few, solution = Few(settled), settled.solution
+    own = few.left(few.matrix(settled.models))
+    found = [
+        Rival(change=change, share=share, moved=moved) for change, share, moved in other_pupils(few)
+    ]
+    for change, other in settled.models.other_instruments.items():
+        share, moved = few.left(few.matrix(other)) / own, np.zeros(4)
+        if change.believed <= share < 1.0 / BETTER:
+            there = refine(other, settled.target, solution.vector, settled.nuisances)
+            moved = there.vector - solution.vector if there.converged else moved
+        found.append(Rival(change=change, share=share, moved=moved))
+    return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
+
+
+def doubt_of_width(settled: Settled) -> Array:
+    """Return how far a width of the influence functions that cannot be fitted moves α, ``(4,)``.
+
+    Those of a table, or of a thin plate, have no coupling. What others would explain is not
+    followed: on the diffractive telescope, whose mirror is of another kind, that was no nearer to
+    the truth. It tells how sure the registration is.
+    """
+    models, solution, target = settled.models, settled.solution, settled.target
+    if Optic.WIDTH in models.optics:
+        return np.zeros(4)
+    modes = spread(target.n_modes)
+    few = target.column_subset(modes)
+    subset = models.model(CHEAP, models.basis.subset(modes))
+    models.counter.n += 1
+    wider = subset.width_derivative(Misregistration.from_vector(solution.vector))
+    known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
+    steps = [
+        few.project(solution.matrix[:, modes], derivatives).best_step[:4]
+        for derivatives in (known, np.concatenate([known, wider[None]]))
+    ]
+    return steps[1] - steps[0]
+
+
+def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple[FoundOptic, ...]:
+    """Return what was found of the instrument; ``models`` are of the one in the file."""
+    nuisances = settled.nuisances
+    changes = nuisances.changes(settled.solution.nuisances)
+    radius = models.instrument.wfs.modulation_lambda_over_d
+    found = []
+    for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
+        told, value = radius, radius * float(np.exp(change))
+        if optic is Optic.WIDTH and models.coupling is not None:
+            told, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
+        known = models.exact(optic)
+        found.append(
+            FoundOptic(
+                optic=optic,
+                change=change,
+                sigma=float(sure.nuisance_sigma[k]),
+                found=value if known else None,
+                told=told if known and optic not in nuisances.unknown else None,
+            )
+        )
+    return tuple(found)
+
+
+def as_told(models: FitModels, settled: Settled) -> AsTold:
+    """Return the fit with the instrument that the file describes: ``models`` are its."""
+    nothing = replace(settled.nuisances, optics=())
+    there = refine(models, settled.target, settled.solution.vector, nothing)
+    return AsTold(
+        share=settled.solution.projection.chi / there.projection.chi,
+        moved=there.vector - settled.solution.vector,
+    )

@@ -1,0 +1,139 @@
+"""The light on the four pupil images, from a file: how even it is, where it lies, how turned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.light_rotation import Arms, LightRotation, find_rotation
+from service.errors import MatrixError
+from service.estimation.light import (
+    CannotTell,
+    PupilPosition,
+    find_pupil,
+    measured_illumination,
+    relative_light,
+)
+from service.files.container import opened
+from service.model.instrument import Instrument
+from service.model.pupil import Illumination
+from service.model.slopes import turned_mask
+
+FLUX = "flux"
+"""Name of the array in its file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Light:
+    """What the light tells."""
+
+    illumination: Illumination
+    """For the model's pupil amplitude."""
+
+    position: PupilPosition
+    turn: LightRotation | CannotTell | None = None
+    """Against the spider's arms at rotation 0, or the light of another day; None: neither is
+    known."""
+
+    @property
+    def note(self) -> str:
+        """What somebody who fits should know of it, one sentence."""
+        (x, y), (sigma_x, sigma_y) = self.position.at, self.position.sigma
+        return (
+            f"the model is lit as the flux map says; by its light alone the pupil images lie at "
+            f"x = {x:.2f} ± {sigma_x:.2f}, y = {y:.2f} ± {sigma_y:.2f} subapertures"
+            f"{self._turn_note}"
+        )
+
+    @property
+    def _turn_note(self) -> str:
+        match self.turn:
+            case None:
+                return ""
+            case CannotTell(reason=reason):
+                return f"; how they are turned it does not tell: {reason}"
+            case LightRotation(rotation_rad=rotation, sigma_rad=sigma):
+                return (
+                    f", turned by {np.rad2deg(rotation):+.1f} ± {np.rad2deg(sigma):.1f} deg "
+                    "against the reference"
+                )
+
+
+def read_light(path: Path, instrument: Instrument, reference: Path | Arms | None = None) -> Light:
+    """Read mean counts ``(4, n, n)``, the images in row-major order of their place on the detector.
+
+    They are in the RTC's own axes, as slopes are, so the instrument must know these. A
+    ``reference``, the counts of another day or the spider's arms at rotation 0, tells by how much
+    the light is turned: any angle against the first, up to half the arms' spacing about the
+    mirror's nominal rotation, if it has one, against the second.
+
+    Raises
+    ------
+    MatrixError
+        If there are no such counts in a file, their axes are not known, or they show no pupil.
+    """
+    counts, position = _read(path, instrument)
+    turn = None
+    if reference is not None:
+        turn = _turn(relative_light(counts, instrument, position), position, instrument, reference)
+    illumination = measured_illumination(counts, instrument, position)
+    return Light(illumination=illumination, position=position, turn=turn)
+
+
+def _turn(
+    light: tuple[NDArray[np.float64], NDArray[np.bool_]],
+    position: PupilPosition,
+    instrument: Instrument,
+    reference: Path | Arms,
+) -> LightRotation | CannotTell:
+    if isinstance(reference, Path):
+        return find_rotation(*light, position, _illumination(reference, instrument))
+    nominal = instrument.start.rotation_rad
+    there = replace(reference, angles_rad=tuple(a + nominal for a in reference.angles_rad))
+    known = instrument.mirror.nominal_rotation_rad is not None
+    within = np.pi / len(there.angles_rad) if known else 2 * np.pi
+    found = find_rotation(*light, position, there, within_rad=within)
+    if isinstance(found, CannotTell):
+        return found
+    return replace(found, rotation_rad=nominal + found.rotation_rad)
+
+
+def _illumination(path: Path, instrument: Instrument) -> Illumination:
+    counts, position = _read(path, instrument)
+    return measured_illumination(counts, instrument, position)
+
+
+def _read(path: Path, instrument: Instrument) -> tuple[NDArray[np.float64], PupilPosition]:
+    """Return counts in the axes of conventions.md, and where they show the pupil."""
+    if instrument.slopes.orientation is None:
+        raise MatrixError(
+            f'{path}: found slopes.orientation = "auto", expected it written down: which way a '
+            "flux map lies it does not show; fit without it once, and copy what was found"
+        )
+    n = instrument.wfs.n_subapertures
+    with opened(path) as container:
+        stored = container.find(FLUX)
+        if stored is None:
+            raise MatrixError(f"{path}: no dataset {FLUX}; it holds {container.listing()}")
+        if stored.shape != (4, n, n):
+            raise MatrixError(f"{stored.where}: found shape {stored.shape}, expected {(4, n, n)}")
+        counts = in_conventions(stored.numbers(), instrument)
+    position = find_pupil(counts, instrument)
+    if isinstance(position, CannotTell):
+        raise MatrixError(f"{path}: {position.reason}")
+    return counts, position
+
+
+def in_conventions(counts: NDArray[Any], instrument: Instrument) -> NDArray[Any]:
+    """Return counts ``(4, n, n)`` in the RTC's axes, in those of conventions.md.
+
+    A flip or a swap moves the images among one another, too.
+    """
+    n = counts.shape[-1]
+    detector = counts.reshape(2, 2, n, n).transpose(0, 2, 1, 3).reshape(2 * n, 2 * n)
+    turned = turned_mask(detector, instrument.slopes.assumed_orientation)
+    return np.ascontiguousarray(turned.reshape(2, n, 2, n).transpose(0, 2, 1, 3)).reshape(4, n, n)

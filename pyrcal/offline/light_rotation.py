@@ -1,0 +1,191 @@
+"""How far the light on the pupil is turned against a reference: a coarse rotation.
+
+Only what is not round tells: the shadows of spider arms, or unevenness of the beam. Whether these
+turn with the mirror is the instrument's business: at an adaptive secondary hung from its arms, they
+do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.estimation.light import CannotTell, PupilPosition
+from service.estimation.solver import vertex
+from service.model.pupil import Illumination
+
+Array = NDArray[np.float64]
+
+_STEP_DEG = 0.5
+_LEAST_CORRELATION = 0.3
+"""Below it the two maps show no common structure. Diffraction leaves narrow arms 0.4; a pupil
+without any reaches 0.2."""
+
+_RIVAL = 0.85
+"""Another rotation whose correlation reaches this share of the best makes the answer ambiguous."""
+
+_APART_DEG = 10.0
+"""A rival is a peak of its own, at least this far away."""
+
+_LARGEST_SIGMA_DEG = 2.0
+_SHADOW_SAMPLES = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LightRotation:
+    """By how much the light is turned against its reference."""
+
+    rotation_rad: float
+    """From sensor +x towards +y."""
+
+    sigma_rad: float
+    """1 σ, from the noise of the map and the sharpness of its structure."""
+
+    correlation: float
+    """Of the map with the turned reference, 0..1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Arms:
+    """Spider arms as they lie when the rotation is 0."""
+
+    angles_rad: tuple[float, ...]
+    """Of each, from +x towards +y, from the centre outwards."""
+
+    width_subap: float
+    """Of each shadow."""
+
+    def light(self, n: int) -> Array:
+        """Return the light they leave, ``(n, n)`` on subapertures about the centre, 0..1."""
+        inside = (np.arange(_SHADOW_SAMPLES) + 0.5) / _SHADOW_SAMPLES - 0.5
+        fine = (np.arange(n)[:, None] - (n - 1) / 2 + inside).reshape(-1)
+        x, y = fine[None, :], fine[:, None]
+        hidden = np.zeros((len(fine), len(fine)))
+        for angle in self.angles_rad:
+            along = x * np.cos(angle) + y * np.sin(angle)
+            across = y * np.cos(angle) - x * np.sin(angle)
+            edge = np.clip((self.width_subap / 2 - np.abs(across)) * _SHADOW_SAMPLES + 0.5, 0, 1)
+            hidden = np.maximum(hidden, np.where(along >= 0.0, edge, 0.0))
+        cells = hidden.reshape(n, _SHADOW_SAMPLES, n, _SHADOW_SAMPLES)
+        return np.asarray(1.0 - cells.mean(axis=(1, 3)))
+
+
+def find_rotation(
+    light: Array,
+    known: NDArray[np.bool_],
+    position: PupilPosition,
+    reference: Illumination | Arms,
+    *,
+    within_rad: float = 2 * np.pi,
+) -> LightRotation | CannotTell:
+    """Return the turn of the light against a reference centred on its own pupil.
+
+    Parameters
+    ----------
+    light, known
+        As from ``relative_light``, on the sensor.
+    position
+        Of the pupil on the sensor.
+    reference
+        The beam's light at rotation 0, measured once, or the arms it has to pass. Smooth
+        unevenness is left out of account beside arms: they say nothing of it.
+    within_rad
+        Largest turn looked for: arms evenly spread are alike after a fraction of a turn.
+
+    Raises
+    ------
+    ModelError
+        If a map is not square.
+    """
+    if light.shape != known.shape or light.ndim != 2 or light.shape[0] != light.shape[1]:
+        raise ModelError(
+            f"rotation: found light {light.shape} and its mask {known.shape}; expected the same "
+            "square map"
+        )
+    # beyond half a turn, so that its end is a rotation like any other
+    limit = min(np.rad2deg(within_rad), 180.0 + _APART_DEG / 2)
+    angles = np.arange(-limit, limit + _STEP_DEG / 2, _STEP_DEG)
+    if isinstance(reference, Arms):
+        template, smooth = reference.light(len(light) + 2), _smooth_shapes(known, 3)
+    else:
+        template, smooth = reference.intensity, _smooth_shapes(known, 0)
+    seen = _without(light[known], smooth)
+    turned = np.array(
+        [
+            _without(_turned(template, known, position, angle), smooth)
+            for angle in np.deg2rad(angles)
+        ]
+    )
+    sizes = np.linalg.norm(turned, axis=1) * np.linalg.norm(seen)
+    if sizes.min() <= 1e-9 * max(float(sizes.max()), 1.0):
+        return CannotTell(reason="the light, or its reference, is even: no rotation shows")
+    correlation = turned @ seen / sizes
+    best = int(np.argmax(correlation))
+    refusal = _refusal(angles, correlation, best)
+    if refusal:
+        return CannotTell(reason=refusal)
+    rotation_deg = angles[best] + _STEP_DEG * vertex(*correlation[best - 1 : best + 2])
+    slope = (turned[best + 1] - turned[best - 1]) / (2 * np.deg2rad(_STEP_DEG))
+    scale = float(turned[best] @ seen / (turned[best] @ turned[best]))
+    left = seen - scale * turned[best]
+    sigma = float(left.std() / (scale * np.linalg.norm(slope)))
+    if np.rad2deg(sigma) > _LARGEST_SIGMA_DEG:
+        return CannotTell(
+            reason=f"the light's structure is too weak: {np.rad2deg(sigma):.1f} deg of "
+            f"uncertainty, expected at most {_LARGEST_SIGMA_DEG:g}; average more frames"
+        )
+    return LightRotation(
+        rotation_rad=float(np.deg2rad(rotation_deg)),
+        sigma_rad=sigma,
+        correlation=float(correlation[best]),
+    )
+
+
+def _refusal(angles: Array, correlation: Array, best: int) -> str:
+    """Return why the best rotation is not to be believed; empty: it is."""
+    highest = float(correlation[best])
+    if highest < _LEAST_CORRELATION:
+        return (
+            f"the light does not resemble its reference at any rotation: correlation "
+            f"{highest:.2f}, expected at least {_LEAST_CORRELATION:g}"
+        )
+    apart = np.abs((angles - angles[best] + 180.0) % 360.0 - 180.0)
+    peak = np.r_[False, np.diff(np.sign(np.diff(correlation))) < 0, False]
+    rivals = np.where(peak & (apart >= _APART_DEG), correlation, -1.0)
+    if rivals.max() > _RIVAL * highest:
+        other = angles[int(np.argmax(rivals))]
+        return (
+            f"ambiguous: rotations of {angles[best]:.0f} and {other:.0f} deg explain the light "
+            "equally well; say within which range it lies"
+        )
+    if best in {0, len(angles) - 1}:
+        return f"the best rotation is the last one tried, {angles[best]:.0f} deg; look further"
+    return ""
+
+
+def _turned(
+    reference: Array, known: NDArray[np.bool_], position: PupilPosition, angle_rad: float
+) -> Array:
+    """Return the reference, turned and moved to ``position``, on the known subapertures."""
+    n, middle = len(known), (len(reference) - 1) / 2
+    rows, columns = np.nonzero(known)
+    x = columns - (n - 1) / 2 - position.at[0]
+    y = rows - (n - 1) / 2 - position.at[1]
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    places = [middle + cosine * y - sine * x, middle + cosine * x + sine * y]
+    return np.asarray(scipy.ndimage.map_coordinates(reference, places, order=1, mode="nearest"))
+
+
+def _smooth_shapes(known: NDArray[np.bool_], order: int) -> Array:
+    """Return polynomials over the known subapertures, orthonormal, ``(n_known, n_shapes)``."""
+    y, x = (2.0 * axis / len(known) - 1.0 for axis in np.nonzero(known))
+    terms = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)]
+    return np.asarray(np.linalg.qr(np.column_stack(terms))[0])
+
+
+def _without(values: Array, shapes: Array) -> Array:
+    return np.asarray(values - shapes @ (shapes.T @ values))

@@ -1,0 +1,436 @@
+"""From a measured interaction matrix to the registration it was measured at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.instrument_checks import (
+    FoundOptic,
+    as_told,
+    doubt_of_width,
+    found_optics,
+    rivals,
+)
+from pyrcal.offline.methods import (
+    Landing,
+    ScanStep,
+    Settled,
+    land,
+    project_on_sensitivities,
+    scan,
+    settle,
+    settle_at,
+)
+from pyrcal.offline.noise import structure
+from pyrcal.offline.pupil_checks import Few, left_by_light
+from pyrcal.offline.remarks import remarks
+from pyrcal.offline.uncertainty import (
+    LOCAL_MAGNIFICATION_FLOOR,
+    MAGNIFICATION_FLOOR,
+    pupil_regions,
+    uncertainty,
+)
+from pyrcal.offline.verdict import Evidence, judged
+from service.errors import ModelError
+from service.estimation.models import FitModels
+from service.estimation.orientation import DOUBTFUL, LEAST_CORRELATION, find_orientation, overruled
+from service.estimation.reference import Reference, Target, checked, target_of
+from service.estimation.solver import nuisances_of
+from service.model.instrument import Instrument
+from service.model.interaction import rtc_valid_subapertures
+from service.model.kinds import Method, Normalisation, SlopeOrder
+from service.model.misregistration import Determination, Misregistration
+from service.model.modes import Basis, modal_basis
+from service.model.pupil import Illumination
+from service.model.pyramid import Mapper
+from service.model.slopes import Orientation, SlopeRecipe
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitOptions:
+    """What may be asked of a fit."""
+
+    method: Method = Method.JOINT
+    """How the registration is found."""
+
+    modes: NDArray[np.intp] | None = None
+    """Basis indices to use; None: all that the reference has."""
+
+    start: Misregistration | None = None
+    """Where to begin; None: a rough rotation from the lowest orders, the rest nominal."""
+
+    orientation: Orientation | None = None
+    """Of the slopes; None: the instrument's, or found when that does not say either."""
+
+    gain_map: bool = False
+    """Whether a smooth gain over the pupil, common to all modes, is unknown too."""
+
+    anamorphosis: bool = False
+    """Whether stretches of the mirror's image along and across 0 and 45 deg are unknown too."""
+
+    illumination: Illumination | None = None
+    """Measured light of the beam, in the axes of conventions.md; None: even."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fit(Determination):
+    """Where the mirror is, how sure that is, and whether to believe it.
+
+    The covariance is of noise, the disagreement of subsets and the model-error floor.
+    """
+
+    gains: NDArray[np.float64]
+    """``(n_used,)`` size of each measured column over the model's, passes accounted for."""
+
+    residual_fraction: float
+    """RMS of what is left over RMS of the measurement, each mode counted alike."""
+
+    residual_map: NDArray[np.float64]
+    """``(n_planes, n, n)`` [x or y, or image; row, column] RMS over modes of what is left, in units
+    of the measurement's own RMS; NaN outside the valid subapertures."""
+
+    residual_by_mode: NDArray[np.float64]
+    """``(n_used,)`` the same fraction for each mode."""
+
+    condition_number: float
+    """Of the synthetic matrix at ``alpha``, modes used."""
+
+    modes: NDArray[np.intp]
+    """``(n_used,)`` basis indices."""
+
+    orientation: Orientation
+    """Of the slopes, given or found."""
+
+    order: SlopeOrder
+    """Order of the components, given or found."""
+
+    subset_scatter: NDArray[np.float64]
+    """``(4,)`` 1 σ scatter of disjoint sets of modes, units of ``alpha.vector``."""
+
+    accepted: bool
+    """Whether this is the registration, as far as the data tell."""
+
+    converged: bool
+    """Whether the steps came to rest."""
+
+    verdict: str
+    """One line: accepted and how well, or refused, why and what to do."""
+
+    left_out: tuple[str, ...]
+    """Columns and slopes that were not used, one sentence for each kind."""
+
+    remarks: tuple[str, ...]
+    """What should be known beside the verdict, one sentence each."""
+
+    n_evaluations: int
+    """Interaction matrices computed on the way, those for derivatives included."""
+
+    synthetic: NDArray[Any]
+    """``(n_slopes, n_used)`` the model at ``alpha``, gains not applied, conventions' axes."""
+
+    measured: NDArray[Any]
+    """``(n_slopes, n_used)`` the reference in the same axes and unit (passes divided out)."""
+
+    valid: NDArray[np.bool_]
+    """``(n, n)`` [y, x] mask that lists both, in conventions' axes."""
+
+    gain_map: NDArray[np.float64] | None = None
+    """``(n, n)`` gain over the pupil common to all modes, mean 1; None: not asked for."""
+
+    anamorphosis: NDArray[np.float64] | None = None
+    """``(2,)`` half the stretch along x over that along y, and along 45 deg over 135 deg."""
+
+    optics: tuple[FoundOptic, ...] = ()
+    """What of the instrument was fitted, too: coupling or width, modulation."""
+
+    paper_table: tuple[ScanStep, ...] | None = None
+    """The scans, in their order; None for the other methods."""
+
+
+def fit_matrix(
+    instrument: Instrument,
+    reference: Reference,
+    options: FitOptions | None = None,
+    *,
+    basis: Basis | None = None,
+    mapper: Mapper = map,
+    progress: Progress | None = None,
+) -> Fit:
+    """Return the registration at which this matrix was measured, and whether to believe it.
+
+    Parameters
+    ----------
+    instrument
+        Whose matrix it is.
+    reference
+        The matrix as it was measured.
+    options
+        What is asked of the fit.
+    basis
+        The instrument's modes, when they are at hand; None: made here, which takes seconds.
+    mapper
+        Like ``map``; an executor's spreads the work over threads.
+    progress
+        Told in a few words what begins.
+
+    Raises
+    ------
+    MatrixError
+        If the matrix is another instrument's, transposed, in another unit or empty.
+    ModelError
+        If a mode that is to be used was not measured, or the instrument cannot be modelled.
+    """
+    options = options or FitOptions()
+    tell = progress or (lambda _: None)
+    try:
+        return _fitted(instrument, reference, options, basis, mapper, tell)
+    except np.linalg.LinAlgError as error:
+        raise ModelError(
+            f"{instrument.name}: found modes that tell nothing of a registration ({error}); "
+            "expected actuators or tables in metres over the pupil that the sensor sees"
+        ) from error
+
+
+def _fitted(
+    instrument: Instrument,
+    reference: Reference,
+    options: FitOptions,
+    basis: Basis | None,
+    mapper: Mapper,
+    tell: Progress,
+) -> Fit:
+    if basis is None:
+        tell("modes")
+        basis = modal_basis(instrument)
+    usable = checked(
+        _selected(reference, options.modes),
+        n_slopes=instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum()),
+        n_modes=basis.n_modes,
+        wavelength_m=instrument.wfs.wavelength_m,
+        stroke_known=_stroke_known(instrument),
+    )
+    used = basis.subset(usable.columns)
+    tell("orientation")
+    instrument = _masked(instrument)
+    told = replace(
+        instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
+    )
+    slopes, rotation_rad, untold = _axes(instrument, usable, used, options, mapper)
+    instrument = replace(instrument, slopes=slopes)
+    target = target_of(usable, instrument)
+    models = FitModels(
+        instrument=instrument, basis=used, illumination=options.illumination, mapper=mapper
+    )
+    tell("fit")
+    if options.start is not None:
+        start = options.start.vector
+    else:
+        start = instrument.start.vector
+        start[2] = rotation_rad if rotation_rad is not None else start[2]
+    found = _found(models, target, start, options)
+    tell("verdict")
+    return _answer(models, found, usable, untold, told)
+
+
+def _stroke_known(instrument: Instrument) -> bool:
+    """Return whether the size of a column means anything: a wavelength scales them all."""
+    return instrument.mirror.stroke_known and "wfs.wavelength_m" not in instrument.unknown
+
+
+def _masked(instrument: Instrument) -> Instrument:
+    """Return the instrument with its mask worked out: every model of the fit asks for it."""
+    mask = rtc_valid_subapertures(instrument)
+    return replace(instrument, wfs=replace(instrument.wfs, valid_subapertures=mask))
+
+
+def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference:
+    """Return only the columns of these modes.
+
+    Raises
+    ------
+    ModelError
+        If one of them was not measured.
+    """
+    if modes is None:
+        return reference
+    place = {int(mode): column for column, mode in enumerate(reference.columns)}
+    missing = [int(mode) for mode in modes if int(mode) not in place]
+    if missing:
+        raise ModelError(
+            f"modes: {missing[0]} is asked for and was not measured; expected some of the "
+            f"{len(place)} that were ({min(place)} to {max(place)})"
+        )
+    columns = np.array([place[int(mode)] for mode in modes], dtype=np.intp)
+    return replace(
+        reference,
+        matrix=reference.matrix[:, columns],
+        modes=reference.columns[columns],
+        noise=None if reference.noise is None else reference.noise[columns],
+    )
+
+
+def _axes(
+    instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
+) -> tuple[SlopeRecipe, float | None, str]:
+    """Return how slopes are listed, as stated or found, the rotation found, why it is not sure.
+
+    The search also tells the rotation, so it is spared only when a start is given too.
+    """
+    stated = options.orientation or instrument.slopes.orientation
+    slopes = replace(instrument.slopes, orientation=stated)
+    if stated is not None and options.start is not None:
+        return slopes, None, ""
+    search = find_orientation(replace(instrument, slopes=slopes), usable, basis, mapper=mapper)
+    best = search.best
+    sure = best.correlation >= LEAST_CORRELATION
+    rotation_rad = best.rotation_rad if sure else None
+    if stated is None:
+        return best.slopes, rotation_rad, search.refusal
+    if best.correlation >= DOUBTFUL:
+        return best.slopes, rotation_rad, ""
+    free = replace(instrument, slopes=replace(slopes, orientation=None))
+    other = find_orientation(free, usable, basis, mapper=mapper).best
+    return best.slopes, rotation_rad, overruled(best, other)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    """What one of the methods came to."""
+
+    settled: Settled
+    landing: Landing | None = None
+    table: tuple[ScanStep, ...] | None = None
+
+
+def _found(models: FitModels, target: Target, start: Array, options: FitOptions) -> _Found:
+    nuisances = nuisances_of(
+        target.valid,
+        models.instrument.slopes.kind,
+        gain_map=options.gain_map,
+        anamorphosis=options.anamorphosis,
+        optics=models.optics,
+        unknown=models.unknown,
+    )
+    match options.method:
+        case Method.JOINT:
+            landing = land(models, target, start)
+            settled = settle(models, target, landing.best.vector, nuisances)
+            return _Found(settled=settled, landing=landing)
+        case Method.SENSITIVITY:
+            return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
+        case Method.PAPER:
+            vector, table = scan(models, target, start)
+            return _Found(settled=settle_at(models, target, vector, nuisances), table=table)
+
+
+def _answer(
+    as_in_file: FitModels, found: _Found, usable: Reference, untold: str, told: SlopeRecipe
+) -> Fit:
+    settled = found.settled
+    solution, target, models = settled.solution, settled.target, settled.models
+    nuisances, slopes = settled.nuisances, models.instrument.slopes
+    seen = solution.projection
+    values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
+    regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
+    residual_fraction = settled.share
+    others = rivals(settled)
+    power = np.sum(target.matrix[target.rows] ** 2, axis=0)
+    noise = None if usable.noise is None else usable.noise / usable.passes
+    structured = structure(seen.residual, power, noise)
+    by_light = residual_fraction**2 * (1.0 - left_by_light(Few(settled)))
+    sure = uncertainty(
+        seen,
+        values,
+        nuisances.prior,
+        regions,
+        shift_subap=float(np.hypot(*solution.vector[:2])),
+        radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
+        magnification_floor=LOCAL_MAGNIFICATION_FLOOR
+        if slopes.normalisation is Normalisation.LOCAL
+        else MAGNIFICATION_FLOOR,
+        residual_fraction=residual_fraction,
+        doubt=np.array([doubt_of_width(settled), *(rival.moved for rival in others)]),
+    )
+    optics = found_optics(as_in_file, settled, sure)
+    evidence = Evidence(
+        solution=solution,
+        residual_fraction=residual_fraction,
+        structure=structured,
+        after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
+        uncertainty=sure,
+        landing=found.landing,
+        rivals=others,
+        optics=optics,
+        as_told=as_told(as_in_file, settled) if any(one.notable for one in optics) else None,
+        axes=untold,
+        passes=usable.passes,
+        stroke_known=_stroke_known(models.instrument),
+    )
+    accepted, verdict = judged(evidence)
+    return Fit(
+        alpha=Misregistration.from_vector(solution.vector),
+        covariance=sure.covariance,
+        gains=seen.gains,
+        residual_fraction=residual_fraction,
+        residual_map=_residual_map(found),
+        residual_by_mode=settled.by_mode,
+        condition_number=_condition_number(solution.matrix),
+        modes=target.modes,
+        orientation=slopes.assumed_orientation,
+        order=slopes.order,
+        subset_scatter=sure.subset_scatter,
+        accepted=accepted,
+        converged=solution.converged,
+        verdict=verdict,
+        remarks=remarks(
+            evidence,
+            target,
+            told=told,
+            found=slopes,
+            about=models.instrument,
+        ),
+        left_out=usable.left_out + _rows_left_out(target),
+        n_evaluations=models.counter.n,
+        synthetic=solution.matrix,
+        measured=target.matrix,
+        valid=target.valid,
+        gain_map=nuisances.gain_map(solution.nuisances, target.valid),
+        anamorphosis=nuisances.stretches(solution.nuisances),
+        optics=optics,
+        paper_table=found.table,
+    )
+
+
+def _rows_left_out(target: Target) -> tuple[str, ...]:
+    n = int(np.sum(~target.rows))
+    if not n:
+        return ()
+    return (f"{n} of {len(target.rows)} slopes: silent, or seen against unknown surface",)
+
+
+def _residual_map(found: _Found) -> Array:
+    """Return the RMS residual of every slope over the RMS of all, modes counted alike."""
+    target, seen = found.settled.target, found.settled.solution.projection
+    scale = np.sqrt(target.weights)
+    typical = np.sqrt(np.mean((target.matrix[target.rows] * scale) ** 2))
+    by_slope = np.full(len(target.rows), np.nan)
+    by_slope[target.rows] = np.sqrt(np.mean((seen.residual * scale) ** 2, axis=1)) / typical
+    planes = by_slope.reshape(-1, int(target.valid.sum()))
+    maps = np.full((len(planes), *target.valid.shape), np.nan)
+    maps[:, target.valid] = planes
+    return maps
+
+
+def _condition_number(matrix: NDArray[np.float32]) -> float:
+    """Return the ratio of the extreme singular values, from the Gram matrix: ample below 1e6."""
+    columns = matrix.astype(np.float64)
+    power = np.linalg.eigvalsh(columns.T @ columns)
+    return float(np.sqrt(power[-1] / power[0])) if power[0] > 0.0 else float("inf")

@@ -1,0 +1,347 @@
+"""Three ways from a start to the registration that explains a matrix.
+
+**joint**: all four parameters together (:mod:`service.estimation.solver`), from one start or
+from many.
+
+**sensitivity**: as the Adaptive Optics Facility does it, the measured matrix less the synthetic one
+is projected on the derivatives of the synthetic one. It is first order, so it is repeated about
+each answer.
+
+**paper**: rotation, shift along x, shift along y and magnification are scanned in turn, the others
+held; the lowest point of a parabola through χ² is kept, and the next round takes smaller steps. χ²
+is the sum over modes of the squared difference of measured and synthetic slopes, each mode with a
+gain of its own and unit weight, the first modes left out: vibrations and the edge of the pupil
+spoil them. The order of the parameters and the parabolas are the paper's. Its step sizes are not
+reproduced from its table; those here shrink by five from a fifth of the capture range to what noise
+allows.
+
+References
+----------
+Heritier et al. 2018, MNRAS 481, 2829, section 4 and Table 1 (the scans); Kolb et al. 2012, Proc.
+SPIE 8447 (identification by sensitivity matrices at the VLT's AOF).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.models import FitModels, Optic
+from service.estimation.reference import Target
+from service.estimation.solver import (
+    LIMIT,
+    LONGEST_OPTIC_STEP,
+    SETTLED,
+    Approach,
+    Columns,
+    Nuisances,
+    Solution,
+    approach,
+    refine,
+    vertex,
+    within_limits,
+)
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+
+Array = NDArray[np.float64]
+
+GOOD = 0.10
+"""Share of χ² that even uneven light and another mirror leave to the smooth shapes; a false
+minimum leaves several times as much."""
+
+SAME = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
+"""Minima nearer than this are one (numeric units)."""
+
+NEARLY_AS_GOOD = 1.3
+"""A minimum with less than this times the least misfit is a rival."""
+
+MOST_REPEATS = 6
+LINEAR = 0.01
+"""A logarithm of the instrument's that differs by less is as good as linear."""
+
+REACH = 20.0
+"""Derivatives within so many settling lengths of where they were taken are as good as new."""
+
+ORDER = (2, 0, 1, 3)
+"""Indices of the parameters in the order they are scanned."""
+
+ROUNDS = (
+    np.array([0.5, 0.5, 2.0, 0.02]),
+    np.array([0.1, 0.1, 0.4, 0.004]),
+    np.array([0.02, 0.02, 0.08, 0.0008]),
+)
+"""Step of each parameter in each round, boundary units."""
+
+HALF_WIDTH = 2
+"""Samples on either side of where a scan begins."""
+
+MOST_EXTENSIONS = 2
+"""Times that a scan moves on when its lowest sample is its last."""
+
+N_LEFT_OUT = 10
+"""First modes that have no part in χ², where there are enough others."""
+
+MOST_MODES = 60
+"""Modes, spread over those fitted, that are compared where a few will do."""
+
+MODULATIONS = np.arange(-4, 5) * 0.3
+"""Logarithms of the factors that a modulation is looked for at, from a third to three."""
+
+STRANGE = 0.05
+"""RMS share of the signal left over beyond which the modulation is looked for from afar, ..."""
+
+FAR_OFF = 0.03
+"""... as it is where its logarithm seems off by this."""
+
+_SHIFTS = (-1.3, 1.3)
+_TURNS_RAD = np.deg2rad([-6.0, 6.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanStep:
+    """One line of the paper's Table 1: one parameter scanned, the others held."""
+
+    parameter: str
+    """Name at the boundary, as in ``PARAMETERS``."""
+
+    step: float
+    """Distance of two samples, in boundary units (subaperture, degree, ratio)."""
+
+    samples: NDArray[np.float64]
+    """``(n_samples,)`` values tried, in boundary units."""
+
+    chi: NDArray[np.float64]
+    """``(n_samples,)`` χ² at each."""
+
+    minimum: float
+    """Lowest point of the parabola, in boundary units: where the next line begins."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landing:
+    """Where the starts led."""
+
+    best: Approach
+    rivals: tuple[Approach, ...]
+    """Other minima nearly as good."""
+
+
+def land(models: FitModels, target: Target, start: Array) -> Landing:
+    """Return where a start leads; if that explains little, where the best of many leads."""
+    matrix = models.low_order.measured(target.matrix)
+    low = Columns(
+        matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
+    )
+    found: list[Approach] = []
+    for tried in (start, *_other_starts(start)):
+        found.append(approach(models.far, low, tried))
+        models.counter.n += found[-1].n_matrices
+        if found[-1].converged and found[-1].misfit < GOOD:
+            break
+    best = min(found, key=lambda one: (not one.converged, one.misfit))
+    rivals = [
+        one
+        for one in found
+        if one.converged
+        and one.misfit < NEARLY_AS_GOOD * best.misfit
+        and np.any(np.abs(one.vector - best.vector) > SAME)
+    ]
+    return Landing(best=best, rivals=tuple(rivals))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Settled:
+    """Where the fine grid came to rest, and with which models."""
+
+    solution: Solution
+    target: Target
+    """Without the slopes of unknown surface."""
+
+    models: FitModels
+    """Of the instrument that was found; its basis may have another coupling."""
+
+    nuisances: Nuisances
+    """About these models."""
+
+    @property
+    def by_mode(self) -> Array:
+        """``(n_modes,)`` RMS of what is left over, over the RMS of the measurement."""
+        left = np.sum(self.solution.projection.residual**2, axis=0)
+        power = np.sum(self.target.matrix[self.target.rows] ** 2, axis=0)
+        return np.asarray(np.sqrt(left / power))
+
+    @property
+    def share(self) -> float:
+        """RMS of what is left over, each mode counted alike."""
+        return float(np.sqrt(np.mean(self.by_mode**2)))
+
+
+def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances) -> Settled:
+    """Return the minimum on the fine grid.
+
+    What is found of the instrument is linear only close by, so the fit is done again about it. A
+    table of modes ends somewhere, and where depends on the registration: the slopes near its edge
+    are left out, and the fit is done again if that changed anything.
+    """
+    seen = _known(models, target, start)
+    solution = refine(models, seen, start, nuisances)
+    settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+    models, nuisances = _with_nearest_modulation(settled)
+    for _ in range(MOST_REPEATS):
+        if models is settled.models:
+            models, nuisances = _adjusted(settled)
+        there = _known(models, target, settled.solution.vector)
+        if models is settled.models and np.array_equal(there.rows, settled.target.rows):
+            break
+        solution = refine(models, there, settled.solution.vector, nuisances)
+        settled = Settled(solution=solution, target=there, models=models, nuisances=nuisances)
+    return settled
+
+
+def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models of the modulation that explains the matrix best, where it seems far off.
+
+    Steps lead slowly there: gains hide much of what a modulation does. So a few modes are looked at
+    on the cheap grid; each modulation is allowed its own registration, to first order.
+    """
+    models, nuisances, solution = settled.models, settled.nuisances, settled.solution
+    places = [k for k, (o, _) in enumerate(nuisances.optics) if o is Optic.MODULATION]
+    if not places:
+        return models, nuisances
+    step = solution.nuisances[nuisances.first_optic + places[0]]
+    unknown = Optic.MODULATION in nuisances.unknown
+    if settled.share < STRANGE and abs(step) < FAR_OFF and not unknown:
+        return models, nuisances
+    modes = spread(settled.target.n_modes)
+    few = settled.target.column_subset(modes)
+    subset = replace(models, basis=models.basis.subset(modes))
+    here = Misregistration.from_vector(solution.vector)
+    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
+
+    def left(change: float) -> float:
+        models.counter.n += 1
+        changed = subset.adjusted(Optic.MODULATION, change) if change else subset
+        return few.project(changed.cheap.interaction_matrix(here), every).chi_at_best
+
+    found = [left(change) for change in MODULATIONS]
+    best = int(np.argmin(found))
+    change = MODULATIONS[best]
+    if 0 < best < len(found) - 1:
+        change += vertex(*found[best - 1 : best + 2]) * (MODULATIONS[1] - MODULATIONS[0])
+    if abs(change) < LINEAR:
+        return models, nuisances
+    optics = [
+        (optic, offset + change * (optic is Optic.MODULATION)) for optic, offset in nuisances.optics
+    ]
+    moved = models.adjusted(Optic.MODULATION, float(change))
+    return moved, replace(nuisances, optics=tuple(optics))
+
+
+def spread(n_modes: int) -> NDArray[np.intp]:
+    """Return the columns that are compared where a few will do, spread over all."""
+    return np.unique(np.linspace(0, n_modes - 1, min(MOST_MODES, n_modes)).astype(np.intp))
+
+
+def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models of the instrument that was found, and the unknowns about it."""
+    models, nuisances = settled.models, settled.nuisances
+    optics = []
+    for k, (optic, offset) in enumerate(nuisances.optics, nuisances.first_optic):
+        change = float(settled.solution.nuisances[k])
+        if abs(change) > LINEAR and models.exact(optic):
+            change = float(np.clip(change, -LONGEST_OPTIC_STEP, LONGEST_OPTIC_STEP))
+            models, offset = models.adjusted(optic, change), offset + change
+        optics.append((optic, offset))
+    return models, replace(nuisances, optics=tuple(optics))
+
+
+def settle_at(models: FitModels, target: Target, vector: Array, nuisances: Nuisances) -> Settled:
+    """Return the model as it stands at a registration that another method has found."""
+    seen = _known(models, target, vector)
+    there = refine(models, seen, vector, nuisances, most_steps=0)
+    solution = replace(there, converged=within_limits(vector))
+    return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+
+
+def project_on_sensitivities(
+    models: FitModels, target: Target, start: Array, nuisances: Nuisances
+) -> Settled:
+    """Return where the sensitivities lead from a start, without any search for a better one."""
+    for _ in range(MOST_REPEATS):
+        settled = settle(models, target, start, nuisances)
+        vector = settled.solution.vector
+        if not settled.solution.converged or np.all(np.abs(vector - start) < REACH * SETTLED):
+            break
+        start = vector
+    return settled
+
+
+def scan(models: FitModels, target: Target, start: Array) -> tuple[Array, tuple[ScanStep, ...]]:
+    """Return where the scans lead from a start, and each of them.
+
+    ``start`` is ``(4,)`` in numeric units.
+    """
+    first = N_LEFT_OUT if target.n_modes >= 3 * N_LEFT_OUT else 0
+    columns = np.arange(first, target.n_modes)
+    model = models.model(2, models.basis.subset(columns))
+    target = target.column_subset(columns)
+    values = start * BOUNDARY_SCALE
+    table = []
+
+    def chi(tried: Array) -> float:
+        return target.misfit(models.matrix(model, tried / BOUNDARY_SCALE))
+
+    for steps in ROUNDS:
+        for index in ORDER:
+            for _ in range(1 + MOST_EXTENSIONS):
+                step = _scanned(chi, values, index, float(steps[index]))
+                table.append(step)
+                values[index] = step.minimum
+                if step.samples[0] < step.minimum < step.samples[-1]:
+                    break
+    return values / BOUNDARY_SCALE, tuple(table)
+
+
+def _known(models: FitModels, target: Target, vector: Array) -> Target:
+    """Return the target without slopes that see surface a table of modes does not know."""
+    return target.without(models.fine.unknown_rows(Misregistration.from_vector(vector)))
+
+
+def _other_starts(start: Array) -> list[Array]:
+    """Return starts about one that led nowhere: corners of the range, and turns."""
+    corners = [np.array([x, y, 0.0, 0.0]) for x, y in product(_SHIFTS, _SHIFTS)]
+    turns = [np.array([0.0, 0.0, turn, 0.0]) for turn in _TURNS_RAD]
+    nominal = np.array([0.0, 0.0, start[2], 1.0])
+    return [nominal, *(nominal + step for step in [*turns, *corners])]
+
+
+def _scanned(chi: Callable[[Array], float], values: Array, index: int, step: float) -> ScanStep:
+    samples = values[index] + step * np.arange(-HALF_WIDTH, HALF_WIDTH + 1)
+    if index == 3:
+        samples = np.clip(samples, 1.0 - LIMIT[index], 1.0 + LIMIT[index])
+    tried = np.tile(values, (len(samples), 1))
+    tried[:, index] = samples
+    found = np.array([chi(one) for one in tried])
+    return ScanStep(
+        parameter=PARAMETERS[index],
+        step=step,
+        samples=samples,
+        chi=found,
+        minimum=_lowest(samples, found),
+    )
+
+
+def _lowest(samples: Array, chi: Array) -> float:
+    """Return the lowest point of the parabola through the lowest sample and its neighbours.
+
+    At the end of a scan the sample itself.
+    """
+    best = int(np.argmin(chi))
+    if best in {0, len(samples) - 1}:
+        return float(samples[best])
+    step = samples[best + 1] - samples[best]
+    return float(samples[best] + step * vertex(*chi[best - 1 : best + 2]))

@@ -1,0 +1,149 @@
+"""What a matrix says of the pupil that its instrument file describes: its obscuration, its size.
+
+Neither is fitted beside the registration: a pupil that is told wrong shows at its edges only, and
+there uneven light looks alike. What would explain the matrix far better is named instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.methods import Settled, spread
+from service.estimation.models import BETTER, CHEAP, FAR_BETTER, FitModels, Other
+from service.estimation.solver import nuisances_of
+from service.model.instrument import Instrument
+from service.model.misregistration import Misregistration
+
+Array = NDArray[np.float64]
+
+LEAST_EXPLAINED = 0.03
+"""RMS share of the signal below which what a pupil explains may be the model's own error."""
+
+_STEPS = 2
+"""Towards the value that explains most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PupilNumber:
+    """A number of the instrument file that says what the pupil is."""
+
+    key: str
+    """In the file."""
+
+    told: float
+    """What the file says."""
+
+    power: int
+    """Light goes with this power of it: the step of an area is straight."""
+
+    step: float
+    """Of that power, for the difference that stands for a derivative."""
+
+    range: tuple[float, float]
+    """No file is wrong by more."""
+
+    notable: float
+    """Less is not worth a word: simulators round their pupils to whole points."""
+
+    def changed(self, about: Instrument, light: float) -> Instrument:
+        """Return the instrument with another value, given by its power."""
+        value = light ** (1.0 / self.power)
+        if self.key == "obscuration_ratio":
+            return replace(about, obscuration_ratio=value)
+        return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
+
+    def found(self, few: Few) -> tuple[float, Array]:
+        """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
+        light, matrix = self.told**self.power, few.matrix(few.models)
+        low, high = (limit**self.power for limit in self.range)
+        for _ in range(_STEPS):
+            there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
+            light += float(few.step(matrix, (there - matrix) / self.step)[-1])
+            light = float(np.clip(light, low, high))
+            matrix = few.matrix(few.of(self.changed(few.models.instrument, light)))
+        return light ** (1.0 / self.power), matrix
+
+
+def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
+    size, hole = about.wfs.pupil_diameter, about.obscuration_ratio
+    return (
+        PupilNumber(
+            key="obscuration_ratio",
+            told=hole,
+            power=2,
+            step=0.01,
+            range=(0.0, max(0.6, hole)),
+            notable=0.03,
+        ),
+        PupilNumber(
+            key="pupil_diameter_subap",
+            told=size,
+            power=1,
+            step=0.01 * size,
+            range=(0.94 * size, 1.06 * size),
+            notable=0.01 * size,
+        ),
+    )
+
+
+class Few:
+    """Some of the modes of a fit at its solution, on the cheap grid."""
+
+    def __init__(self, settled: Settled) -> None:
+        solution, self.models = settled.solution, settled.models
+        self.residual_fraction = settled.share
+        self.modes = spread(settled.target.n_modes)
+        self.target = settled.target.column_subset(self.modes)
+        self.here = Misregistration.from_vector(solution.vector)
+        known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
+        self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
+        """Of the instrument as it is: they hardly depend on the hypothesis."""
+
+    def of(self, about: Instrument) -> FitModels:
+        """Return the models of another instrument with the same modes."""
+        return replace(self.models, instrument=about)
+
+    def matrix(self, tried: FitModels) -> Array:
+        """Return D of an instrument, ``(n_slopes, n_few)``."""
+        self.models.counter.n += 1
+        model = tried.model(CHEAP, tried.basis.subset(self.modes))
+        return np.asarray(model.interaction_matrix(self.here), dtype=np.float64)
+
+    def left(self, matrix: Array, *more: Array) -> float:
+        """Return χ² at the best unknowns, those given by a derivative included."""
+        return float(self.target.project(matrix, self._with(more)).chi_at_best)
+
+    def step(self, matrix: Array, *more: Array) -> Array:
+        """Return the best step of all of them."""
+        return self.target.project(matrix, self._with(more)).best_step
+
+    def _with(self, more: tuple[Array, ...]) -> Array:
+        return np.concatenate([self.derivatives, np.array(more)]) if more else self.derivatives
+
+
+def other_pupils(few: Few) -> Iterator[tuple[Other, float, Array]]:
+    """Yield pupils that explain the matrix better.
+
+    Each with what to write into the file, χ² that is left over what the file's leaves, and by how
+    much α would be another ``(4,)``.
+    """
+    own = few.matrix(few.models)
+    for number in _numbers(few.models.instrument):
+        value, matrix = number.found(few)
+        share = few.left(matrix) / few.left(own)
+        explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
+        notable = abs(value - number.told) >= number.notable and explained >= LEAST_EXPLAINED
+        if notable and share < BETTER:
+            other = Other(words=f"{number.key} = {value:.3g}", believed=FAR_BETTER)
+            yield other, share, few.step(matrix)[:4] - few.step(own)[:4]
+
+
+def left_by_light(few: Few) -> float:
+    """Return χ² that a smooth gain over the pupil, common to all modes, leaves, over what is."""
+    kind, own = few.models.instrument.slopes.kind, few.matrix(few.models)
+    maps = nuisances_of(few.target.valid, kind, gain_map=True).maps
+    return few.left(own, *(pattern[:, None] * own for pattern in maps)) / few.left(own)

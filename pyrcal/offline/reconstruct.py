@@ -1,0 +1,200 @@
+"""``pyrcal reconstruct``: from a registration to a reconstructor that says what it is made of."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pyrcal.offline.instrument_checks import FITTED_KEYS
+from pyrcal.offline.light import read_light
+from pyrcal.offline.report import (
+    KnownFit,
+    Provenance,
+    fill_reconstructor,
+    orientation_words,
+    read_fit,
+)
+from pyrcal.terminal import show_progress
+from service.archive.store import write_whole
+from service.config import load_instrument
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
+from service.errors import ConfigurationError, MatrixError, say
+from service.files import parse_alpha
+from service.files.container import file_sha256
+from service.model.instrument import Instrument, instrument_sha256
+from service.model.interaction import RtcInteractionModel
+from service.model.modes import Basis, Gaussian, ModalBasis, modal_basis
+
+COUPLING_KEY, MODULATION_KEY = FITTED_KEYS
+
+SAMPLING = 4
+"""Pupil points per subaperture, and detector nodes: the finest of the design's table that takes
+seconds; D is then good to 0.5 %."""
+
+
+def main(options: argparse.Namespace) -> int:
+    """Compute, write, and return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used.
+    """
+    if options.max_condition < 1.0:
+        raise ConfigurationError(
+            f"--max-condition: found {options.max_condition:g}, expected at least 1"
+        )
+    known = _known(options)
+    described = load_instrument(options.instrument)
+    found = instrument_sha256(described)
+    if known.instrument_sha256 not in {None, found}:
+        say(f"note: {options.instrument} has changed since {known.origin} was fitted with it")
+    instrument = _modulated(_oriented(described, known), known)
+    light = None if options.flux_map is None else read_light(options.flux_map, instrument)
+    with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        model = RtcInteractionModel(
+            instrument,
+            _basis(instrument, known),
+            pupil_sampling=SAMPLING,
+            detector_nodes=SAMPLING,
+            illumination=None if light is None else light.illumination,
+            mapper=pool.map,
+        )
+        show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
+        matrix = model.interaction_matrix(known.alpha)
+    provenance, inverted = _inverted(options, known, model, matrix)
+    inversion, slopes = provenance.inversion, instrument.slopes
+    fill = partial(
+        fill_reconstructor,
+        interaction_matrix=inverted[:, : options.modes],
+        provenance=provenance,
+        circumstances={
+            "instrument": instrument.name,
+            "instrument_sha256": found,
+            "alpha_from": known.origin,
+            **{f"found_{key}": value for key, value in known.instrument_found.items()},
+            "model_pupil_sampling": SAMPLING,
+            "model_detector_nodes": SAMPLING,
+            "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
+        },
+    )
+    write_whole(options.output, fill)
+    print(
+        f"{options.output}: {options.modes} modes, {model.n_slopes} slopes, {options.method}, "
+        f"condition number {inversion.condition_number:.2f}, {inversion.n_truncated} singular "
+        "values left out"
+    )
+    return 0
+
+
+def _known(options: argparse.Namespace) -> KnownFit:
+    """Return the registration, from the words or from the file.
+
+    Raises
+    ------
+    MatrixError
+        If the file is of a refused fit, or its reference another one.
+    """
+    path = Path(options.alpha)
+    if path.is_file():
+        known = read_fit(path)
+        if not known.accepted:
+            raise MatrixError(
+                f"{path}: found a fit that was refused, expected an accepted one; whoever knows "
+                "better gives the registration itself: X,Y,ROT,MAG"
+            )
+    else:
+        known = KnownFit(alpha=parse_alpha(options.alpha))
+    if options.reference is not None:
+        found = file_sha256(options.reference)
+        if known.reference_sha256 not in {None, found}:
+            raise MatrixError(
+                f"{options.reference}: found checksum {found}, expected {known.reference_sha256} "
+                f"of the reference that {path} was fitted to"
+            )
+        known = replace(known, reference_sha256=found)
+    return known
+
+
+def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
+    """Return the instrument with the slopes as the fit found them."""
+    recipe = instrument.slopes
+    if known.orientation is not None and known.order is not None:
+        if known.order.kind is not recipe.kind:
+            raise MatrixError(
+                f'{known.origin}: found a fit of slopes.kind = "{known.order.kind}"; expected '
+                f'"{recipe.kind}", as the instrument file says'
+            )
+        recipe = replace(recipe, orientation=known.orientation, order=known.order)
+    elif recipe.orientation is None:
+        say(
+            'note: slopes.orientation is "auto" and no fit has found it: the reconstructor is for '
+            "slopes in the axes of docs/integrate/fitting.md"
+        )
+    return replace(instrument, slopes=recipe)
+
+
+def _modulated(instrument: Instrument, known: KnownFit) -> Instrument:
+    """Return the instrument with the modulation that the fit found; say what is as it found it."""
+    for key, value in known.instrument_found.items():
+        say(f"note: made with {key} = {value:.3g}, as {known.origin} found; correct the instrument")
+    radius = known.instrument_found.get(MODULATION_KEY)
+    if radius is None:
+        return instrument
+    return replace(instrument, wfs=replace(instrument.wfs, modulation_lambda_over_d=radius))
+
+
+def _basis(instrument: Instrument, known: KnownFit) -> Basis:
+    """Return the modes of the instrument, its actuators coupled as the fit found."""
+    basis, coupling = modal_basis(instrument), known.instrument_found.get(COUPLING_KEY)
+    if coupling is None or not isinstance(basis, ModalBasis):
+        return basis
+    if not isinstance(basis.surface, Gaussian):
+        return basis
+    return basis.of_surface(replace(basis.surface, coupling=coupling))
+
+
+def _inverted(
+    options: argparse.Namespace, known: KnownFit, model: RtcInteractionModel, matrix: NDArray[Any]
+) -> tuple[Provenance, NDArray[Any]]:
+    """Return the reconstructor with how it was made, and the matrix that it inverts."""
+    gains = None
+    if known.gains is not None and known.modes is not None and not options.no_gains:
+        gains = CalibrationGains.of_modes(known.gains, known.modes, model.basis.n_modes)
+        matrix = gains.tuned(matrix)
+    recipe = _recipe(options, model)
+    provenance = Provenance(
+        recipe=recipe,
+        inversion=reconstruct(matrix, recipe),
+        fit=known,
+        gains=gains,
+        measured_illumination=options.flux_map is not None,
+    )
+    return provenance, matrix
+
+
+def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
+    prior = None
+    if options.method == InversionMethod.MAP:
+        prior = Prior(
+            variance_m2=model.basis.variance_m2,
+            slope_noise=np.full(
+                model.n_slopes, options.slope_noise * model.instrument.slopes.kind.noise
+            ),
+        )
+    return Recipe(
+        n_modes=options.modes,
+        max_condition=options.max_condition,
+        prior=prior,
+    )

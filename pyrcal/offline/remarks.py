@@ -1,0 +1,205 @@
+"""What should be known beside the verdict on a fit: what was overruled, and what looks odd."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.verdict import MOST_STRUCTURE, Evidence, factor_of_passes
+from service.estimation.reference import Target
+from service.estimation.solver import Solution
+from service.model.instrument import Instrument
+from service.model.kinds import SlopeOrder
+from service.model.misregistration import BOUNDARY_SCALE
+from service.model.slopes import FLIPS, SlopeRecipe
+
+Array = NDArray[np.float64]
+
+OPPOSITE = -0.5
+"""Correlation with its model below which a column has the wrong sign."""
+
+ANOTHERS = 0.7
+"""Correlation with another mode's model above which a column is that mode's."""
+
+OWN = 0.35
+"""... unless its own model explains more than this of it."""
+
+_NAMED = 12
+
+STRAIGHT = 0.01
+"""Distance of the magnification from 1 beyond which pitch or diameter may be told wrong."""
+
+UNIFORM = 0.06
+"""Relative scatter of gains that are off together."""
+
+OFF_TOGETHER = 0.08
+"""... by more than this, ..."""
+
+EXPLAINED = 0.1
+"""... where no more than this share of the signal is left over."""
+
+
+def remarks(
+    evidence: Evidence,
+    target: Target,
+    *,
+    told: SlopeRecipe,
+    found: SlopeRecipe,
+    about: Instrument,
+) -> tuple[str, ...]:
+    """Return what should be known, one sentence each.
+
+    Parameters
+    ----------
+    evidence, target
+        Of the fit.
+    told, found
+        How slopes are listed, as the instrument file says it and as the matrix lists them.
+    about
+        The instrument of the file.
+    """
+    return (
+        *_order(told.order, found.order),
+        *_mirrored(told, found),
+        *_optics(evidence),
+        *_light(evidence),
+        *_size(evidence),
+        *_passes(evidence),
+        *_scale(evidence, about),
+        *_columns(evidence.solution, target),
+    )
+
+
+def _order(told: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
+    if told is not found:
+        yield (
+            f'the instrument file says order = "{told}", the matrix lists its slopes "{found}": '
+            f'taken as found; write order = "{found}" into [slopes]'
+        )
+
+
+def _mirrored(told: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
+    """Yield that the sensor sees the mirror's drawing as in a looking-glass."""
+    axes = found.assumed_orientation
+    flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
+    if told.orientation is None and len(flags) % 2:
+        yield (
+            f"the slopes' grid is mirrored against the actuators' drawing ({', '.join(flags)}): "
+            "the detector is read from another corner, or the coordinates of the actuators are "
+            "mirrored or exchanged (parity = -1); a matrix looks the same in both cases, and shift "
+            "and rotation count in the axes found"
+        )
+
+
+def _optics(evidence: Evidence) -> Iterator[str]:
+    """Yield what of the instrument is another than told, or was found because it was unknown."""
+    for optic in evidence.optics:
+        if optic.found is not None and optic.told is None:
+            yield (
+                f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}: write it "
+                "into the instrument file"
+            )
+    wrong = [optic for optic in evidence.optics if optic.notable]
+    if not wrong or evidence.as_told is None:
+        return
+    found = " and ".join(f"{optic.found_words} ({optic.told_words})" for optic in wrong)
+    moved = evidence.as_told.moved * BOUNDARY_SCALE
+    yield (
+        f"with {found} the misfit is {evidence.as_told.share:.0%} of what it would be: the "
+        f"registration allows for it, which moved it by {moved[0]:.2g}, {moved[1]:.2g} "
+        f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; correct the instrument file"
+    )
+
+
+def _light(evidence: Evidence) -> Iterator[str]:
+    """Yield that uneven light explains what is left over."""
+    if evidence.structure > MOST_STRUCTURE >= evidence.after_light:
+        yield (
+            f"{evidence.structure:.0%} of the signal is left over and no noise; a smooth gain over "
+            "the pupil explains it: uneven light, which sigma allows for; give the light "
+            "(--flux-map), or have the gain fitted (--gain-map)"
+        )
+
+
+def _size(evidence: Evidence) -> Iterator[str]:
+    """Yield that the mirror is drawn in another size than the pupil."""
+    magnification = float(evidence.solution.vector[3])
+    if abs(magnification - 1.0) > STRAIGHT:
+        yield (
+            f"magnification {magnification:.3f}: a matrix tells only how large the mirror is on "
+            "the sensor, so pitch_m or positions (modes_pitch_m), diameter_m or "
+            f"pupil_diameter_subap may be off by {abs(magnification - 1.0):.1%} instead"
+        )
+
+
+def _scale(evidence: Evidence, about: Instrument) -> Iterator[str]:
+    """Yield that all gains are off together: the wavelength, or the unit."""
+    gains = evidence.solution.projection.gains
+    middle = float(np.median(gains))
+    wavelength_m = about.wfs.wavelength_m / middle
+    if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
+        yield (
+            f"wavelength_m = {wavelength_m:.3g} was found, if the matrix is per metre of OPD on a "
+            f"flat wavefront: gains of the modes scatter by {float(np.std(gains)) / middle:.1%}"
+        )
+    together = float(np.std(gains)) < UNIFORM * abs(middle) and abs(middle - 1.0) > OFF_TOGETHER
+    explained = evidence.residual_fraction < EXPLAINED
+    if evidence.stroke_known and explained and together and factor_of_passes(evidence) is None:
+        yield (
+            f"the gain of every mode is {middle:.3g}: a wavelength of {wavelength_m:.3g} "
+            "m instead of the file's would do that, or another unit of strokes; the registration "
+            "does not depend on it"
+        )
+
+
+def _passes(evidence: Evidence) -> Iterator[str]:
+    factor = factor_of_passes(evidence)
+    if factor is None:
+        return
+    passes = f"double_pass = {str(evidence.passes == 2).lower()}"
+    cause = {
+        (1, 2.0): "double_pass = true if the light meets the mirror twice",
+        (2, 2.0): 'per metre of surface? Then divide it by two, or write modes_kind = "surface"',
+        (2, 0.5): "double_pass = false if the light meets the mirror once",
+    }[evidence.passes, factor]
+    middle = float(np.median(evidence.solution.projection.gains))
+    yield (
+        f"the gains' median is {middle:.2f} with {passes}: "
+        f"{'twice' if factor > 1.0 else 'half'} what was expected; {cause}"
+    )
+
+
+def _columns(solution: Solution, target: Target) -> Iterator[str]:
+    """Yield which columns have the wrong sign, and which are other modes'."""
+    measured = _unit(target.matrix[target.rows])
+    alike = measured.T @ _unit(np.asarray(solution.matrix, dtype=np.float64)[target.rows])
+    own = np.diag(alike)
+    turned = target.modes[own < OPPOSITE]
+    if len(turned):
+        yield f"columns of the wrong sign: {_named(turned)}"
+    likest = np.argmax(np.abs(alike), axis=1)
+    columns = np.arange(len(own))
+    strange = (np.abs(alike[columns, likest]) > ANOTHERS) & (np.abs(own) < OWN)
+    exchanged, moved = [], []
+    for column in np.flatnonzero(strange):
+        other = likest[column]
+        pair = target.modes[column], target.modes[other]
+        if not (strange[other] and likest[other] == column):
+            moved.append(f"{pair[0]} is mode {pair[1]}'s")
+        elif column < other:
+            exchanged.append(f"{pair[0]} and {pair[1]}")
+    if exchanged:
+        yield f"columns that have changed places: {_named(exchanged, '; ')}"
+    if moved:
+        yield f"columns that are another mode's: {_named(moved, '; ')}"
+
+
+def _unit(columns: Array) -> Array:
+    return np.asarray(columns / np.linalg.norm(columns, axis=0))
+
+
+def _named(what: Sequence[object] | NDArray[np.intp], between: str = ", ") -> str:
+    more = f" and {len(what) - _NAMED} more" if len(what) > _NAMED else ""
+    return between.join(str(one) for one in what[:_NAMED]) + more

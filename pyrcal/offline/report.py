@@ -1,0 +1,467 @@
+"""A fit together with what it was made from: as a JSON document, as a table, as an HDF5 file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.instrument_checks import FITTED_KEYS, NOTABLE, NOTABLE_SIGMA
+from pyrcal.offline.matrix import Fit
+from pyrcal.offline.methods import ScanStep
+from service import __version__
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import Inversion, Recipe
+from service.errors import MatrixError, shown
+from service.files.container import put_array, put_covariance
+from service.model.kinds import Method, SlopeOrder
+from service.model.misregistration import (
+    BOUNDARY_SCALE,
+    COVARIANCE_SCALE,
+    PARAMETERS,
+    Misregistration,
+)
+from service.model.slopes import FLIPS, Orientation
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FitReport:
+    """What was found, from which file, for which instrument."""
+
+    fit: Fit
+    method: Method
+    instrument: str
+    """Name of the instrument."""
+
+    instrument_sha256: str
+    """Of everything that is known of the instrument, arrays included."""
+
+    reference: str
+    """File and array that were fitted."""
+
+    reference_sha256: str
+    """Of the whole file."""
+
+    double_pass: bool
+    """Whether the matrix was taken as twice the model's."""
+
+    seconds: float
+    """Time of the fit, the optical model included and reading not."""
+
+    notes: tuple[str, ...] = ()
+    """What was decided on the way and should be known, one sentence each."""
+
+
+def document(report: FitReport) -> dict[str, Any]:
+    """Return the fit as one JSON object, in boundary units; a number that is not finite is None.
+
+    ``gains`` belong to the modes used, in the order of the basis. What was left out is named in
+    ``verdict``, which begins with "accepted" or "refused".
+    """
+    fit = report.fit
+    return {
+        **fit.alpha.to_boundary(),
+        "sigma": _four(fit.sigma),
+        "covariance": _plain(fit.covariance * COVARIANCE_SCALE),
+        "gains": _plain(fit.gains),
+        "residual_fraction": _plain(fit.residual_fraction),
+        "condition_number": _plain(fit.condition_number),
+        "n_modes_used": len(fit.modes),
+        "orientation": orientation_words(fit.orientation, fit.order),
+        "subset_scatter": _four(fit.subset_scatter),
+        "converged": bool(fit.converged),
+        "verdict": verdict_line(fit),
+        "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
+        "instrument_found": {
+            one.key if one.found is not None else "influence_width": {
+                "found": _plain(one.found if one.found is not None else np.exp(one.change)),
+                "sigma": _plain(one.found_sigma),
+                "told": one.told,
+            }
+            for one in fit.optics
+        },
+        "notes": list(report.notes),
+        "seconds": round(report.seconds, 3),
+    }
+
+
+def verdict_line(fit: Fit) -> str:
+    """Return the verdict and what was left out, in one line."""
+    if not fit.left_out:
+        return fit.verdict
+    return f"{fit.verdict}; left out: {'; '.join(fit.left_out)}"
+
+
+def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, Any]:
+    """Return order and orientation as the instrument file would say them."""
+    both = [orientation.sign_x, orientation.sign_y]
+    flips = {name: getattr(orientation, name) for name in FLIPS}
+    return {"order": str(order), **flips, "sign": both[0] if both[0] == both[1] else both}
+
+
+def _four(values: NDArray[np.float64]) -> dict[str, float | None]:
+    return dict(zip(PARAMETERS, _plain(values * BOUNDARY_SCALE), strict=True))
+
+
+def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nested as the array
+    """Return numbers or nested lists of them, None for what is not finite."""
+    return np.ma.masked_invalid(np.asarray(values, dtype=np.float64)).tolist()
+
+
+_ROWS = (
+    ("shift x", "subapertures", 4),
+    ("shift y", "subapertures", 4),
+    ("rotation", "deg", 4),
+    ("magnification", "ratio, of the mirror as drawn over the pupil as told", 5),
+)
+"""Name, unit and decimals of each parameter."""
+
+_FAR_GAIN = 0.2
+"""Gains further than this from the median are named: such modes are worth a look."""
+
+_NAMED = 8
+
+
+def table(report: FitReport) -> str:
+    """Return the verdict, the registration and what it rests on, as text."""
+    fit = report.fit
+    lines = [
+        verdict_line(fit),
+        "",
+        *_registration(fit),
+        "",
+        *_basis(report),
+        *_extras(fit),
+        *(f"note: {note}" for note in report.notes),
+    ]
+    return "\n".join(shown(line) for line in lines)
+
+
+def _registration(fit: Fit) -> Iterator[str]:
+    yield f"{'':15s}{'value':>11s}{'1 sigma':>11s}{'subsets':>11s}"
+    values = fit.alpha.vector * BOUNDARY_SCALE
+    sigma = fit.sigma * BOUNDARY_SCALE
+    scatter = fit.subset_scatter * BOUNDARY_SCALE
+    for (name, unit, decimals), value, one, spread in zip(
+        _ROWS, values, sigma, scatter, strict=True
+    ):
+        numbers = "".join(_number(number, decimals) for number in (value, one, spread))
+        yield f"{name:15s}{numbers}  {unit}"
+
+
+def _number(value: float, decimals: int) -> str:
+    return f"{value:11.{decimals}f}" if np.isfinite(value) else f"{'-':>11s}"
+
+
+def _basis(report: FitReport) -> Iterator[str]:
+    fit = report.fit
+    yield f"{'residual':20s}{100.0 * fit.residual_fraction:.2f} % of the measured slopes"
+    yield f"{'modes used':20s}{len(fit.modes)} ({_spans(fit)})"
+    for sentence in fit.left_out:
+        yield f"{'left out':20s}{sentence}"
+    yield f"{'gains':20s}{_gains(fit)}"
+    yield f"{'condition number':20s}{fit.condition_number:.2f}"
+    words = ", ".join(
+        f"{k} = {v}" for k, v in orientation_words(fit.orientation, fit.order).items()
+    )
+    yield f"{'slopes':20s}{words}"
+    yield f"{'double pass':20s}{'yes' if report.double_pass else 'no'}"
+    yield f"{'method':20s}{report.method}, {fit.n_evaluations} matrices, {report.seconds:.1f} s"
+    yield f"{'reference':20s}{report.reference}"
+    yield f"{'instrument':20s}{report.instrument}"
+
+
+def _extras(fit: Fit) -> Iterator[str]:
+    for one in fit.optics:
+        if one.found is not None:
+            told = "unknown" if one.told is None else f"{one.told:g}"
+            words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
+            yield f"{one.key[:19]:20s}{words} (the instrument file says {told})"
+    if fit.anamorphosis is not None:
+        along, across = 100.0 * fit.anamorphosis
+        yield f"{'anamorphosis':20s}{along:+.3f} % along x, {across:+.3f} % along 45 deg"
+    if fit.gain_map is not None:
+        gains = fit.gain_map[fit.valid]
+        yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"
+    if fit.paper_table is not None:
+        yield ""
+        yield from paper_lines(fit.paper_table)
+
+
+def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
+    """Yield the paper's Table 1: which parameter was scanned, how finely, and its minimum."""
+    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'every':>9s}{'minimum':>11s}"
+    for number, scan in enumerate(steps, start=1):
+        yield (
+            f"{number:4d}  {scan.parameter:15s}{scan.samples.min():11.4f}"
+            f"{scan.samples.max():11.4f}{scan.step:9.4f}{scan.minimum:11.4f}"
+        )
+
+
+def _spans(fit: Fit) -> str:
+    """Return the modes as ranges, ends included."""
+    modes = np.sort(fit.modes)
+    runs = np.split(modes, np.flatnonzero(np.diff(modes) > 1) + 1)
+    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:_NAMED]]
+    return ", ".join(words) + (", ..." if len(runs) > _NAMED else "")
+
+
+def _gains(fit: Fit) -> str:
+    low, middle, high = np.percentile(fit.gains, [5.0, 50.0, 95.0])
+    text = f"median {middle:.3g}, 90 % of them within {low:.3g} to {high:.3g}"
+    far = fit.modes[np.abs(fit.gains / middle - 1.0) > _FAR_GAIN]
+    if len(far):
+        named = ", ".join(str(mode) for mode in far[:_NAMED])
+        more = f" and {len(far) - _NAMED} more" if len(far) > _NAMED else ""
+        text += f"; more than {100 * _FAR_GAIN:.0f} % off: mode {named}{more}"
+    return text
+
+
+# --- as an HDF5 file
+
+
+_DESCRIPTIONS = {
+    "subset_scatter": "(4,) 1 sigma scatter of disjoint sets of modes, in the same units",
+    "modes": "(n_used,) basis index of each column",
+    "gains": "(n_used,) measured column over the model's, passes divided out",
+    "residual_by_mode": "(n_used,) rms left over, as a fraction of the mode's own",
+    "residual_map": "(n_planes, n, n) [x or y, or image] rms left over, over the measured",
+    "synthetic": "(n_slopes, n_used) the model, slope per metre OPD, axes of conventions",
+    "measured": "(n_slopes, n_used) the reference in the same axes and unit",
+    "valid": "(n, n) [row, column] subapertures the slopes belong to",
+    "gain_map": "(n, n) gain over the pupil common to all modes",
+    "anamorphosis": "(2,) half the stretch of x over y, and of 45 deg over 135 deg",
+}
+
+
+def fill_fit(file: h5py.File, report: FitReport) -> None:
+    """Write a fit into an open, empty HDF5 file.
+
+    The JSON document is the attribute ``document``; arrays that JSON cannot hold are datasets.
+    """
+    fit = report.fit
+    put_covariance(file, fit.covariance)
+    arrays = {name: getattr(fit, name) for name in _DESCRIPTIONS}
+    arrays["subset_scatter"] = fit.subset_scatter * BOUNDARY_SCALE
+    for name, values in arrays.items():
+        if values is not None:
+            put_array(file, name, values, _DESCRIPTIONS[name])
+    for step, scan in enumerate(fit.paper_table or ()):
+        group = file.create_group(f"paper_table/{step:02d}")
+        group.attrs.update(parameter=scan.parameter, step=scan.step, minimum=scan.minimum)
+        group["samples"], group["chi"] = scan.samples, scan.chi
+    file.attrs.update(fit.alpha.to_boundary())
+    file.attrs.update(_provenance(report))
+    file.attrs["document"] = json.dumps(document(report), allow_nan=False)
+
+
+def _provenance(report: FitReport) -> dict[str, Any]:
+    """Return where a fit comes from, as HDF5 attributes."""
+    return {
+        "instrument": report.instrument,
+        "instrument_sha256": report.instrument_sha256,
+        "reference": report.reference,
+        "reference_sha256": report.reference_sha256,
+        "double_pass": report.double_pass,
+        "method": str(report.method),
+        "verdict": report.fit.verdict,
+        "accepted": report.fit.accepted,
+        "notes": "\n".join(report.notes),
+        **_made_now(),
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KnownFit:
+    """What a reconstructor needs of an earlier fit."""
+
+    alpha: Misregistration
+    covariance: NDArray[np.float64] | None = None
+    """``(4, 4)`` of ``alpha.vector``; None: only α is known."""
+
+    modes: NDArray[np.intp] | None = None
+    """``(n_used,)`` basis indices that ``gains`` belong to; None: not in the file."""
+
+    gains: NDArray[np.float64] | None = None
+    """``(n_used,)`` calibration gains."""
+
+    orientation: Orientation | None = None
+    """Of the slopes, as the fit found it; None: not in the file."""
+
+    order: SlopeOrder | None = None
+    """Of the components."""
+
+    double_pass: bool | None = None
+    """Whether light met the mirror twice in the measured matrix; None: not in the file."""
+
+    accepted: bool | None = None
+    """The verdict; None: α was given by hand."""
+
+    origin: str = "given by hand"
+    """Where this comes from."""
+
+    instrument_sha256: str | None = None
+    """Of the instrument it was fitted for; None: not in the file."""
+
+    reference_sha256: str | None = None
+    """Of the measured file; None: not in the file."""
+
+    instrument_found: Mapping[str, float] = field(default_factory=dict)
+    """What the fit found where the instrument file says otherwise or nothing, by key."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Provenance:
+    """What a reconstructor was made of: whoever finds it years later can make it again."""
+
+    recipe: Recipe
+    inversion: Inversion
+    fit: KnownFit
+    """The registration of its synthetic matrix, and the measured one that was fitted."""
+
+    gains: CalibrationGains | None
+    """Folded into the columns; None: the model's own."""
+
+    measured_illumination: bool
+    """Whether the model's pupil was lit as the flux map says."""
+
+    def attributes(self) -> dict[str, str | int | float | bool]:
+        """Return everything as flat, named, scalar facts: for file attributes and JSON."""
+        fit, prior = self.fit, self.recipe.prior
+        found: dict[str, str | int | float | bool] = {
+            "source": "synthetic",
+            "method": str(self.recipe.method),
+            "n_modes": self.recipe.n_modes,
+            "condition_number": self.inversion.condition_number,
+            "n_truncated": self.inversion.n_truncated,
+            "single_pass": True,
+            "measured_illumination": self.measured_illumination,
+            **fit.alpha.to_boundary(),
+        }
+        if prior is None:
+            found["max_condition"] = self.recipe.max_condition
+        else:
+            found["prior_n_modes"] = len(prior.variance_m2)
+            found["prior_wavefront_m"] = float(np.sqrt(prior.variance_m2.sum()))
+            found["prior_slope_noise"] = float(np.sqrt(np.mean(np.square(prior.slope_noise))))
+        if fit.covariance is not None:
+            sigma = np.sqrt(np.diag(fit.covariance)) * BOUNDARY_SCALE
+            found |= {f"sigma_{name}": float(s) for name, s in zip(PARAMETERS, sigma, strict=True)}
+        if fit.reference_sha256 is not None:
+            found["reference_sha256"] = fit.reference_sha256
+        if fit.double_pass is not None:
+            found["reference_passes"] = 1 + fit.double_pass
+        if self.gains is not None:
+            controlled = self.gains.measured[: self.recipe.n_modes]
+            found["n_gains_measured"] = int(controlled.sum())
+            found["n_gains_extended"] = int((~controlled).sum())
+        return found
+
+
+def read_fit(path: Path) -> KnownFit:
+    """Return the fit in a file that ``pyrcal fit`` wrote: its JSON document, or its product.
+
+    Raises
+    ------
+    MatrixError
+        If it is neither.
+    """
+    try:
+        if h5py.is_hdf5(path):
+            with h5py.File(path, "r", locking=False) as file:
+                return _of_product(file, path)
+        return _of_document(json.loads(path.read_text(encoding="utf-8")), path)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise MatrixError(
+            f"{path}: {error!r}; expected what pyrcal fit wrote with --json or --output"
+        ) from error
+
+
+def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
+    words = values["orientation"]
+    sign = words["sign"]
+    sign_x, sign_y = sign if isinstance(sign, list) else (sign, sign)
+    return KnownFit(
+        alpha=Misregistration.from_boundary(values),
+        covariance=np.array(values["covariance"], dtype=np.float64) / COVARIANCE_SCALE,
+        orientation=Orientation(
+            **{name: words[name] for name in FLIPS}, sign_x=sign_x, sign_y=sign_y
+        ),
+        order=SlopeOrder(words["order"]),
+        accepted=str(values["verdict"]).startswith("accepted"),
+        instrument_found=_otherwise(values.get("instrument_found", {})),
+        origin=str(path),
+    )
+
+
+def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
+    """Return what was found and is not what the instrument file says."""
+    otherwise = {}
+    for key, one in found.items():
+        value, told, sigma = one["found"], one["told"], one["sigma"] or 0.0
+        if value is None or key not in FITTED_KEYS:
+            continue
+        if told is None or abs(value - told) > max(NOTABLE * told, NOTABLE_SIGMA * sigma):
+            otherwise[key] = value
+    return otherwise
+
+
+def _of_product(file: h5py.File, path: Path) -> KnownFit:
+    known = _of_document(json.loads(file.attrs["document"]), path)
+    return replace(
+        known,
+        modes=np.asarray(file["modes"][()], dtype=np.intp),
+        gains=np.asarray(file["gains"][()], dtype=np.float64),
+        double_pass=bool(file.attrs["double_pass"]),
+        accepted=bool(file.attrs["accepted"]),
+        instrument_sha256=str(file.attrs["instrument_sha256"]),
+        reference_sha256=str(file.attrs["reference_sha256"]),
+    )
+
+
+def fill_reconstructor(
+    file: h5py.File,
+    interaction_matrix: NDArray[np.float32],
+    provenance: Provenance,
+    circumstances: Mapping[str, str | int | float | bool],
+) -> None:
+    """Write a reconstructor, and what it is made of, into an open, empty HDF5 file.
+
+    Parameters
+    ----------
+    file
+        To be filled.
+    interaction_matrix
+        ``(n_slopes, n_modes)`` what it inverts, slopes as the RTC lists them.
+    provenance
+        How it was made, and what came of it.
+    circumstances
+        Instrument, model, orientation: further attributes.
+    """
+    described = "slopes as the RTC lists them, single pass"
+    for name, values, shape in (
+        ("reconstructor", provenance.inversion.matrix, "(n_modes, n_slopes), metres OPD per slope"),
+        ("interaction_matrix", interaction_matrix, "(n_slopes, n_modes), slope per metre OPD"),
+    ):
+        put_array(file, name, np.ascontiguousarray(values, dtype="<f4"), f"{shape}, {described}")
+    if provenance.fit.covariance is not None:
+        put_covariance(file, provenance.fit.covariance)
+    if provenance.gains is not None:
+        n_modes = provenance.recipe.n_modes
+        file["calibration_gains"] = provenance.gains.values[:n_modes]
+        file["calibration_gains"].attrs["measured"] = provenance.gains.measured[:n_modes]
+    file.attrs.update({**circumstances, **provenance.attributes(), **_made_now()})
+
+
+def _made_now() -> dict[str, str]:
+    return {
+        "software": f"pyrcal {__version__}",
+        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+    }

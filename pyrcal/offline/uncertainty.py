@@ -1,0 +1,208 @@
+"""How sure a registration is: noise, the disagreement of modes, and errors of the model.
+
+Noise and everything else that differs from mode to mode shows in how the modes disagree: each is a
+cluster of a sandwich estimate. Errors of the model (uneven light, another mirror) are common to
+all modes and would pass unseen; they show in how parts of the pupil disagree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.solver import Projection
+
+Array = NDArray[np.float64]
+
+FLOOR_SUBAP = 3e-4
+"""1 σ of where a point of the pupil is seen, that no matrix is free of: of a shift, and at the
+pupil's edge of a rotation. Noise-free matrices of other codes, of the same mirror at 0.3 to 1.1
+subapertures, were read off by 0.017 to 0.038 % of one (RMS of a shift); modes of a sensor of 20
+subapertures, modulated by 20 points, by 0.05 % and 0.0017 deg."""
+
+MAGNIFICATION_FLOOR = 1e-4
+"""The same of the magnification: of those matrices 3e-5 with modes, 1.2e-4 with actuators."""
+
+LOCAL_MAGNIFICATION_FLOOR = 2.5e-4
+"""The same where each subaperture is divided by its own flux: those at the border then weigh as
+much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small."""
+
+FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
+"""1 σ by parameter over the length of the shift in subapertures: far off, a mirror of another kind
+parts from the model at the border. Of 24 telescopes at 0.66 to 1.0 subapertures with it, 23 lie
+inside the 95 % ellipse; without what it adds to rotation and magnification 20 did."""
+
+STRANGE_RESIDUAL = 0.095
+"""Share of the signal that a mirror of another kind leaves over. Less has no room for one: what
+a far shift adds is less in proportion, as with other codes, which leave a hundredth."""
+
+REGIONAL_SHARE = np.array([0.53, 0.53, 0.165, 1.43])
+"""Error of the registration over the scatter of the regions of the pupil, by parameter: what pulls
+one region one way pulls another the other way."""
+
+FEW_MODES = 45.0
+"""Number of modes over which errors of the model cease to average out."""
+
+FEW_MODES_EXCESS = 5.0
+"""How much larger their share is with hardly any modes, less 1."""
+
+FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
+"""By parameter: the magnification feels it less."""
+
+OTHER_SHARE = 0.5
+"""How likely an instrument is that explains a matrix as well as the file's."""
+
+N_SECTORS, N_RINGS = 12, 3
+MOST_SETS = 8
+LEAST_PER_SET = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Uncertainty:
+    """How sure the registration is, and how far sets of modes agree."""
+
+    covariance: Array
+    """``(4, 4)`` of the registration, everything included."""
+
+    nuisance_sigma: Array
+    """``(n_nuisances,)`` 1 σ of the unknowns beside it."""
+
+    subset_steps: Array
+    """``(n_sets, 4)`` where each disjoint set of modes alone would go from the common solution."""
+
+    subset_covariance: Array
+    """``(n_sets, 4, 4)`` of these steps by the disagreement of the modes within each set."""
+
+    @property
+    def subset_scatter(self) -> Array:
+        """``(4,)`` 1 σ scatter of the sets; NaN with fewer than two."""
+        if len(self.subset_steps) < 2:
+            return np.full(4, np.nan)
+        return np.asarray(self.subset_steps.std(axis=0, ddof=1))
+
+    @property
+    def subset_tension(self) -> float:
+        """Largest distance of a set from the common solution, in its own σ."""
+        if len(self.subset_steps) < 2:
+            return 0.0
+        sigma = np.sqrt([np.diag(matrix) for matrix in self.subset_covariance])
+        return float(np.max(np.abs(self.subset_steps) / sigma))
+
+
+def uncertainty(
+    projection: Projection,
+    values: Array,
+    prior: Array,
+    regions: NDArray[np.intp],
+    *,
+    shift_subap: float,
+    radius_subap: float,
+    magnification_floor: float,
+    residual_fraction: float,
+    doubt: Array,
+) -> Uncertainty:
+    """Return how sure the first four unknowns of a projection at its solution are.
+
+    Parameters
+    ----------
+    projection
+        At the solution.
+    values
+        ``(n_unknowns,)`` of the nuisances at the solution; 0 for the registration, whose prior is
+        none.
+    prior
+        ``(n_unknowns,)`` reciprocal variance of each unknown.
+    regions
+        ``(n_rows,)`` region of the pupil of each slope.
+    shift_subap
+        Length of the shift at the solution: part of the model's error grows with it.
+    radius_subap
+        Of the pupil.
+    magnification_floor
+        What no magnification is surer than.
+    residual_fraction
+        RMS of what is left over RMS of the measurement: so far the mirror may be another.
+    """
+    n_modes = len(projection.gains)
+    n_sets = min(MOST_SETS, n_modes // LEAST_PER_SET)
+    normals = projection.normals
+    noise = projection.chi / max(projection.residual.size - len(prior) - n_modes, 1)
+    held = np.diag(prior * noise)
+    spread = np.linalg.inv(normals.sum(axis=0) + held)
+    scores = projection.scores
+    every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
+    from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
+    by_region = _sandwich(spread, _regional_scores(projection, regions))
+    regional = by_region[:4, :4]
+    few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
+    share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
+    strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
+    far = strange * FAR_SHARE * shift_subap
+    floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
+    from_model = np.diag(share**2 + floor**2 + far**2 + OTHER_SHARE * np.sum(doubt**2, axis=0))
+    pull = prior * noise * values
+    steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
+    scatter = np.zeros((4, 4))
+    if n_sets > 1:
+        scatter = np.diag(steps.var(axis=0, ddof=1) / n_sets)
+    return Uncertainty(
+        covariance=_at_least(from_modes, scatter) + from_model,
+        nuisance_sigma=np.sqrt(np.diag(every + by_region + spread * noise))[4:],
+        subset_steps=steps,
+        subset_covariance=covariances + from_model,
+    )
+
+
+def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:
+    """Return the region, sector and ring of equal area, of every signal ``(n_slopes,)``."""
+    n = len(valid)
+    y, x = np.stack(np.nonzero(valid)) - (n - 1) / 2
+    sector = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * N_SECTORS).astype(np.intp)
+    radius = np.hypot(x, y)
+    ring = np.floor((radius / (radius.max() + 1e-9)) ** 2 * N_RINGS).astype(np.intp)
+    return np.tile(np.minimum(sector, N_SECTORS - 1) * N_RINGS + ring, n_planes)
+
+
+def _sandwich(spread: Array, scores: Array) -> Array:
+    """Return the covariance of all unknowns when columns of ``scores`` are independent."""
+    pulled = spread @ scores
+    return np.asarray(pulled @ pulled.T)
+
+
+def _at_least(covariance: Array, other: Array) -> Array:
+    """Return a covariance with the correlations of the first and the larger σ of both."""
+    own, least = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(other))
+    if not np.all(own > 0.0):
+        return other
+    grown = np.maximum(own, least) / own
+    return np.asarray(covariance * np.outer(grown, grown))
+
+
+def _regional_scores(projection: Projection, regions: NDArray[np.intp]) -> Array:
+    """Return ``(n_unknowns, n_regions)`` what each region says each unknown should do."""
+    weighted = projection.residual * projection.weights
+    by_slope = np.einsum("ksm,sm->ks", projection.jacobian, weighted)
+    return np.array([np.bincount(regions, row) for row in by_slope])
+
+
+def _subsets(
+    n_sets: int, normals: Array, held: Array, scores: Array, pull: Array, noise: float
+) -> tuple[Array, Array]:
+    """Return the step of every set of modes ``(n_sets, 4)`` and its covariance.
+
+    The covariance of a set is from how its modes scatter about the set's own solution: about the
+    common one, sets that agree within themselves and not with each other would hide it.
+    """
+    steps, covariances = [], []
+    for k in range(n_sets):
+        own, scored = normals[k::n_sets], scores[:, k::n_sets]
+        spread = np.linalg.inv(own.sum(axis=0) + held)
+        step = spread @ (scored.sum(axis=1) - pull)
+        about = scored - (own @ step).T
+        n_modes = len(own)
+        covariance = _sandwich(spread, about)[:4, :4] * n_modes / max(n_modes - 1, 1)
+        steps.append(step[:4])
+        covariances.append(_at_least(covariance, (spread * noise)[:4, :4]))
+    return np.array(steps), np.array(covariances)

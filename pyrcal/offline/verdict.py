@@ -1,0 +1,246 @@
+"""Whether to believe a fit: what is asked of it, what to do when it fails, what to know besides.
+
+The residual alone does not decide. Uneven light leaves a third of the signal although the
+registration is right, and a wrong stop leaves a tenth although it is wrong. So sets of modes must
+agree, no other minimum may be nearly as good, no other instrument may explain the matrix better,
+the gains must be those of one basis, and what is left over must be noise or have a cause that is
+named. Remarks say what was overruled, and what looks odd.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
+from pyrcal.offline.methods import Landing
+from pyrcal.offline.uncertainty import Uncertainty
+from service.estimation.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+
+Array = NDArray[np.float64]
+
+MOST_RESIDUAL = 0.55
+"""RMS share of the signal left over, by which even strongly uneven light is exceeded."""
+
+MOST_STRUCTURE = 0.09
+"""RMS share of the signal left over that is no noise, for which a cause must be named. Where the
+file is right it was at most 0.02 on matrices of other codes, 0.05 under noise of 30 % and on the
+diffractive telescopes; told an obscuration of 0.14 instead of 0.25 it was 0.13 to 0.16."""
+
+MOST_TENSION = 5.0
+"""Distance of a set of modes from the others, in its own σ."""
+
+MOST_SCATTER = 0.35
+"""Robust relative scatter of the gains; modes of another basis scatter by more than this."""
+
+LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
+"""Less certain than this is not determined (numeric units)."""
+
+STRANGEST = 3.0
+"""Distance of such a logarithm from the file's, over its usual one, that no file is wrong by."""
+
+_PASSES = 0.12
+"""By which gains are off a factor of two, and scatter, that is forgotten in all of them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """All that a verdict rests on."""
+
+    solution: Solution
+    residual_fraction: float
+    structure: float
+    """RMS share of the signal that is left over and is no noise."""
+
+    after_light: float
+    """The same if a smooth gain over the pupil, as uneven light makes, were fitted too."""
+
+    uncertainty: Uncertainty
+    landing: Landing | None
+    """Where the starts led; None for methods that do not search."""
+
+    rivals: tuple[Rival, ...]
+    """Other instruments, the one that explains the matrix best first."""
+
+    optics: tuple[FoundOptic, ...]
+    """What was found of the instrument itself."""
+
+    as_told: AsTold | None
+    """The fit with all of these as the file says; None: they are, so far as the matrix tells."""
+
+    axes: str
+    """Why the orientation cannot be told; empty: it can."""
+
+    passes: int
+    """How often the light is said to have met the mirror."""
+
+    stroke_known: bool
+
+
+def judged(evidence: Evidence) -> tuple[bool, str]:
+    """Return whether the registration is accepted, and the verdict in one line."""
+    for refusal in (
+        evidence.axes,
+        _unsettled(evidence),
+        _undetermined(evidence),
+        _unexplained(evidence),
+        _another_minimum(evidence),
+        _another_instrument(evidence),
+        _another_basis(evidence),
+        _another_unit(evidence),
+        _divided(evidence),
+        _without_a_cause(evidence),
+    ):
+        if refusal:
+            return False, f"refused: {refusal}"
+    return True, f"accepted: {_quality(evidence)}"
+
+
+def _quality(evidence: Evidence) -> str:
+    shares = f"residual {evidence.residual_fraction:.1%} of the signal"
+    if len(evidence.uncertainty.subset_steps) < 2:
+        return f"{shares}; too few modes to split into sets that check each other"
+    tension = evidence.uncertainty.subset_tension
+    n_sets = len(evidence.uncertainty.subset_steps)
+    return f"{n_sets} sets of modes agree within {tension:.1f} sigma, {shares}"
+
+
+def _unsettled(evidence: Evidence) -> str:
+    if evidence.solution.converged:
+        return ""
+    return (
+        "the steps did not come to rest: the start is outside the capture range, or the instrument "
+        "file is another's; start closer (--start), or leave the start out"
+    )
+
+
+def _undetermined(evidence: Evidence) -> str:
+    sigma = np.sqrt(np.diag(evidence.uncertainty.covariance))
+    if np.all(sigma < LARGEST_SIGMA):
+        return ""
+    shown = sigma * BOUNDARY_SCALE
+    return (
+        f"the modes do not determine the registration (1 sigma: {shown[0]:.2g} and {shown[1]:.2g} "
+        f"subaperture, {shown[2]:.2g} deg, {shown[3]:.2g}); measure more modes, or with less noise"
+    )
+
+
+def _unexplained(evidence: Evidence) -> str:
+    if evidence.residual_fraction <= MOST_RESIDUAL:
+        return ""
+    return (
+        f"the model leaves {evidence.residual_fraction:.0%} of the signal unexplained, expected at "
+        f"most {MOST_RESIDUAL:.0%}: too much noise, a false minimum (start closer), or another "
+        "basis or instrument than the file's"
+    )
+
+
+def _another_minimum(evidence: Evidence) -> str:
+    if evidence.landing is None or not evidence.landing.rivals:
+        return ""
+    rival = Misregistration.from_vector(evidence.landing.rivals[0].vector).to_boundary()
+    return (
+        f"another minimum is nearly as good: shift {rival['shift_x_subap']:.2f}, "
+        f"{rival['shift_y_subap']:.2f} subaperture, {rival['rotation_deg']:.1f} deg, "
+        f"{rival['magnification']:.3f}; give a start near the right one (--start) or more modes"
+    )
+
+
+def _another_instrument(evidence: Evidence) -> str:
+    for rival in evidence.rivals:
+        if rival.believed:
+            return (
+                f"another instrument explains the matrix better: with {rival.change.words} the "
+                f"misfit is {rival.share:.0%} of what it is now; correct the instrument file"
+            )
+    for optic in evidence.optics:
+        usual = OPTIC_SIGMA[optic.optic] if optic.told is not None else UNKNOWN_SIGMA
+        if abs(optic.change) > STRANGEST * usual:
+            return (
+                f"only {optic.found_words} would explain the matrix, {optic.told_words}: the "
+                "mirror, the sensor or the modes are not those of the instrument file"
+            )
+    return ""
+
+
+def _another_basis(evidence: Evidence) -> str:
+    gains = evidence.solution.projection.gains
+    middle = float(np.median(gains))
+    scatter = float(np.median(np.abs(gains - middle)) / abs(middle)) * 1.4826
+    negative = int(np.sum(gains <= 0.0))
+    if negative == 0 and (scatter <= MOST_SCATTER or not evidence.stroke_known):
+        return ""
+    if negative:
+        return (
+            f"{negative} of {len(gains)} modes answer with the wrong sign: signs of single modes, "
+            "or the basis, are another's"
+        )
+    return (
+        f"the gains of the modes scatter by {scatter:.0%} about {middle:.3g}: the modes are scaled "
+        'another way or are another basis; say stroke = "unknown" if only their shapes are known'
+    )
+
+
+def _another_unit(evidence: Evidence) -> str:
+    if not evidence.stroke_known:
+        return ""
+    gains = evidence.solution.projection.gains
+    middle = float(np.median(gains))
+    if not 1e-3 < middle < 1e3:
+        return (
+            f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
+            "unit than slope per metre of OPD (per nanometre would be 1e-09)"
+        )
+    factor = factor_of_passes(evidence)
+    if factor is None or float(np.std(gains) / middle) >= _PASSES:
+        return ""
+    words = "twice" if factor > 1.0 else "half"
+    cause = (
+        "the matrix is per metre of the mirror's surface, which is half the OPD: divide it by two, "
+        'or write modes_kind = "surface" where the modes were measured'
+        if (evidence.passes, factor) == (2, 2.0)
+        else f"the light met the mirror {'twice' if factor > 1.0 else 'once'}; set double_pass = "
+        f"{'true' if factor > 1.0 else 'false'}, or correct the unit (surface for OPD)"
+    )
+    return f"the measured slopes are {words} the model's in every mode ({middle:.2f}): {cause}"
+
+
+def factor_of_passes(evidence: Evidence) -> float | None:
+    """Return 2 or 0.5 where gains, uniform or not, look like a forgotten factor; else None.
+
+    Half the slopes after one pass are what the sky leaves of them.
+    """
+    middle = float(np.median(evidence.solution.projection.gains))
+    if not evidence.stroke_known:
+        return None
+    for factor in (2.0,) if evidence.passes == 1 else (2.0, 0.5):
+        if abs(middle / factor - 1.0) < _PASSES:
+            return factor
+    return None
+
+
+def _without_a_cause(evidence: Evidence) -> str:
+    if min(evidence.structure, evidence.after_light) <= MOST_STRUCTURE:
+        return ""
+    nearest = f"with {evidence.rivals[0].change.words} {evidence.rivals[0].share:.0%} of the misfit"
+    return (
+        f"the model leaves {evidence.structure:.0%} of the signal that is no noise, expected at "
+        f"most {MOST_STRUCTURE:.0%}, and nothing tried explains it ({nearest} is left): check the "
+        "mask of valid subapertures, what shades the pupil, the light on it (--flux-map, "
+        "--gain-map), and that columns and modes are the same"
+    )
+
+
+def _divided(evidence: Evidence) -> str:
+    tension = evidence.uncertainty.subset_tension
+    if tension <= MOST_TENSION:
+        return ""
+    scatter = evidence.uncertainty.subset_scatter * BOUNDARY_SCALE
+    return (
+        f"sets of modes disagree by {tension:.1f} sigma (scatter {scatter[0]:.2g} and "
+        f"{scatter[1]:.2g} subaperture, {scatter[2]:.2g} deg, {scatter[3]:.2g}): the stop, the "
+        "modulation, the modes or the mask are not those of the instrument file"
+    )

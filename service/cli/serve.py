@@ -1,0 +1,306 @@
+"""The running service: the only place that wires its parts together."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import logging
+import signal
+import socket
+import sys
+import threading
+import time
+from importlib import import_module
+from typing import Literal, TextIO, cast
+
+import structlog
+from structlog.typing import EventDict
+from threadpoolctl import threadpool_limits
+from typing_extensions import override
+
+from service.archive import Archive
+from service.cli.program import leave
+from service.cli.running import announced
+from service.config import Settings
+from service.config.policy import keeping_of, policy_of
+from service.errors import ConfigurationError, PyrcalError, shown
+from service.files.fit_folder import FitRequest
+from service.files.last_telemetry import LastTelemetry
+from service.model.instrument import Instrument, instrument_sha256
+from service.rtc_bridge import Bridge, Endpoint
+from service.runtime.actions import Actions, Publishing
+from service.runtime.clock import ServiceClock
+from service.runtime.recording import taken_up
+from service.runtime.supervisor import Supervisor
+from service.runtime.uploads import FitLimits, FitQueue
+from service.runtime.workers import WorkerPool
+from service.tracking.measuring import MEASUREMENTS_KEPT
+from service.tracking.resume import restored
+from service.tracking.state import Mode, TrackerState
+from service.web.keys import KeyFile
+
+M_ARENA_MAX = -8
+"""Of mallopt(3)."""
+
+END_WITHIN_S = 4.5
+"""After this what holds the service up is named, and left behind: five seconds is what operators
+and process managers wait."""
+
+
+def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
+    """Run the service until it is asked to stop or fails; return the exit status."""
+    # the event loop's own products are small; a second BLAS thread would only fight the RTC link
+    threadpool_limits(1)
+    share_memory()
+    log_to_the_terminal(settings.service.log_format)
+    for remark in instrument.remarks:
+        structlog.get_logger().warning("instrument.remark", text=remark)
+    return asyncio.run(_serve(settings, instrument, workers))
+
+
+def share_memory() -> None:
+    """Let threads take memory from two pools; each would have its own, and keep what was freed.
+
+    Fifty clients of REST left 250 MB behind in the pools of the threads that had answered them.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # only the GNU C library has it
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
+
+
+async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
+    """Open everything, run until asked to stop or the service fails, close everything."""
+    system = settings.service.system or instrument.name
+    archive = Archive(settings.service.data_dir, settings.archive.noon_utc_h)
+    endpoint = Endpoint(system=system, listen=settings.zenoh.listen, connect=settings.zenoh.connect)
+    with _listener(settings.api.host, settings.api.port) as listener:
+        archive.open()
+        where = "http://{}:{}".format(*listener.getsockname()[:2])
+        last = LastTelemetry(
+            settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
+        )
+        with archive, announced(archive.directory, where), Bridge(endpoint, last) as bridge:
+            bridge.expect(instrument.basis_id, instrument.config_id)
+            supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
+            desk = _desk(settings, instrument)
+            names = (settings.api.host, *settings.api.allowed_hosts)
+            keys = KeyFile(settings.service.data_dir)
+            try:
+                return await _until_stopped(supervisor, desk, listener, names, keys)
+            finally:
+                workers.close()
+
+
+async def _until_stopped(
+    supervisor: Supervisor,
+    desk: FitQueue,
+    listener: socket.socket,
+    names: tuple[str, ...],
+    keys: KeyFile,
+) -> int:
+    desk.open()
+    ending = _Ending()
+
+    async def answer() -> None:
+        # takes a second, in which telemetry is taken in already
+        await asyncio.to_thread(import_module, "service.api")
+        from service import api
+
+        await api.answer(supervisor, desk, listener, names, keys, ending.asked)
+
+    work = asyncio.create_task(supervisor.run())
+    web = asyncio.create_task(answer())
+    asked = asyncio.create_task(ending.asked.wait())
+    await asyncio.wait({work, web, asked}, return_when=asyncio.FIRST_COMPLETED)
+    failed = work.done() or web.done()
+    ending.begin()
+    for task in (work, asked):
+        task.cancel()
+    outcomes = await asyncio.gather(work, web, return_exceptions=True)
+    await desk.close()
+    for outcome in outcomes:
+        _explain(outcome)
+    return 1 if failed else 0
+
+
+def _explain(outcome: BaseException | None) -> None:
+    """Log why the service failed; what it refused on purpose ends as one line.
+
+    Raises
+    ------
+    PyrcalError
+        The refusal itself.
+    """
+    while isinstance(outcome, BaseExceptionGroup):
+        outcome = outcome.exceptions[0]
+    if isinstance(outcome, PyrcalError):
+        raise outcome
+    if isinstance(outcome, Exception):
+        structlog.get_logger().error("service.failed", exc_info=outcome)
+
+
+class _Ending:
+    """Hears SIGINT and SIGTERM, once, and sees to it that the end comes."""
+
+    def __init__(self) -> None:
+        self.asked = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(self.begin))
+
+    def begin(self) -> None:
+        """Begin the end: it is not begun twice, and cannot be put off."""
+        if self.asked.is_set():
+            return
+        self.asked.set()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        guard = threading.Timer(END_WITHIN_S, _leave_behind)
+        guard.daemon = True
+        guard.start()
+
+
+def _leave_behind() -> None:
+    """End the process with what still holds it up; what is on the disk is whole at any moment."""
+    held = [thread.name for thread in threading.enumerate() if not thread.daemon]
+    structlog.get_logger().error("service.ended-late", threads=held)
+    leave(1)
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """Bind the REST port first: a busy one must be said in one line before anything starts."""
+    try:
+        listener = socket.create_server((host, port))
+    except OSError as error:
+        raise ConfigurationError(
+            f"api.port: cannot listen on {host}:{port}: {error.strerror or error}; "
+            "choose another with --port"
+        ) from error
+    return listener
+
+
+def _supervisor(
+    settings: Settings,
+    instrument: Instrument,
+    system: str,
+    bridge: Bridge,
+    workers: WorkerPool,
+    archive: Archive,
+) -> Supervisor:
+    clock = ServiceClock()
+    actions = Actions(
+        bridge=bridge,
+        workers=workers,
+        archive=archive,
+        instrument=instrument,
+        publishing=Publishing(
+            system=system,
+            chunk_bytes=settings.zenoh.chunk_bytes,
+            pole_radius_bound=settings.control.pole_radius_bound,
+        ),
+        clock_ns=clock.now_ns,
+    )
+    policy = policy_of(settings)
+    state = TrackerState(
+        system=system,
+        mode=Mode(settings.service.mode),
+        reconstructors=restored(archive.reconstructors.records()),
+        measurements=archive.measurements()[-MEASUREMENTS_KEPT:],
+        basis_id=instrument.basis_id,
+        config_id=instrument.config_id,
+    )
+    return Supervisor(
+        state=taken_up(archive, state, policy, clock.now_ns()),
+        policy=policy,
+        bridge=bridge,
+        workers=workers,
+        archive=archive,
+        actions=actions,
+        keeping=keeping_of(settings),
+        clock=clock,
+    )
+
+
+FIT_PROGRAM = (sys.executable, "-m", "pyrcal.offline.uploaded")
+"""``pyrcal fit`` of an upload; of the service nothing is imported there but what it stands on."""
+
+
+def _desk(settings: Settings, instrument: Instrument) -> FitQueue:
+    """Return the desk for fits of uploads; an uploaded instrument is read like any other."""
+    most_bytes = settings.fits.upload_limit_mb * 1_000_000
+    return FitQueue(
+        folder=settings.service.data_dir / "uploads",
+        program=FIT_PROGRAM,
+        request=FitRequest(
+            asked={},
+            own_instrument=str(settings.service.instrument),
+            own_sha256=instrument_sha256(instrument),
+            most_bytes=most_bytes,
+            threads=settings.compute.threads,
+            nice=settings.compute.nice,
+            memory_mb=settings.fits.memory_limit_mb,
+        ),
+        limits=FitLimits(
+            most_bytes=most_bytes,
+            waiting=settings.fits.waiting,
+            seconds=settings.fits.time_limit_s,
+        ),
+        clock_ns=time.time_ns,
+    )
+
+
+def log_to_the_terminal(log_format: Literal["auto", "text", "json"] = "auto") -> None:
+    """Have everything that is logged, by libraries too, written to standard error."""
+    is_json = log_format == "json" or (log_format == "auto" and not sys.stderr.isatty())
+    structlog.configure(
+        processors=[
+            structlog.contextvars.merge_contextvars,  # of the request that has led to it
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.format_exc_info,
+            _harmless,
+            structlog.processors.JSONRenderer(ensure_ascii=False)
+            if is_json
+            else structlog.dev.ConsoleRenderer(
+                colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
+            ),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Forgiving(sys.stderr))),
+    )
+    logging.getLogger().handlers = [_IntoStructlog()]
+
+
+class _Forgiving:
+    """A file for the log: a disk that refuses it must not end what is logged."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+
+    def write(self, text: str) -> None:
+        """Write it if that can be."""
+        with contextlib.suppress(OSError):
+            self._file.write(text)
+
+    def flush(self) -> None:
+        """Have it on the disk if that can be."""
+        with contextlib.suppress(OSError):
+            self._file.flush()
+
+
+def _harmless(_logger: object, _method: str, event: EventDict) -> EventDict:
+    """Write out the control characters in what the RTC, files and clients have said."""
+    return {
+        key: shown(value, keep="\n" if key == "exception" else "")
+        if isinstance(value, str)
+        else value
+        for key, value in event.items()
+    }
+
+
+class _IntoStructlog(logging.Handler):
+    """Takes what libraries log."""
+
+    @override
+    def emit(self, record: logging.LogRecord) -> None:
+        log = structlog.get_logger()
+        log.log(record.levelno, record.getMessage(), exc_info=record.exc_info or None)

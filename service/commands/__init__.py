@@ -1,1 +1,0 @@
-"""Commands that work on files and need no running service."""

@@ -1,0 +1,258 @@
+"""Whether an RTC's slopes and commands are what the instrument file says they are.
+
+An RTC whose slopes have the other sign, other axes or another order, or whose commands are in
+nanometres, closes its own loop as well as any other: what it says agrees with itself. Only beside
+the model does it show, and a matrix made by the model would throw its loop open. Two things tell:
+the matrix it runs with, whose inverse is the interaction matrix as that RTC knows it, and the
+slopes that answer a dither.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import MatrixError
+from service.estimation.orientation import (
+    LEAST_CORRELATION,
+    LEAST_LEAD,
+    Pose,
+    poses_of,
+    setting_written,
+    settings_of,
+    sign_written,
+)
+from service.estimation.reference import Reference
+from service.model.instrument import Instrument
+from service.model.interaction import rtc_valid_subapertures
+from service.model.misregistration import Misregistration, unit_like, wrapped
+from service.model.modes import Basis
+from service.model.pyramid import Mapper
+from service.model.slopes import FLIPS, SlopeRecipe, to_conventions, turned_mask
+
+Array = NDArray[Any]
+
+REACH_RAD = np.deg2rad(30.0)
+"""Rotations further than this from where a fit starts are another mounting, or other axes."""
+
+LARGEST_CONDITION = 100.0
+"""Of a reconstructor that is inverted: beyond it noise is all that would come out."""
+
+RESEMBLANCE = 0.5
+"""Least correlation of a dither's answer with the model under axes that are to be believed."""
+
+ADVANTAGE = 2.0
+"""Those told must do worse by this factor."""
+
+LAGS = np.arange(-3.0, 3.1, 0.5)
+"""Frames by which slopes may lag the commands of their row and still be recognised."""
+
+LIKELY = (0.1, 3.0)
+"""Slopes per unit of command over the model's: the optical gain, and by day both passes."""
+
+TWICE = (1.5, 3.0)
+"""The same of a matrix that halves every command, which no optical gain does."""
+
+_UNIT_DECADES = 1.4
+"""Powers of ten around a unit that are still recognised as it: optical gains are in between."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dialect:
+    """What was found of an RTC's slopes and commands."""
+
+    wrong: str = ""
+    """What was found, what was told, and what to write; empty: they are as told."""
+
+    found: SlopeRecipe | None = None
+    """Order and orientation of the slopes where they could be told."""
+
+    adopted: bool = False
+    """Whether the model lists its slopes like that from now on: the file says "auto"."""
+
+    rotation_rad: float | None = None
+    """Rough rotation of the mirror by the same witness; None: it does not tell."""
+
+
+def of_reconstructor(
+    reconstructor: NDArray[np.float32],
+    instrument: Instrument,
+    basis: Basis,
+    *,
+    near: Misregistration,
+    response: NDArray[np.floating],
+    mapper: Mapper = map,
+) -> Dialect:
+    """Return what the matrix an RTC runs with, ``(n_controlled, n_slopes)``, says of its slopes.
+
+    ``near`` is where the mirror is thought to be and ``response`` ``(n_slopes, n_modes)`` the
+    model's answer there: only the size of its columns counts.
+    """
+    used = np.flatnonzero(np.any(reconstructor != 0.0, axis=1))
+    if not len(used) or not np.isfinite(reconstructor).all():
+        return Dialect()
+    known = np.asarray(reconstructor[used], dtype=np.float64)
+    measured = np.asarray(np.linalg.pinv(known, rcond=1.0 / LARGEST_CONDITION), dtype=np.float64)
+    lower = used[: (len(used) + 1) // 2]
+    sizes = np.linalg.norm(measured[:, : len(lower)], axis=0)
+    ratio = float(np.median(sizes / np.linalg.norm(response[:, lower], axis=0)))
+    unit = _unit_of_matrix(ratio, double_pass=instrument.double_pass)
+    try:
+        poses = poses_of(
+            instrument,
+            Reference(matrix=measured, modes=used),
+            basis.subset(used),
+            list(settings_of(instrument.slopes, instrument.slopes.kind.orders)),
+            mapper=mapper,
+        )
+    except MatrixError as error:
+        return Dialect(wrong=unit or f"the RTC's matrix answers to hardly any slope: {error}")
+    axes = _judged(poses, instrument, near.rotation_rad)
+    return replace(axes, wrong="; ".join(part for part in (unit, axes.wrong) if part))
+
+
+def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Instrument) -> Dialect:
+    """Return what the slopes that answer a dither say.
+
+    Parameters
+    ----------
+    slopes
+        ``(n_lines, n_slopes)`` complex, at the lines of the dither, as the RTC lists them.
+    expected
+        The same by the model for the commands at those lines, as the RTC is said to list them.
+    turns_rad
+        ``(n_lines,)`` phase by which each line advances in a frame: slopes that lag by half a
+        period are no slopes of the other sign.
+    """
+    told, mask = _told(instrument), rtc_valid_subapertures(instrument)
+    model = _planes(expected, told, mask)
+    as_seen = _planes(slopes, told, mask)
+    as_told = _resemblance(as_seen, model)
+    lagging = max(_resemblance(as_seen * np.exp(1j * turns_rad * lag), model) for lag in LAGS)
+    ratio = float(np.median(np.linalg.norm(slopes, axis=1) / np.linalg.norm(expected, axis=1)))
+    unit = ""
+    if as_told >= RESEMBLANCE and not LIKELY[0] < ratio < LIKELY[1]:
+        unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
+    every = {
+        setting: _resemblance(_planes(slopes, setting, mask), model)
+        for setting in settings_of(told, told.kind.orders)
+    }
+    best = max(every.values())
+    if best < RESEMBLANCE or as_told * ADVANTAGE > best or lagging > best:
+        return Dialect(wrong=unit)
+    alike = [setting for setting, much in every.items() if much > best - LEAST_LEAD]
+    found = min(alike, key=lambda setting: _n_changes(setting, told))
+    return Dialect(wrong=_axes_named("the answer to the dither", found, told), found=found)
+
+
+def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dialect:
+    told = _told(instrument)
+    best = max(poses, key=lambda pose: pose.correlation)
+    stated = instrument.slopes.orientation is not None
+    if best.correlation < LEAST_CORRELATION:
+        text = (
+            'slopes.orientation is "auto", and no orientation explains the RTC\'s own matrix '
+            f"(correlation {best.correlation:.2f}): its modes are another basis; write "
+            "[slopes] orientation"
+        )
+        return Dialect(wrong="" if stated else text)
+    alike = [pose for pose in poses if pose.correlation > best.correlation - LEAST_LEAD]
+    near = [pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= REACH_RAD]
+    settings = {pose.slopes: pose.rotation_rad for pose in near}
+    if told in settings:
+        return Dialect(found=told, rotation_rad=settings[told])
+    if not near:
+        turned_deg = np.rad2deg(
+            min(alike, key=lambda pose: _n_changes(pose.slopes, told)).rotation_rad
+        )
+        return Dialect(
+            wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, "
+            f"{np.rad2deg(start_rad):.0f} deg were told: write [mirror] nominal_rotation_deg"
+        )
+    found = min(settings, key=lambda setting: _n_changes(setting, told))
+    if not stated:
+        return Dialect(found=found, rotation_rad=settings[found])
+    return Dialect(wrong=_axes_named("the RTC's own matrix", found, told), found=found)
+
+
+def _told(instrument: Instrument) -> SlopeRecipe:
+    return replace(instrument.slopes, orientation=instrument.slopes.assumed_orientation)
+
+
+def _n_changes(setting: SlopeRecipe, told: SlopeRecipe) -> int:
+    """Return how much of what was told a setting contradicts."""
+    axes, told_axes = setting.assumed_orientation, told.assumed_orientation
+    names = (*FLIPS, "sign_x", "sign_y")
+    changed = sum(bool(getattr(axes, name) != getattr(told_axes, name)) for name in names)
+    both_signs = axes.sign_x != told_axes.sign_x and axes.sign_y != told_axes.sign_y
+    # light counted the other way round turns both signs: one thing
+    return changed - both_signs + (setting.order != told.order)
+
+
+def _axes_named(witness: str, found: SlopeRecipe, told: SlopeRecipe) -> str:
+    """Return which of the axes, signs and orders are others than told, and what to write."""
+    axes, told_axes = found.assumed_orientation, told.assumed_orientation
+    differ = []
+    if found.order != told.order:
+        differ.append(f'slopes.order = "{found.order}" ("{told.order}" told)')
+    flips = [name for name in FLIPS if getattr(axes, name) != getattr(told_axes, name)]
+    differ += [f"orientation.{name} = {str(getattr(axes, name)).lower()}" for name in flips]
+    if (axes.sign_x, axes.sign_y) != (told_axes.sign_x, told_axes.sign_y):
+        differ.append(f"orientation.{sign_written(axes)} ({sign_written(told_axes)} told)")
+    turned = replace(told_axes, sign_x=-told_axes.sign_x, sign_y=-told_axes.sign_y)
+    only_the_sign = found == replace(told, orientation=turned)
+    other = "slopes have the other sign" if only_the_sign else "slopes lie otherwise"
+    return (
+        f"{other} than the instrument file says: {', '.join(differ)} by {witness}. Write "
+        f"[slopes] {setting_written(found)}, and start the service again"
+    )
+
+
+def _unit_of_matrix(ratio: float, *, double_pass: bool) -> str:
+    """Return what is wrong with the unit of a matrix that expects so many times the model's slopes.
+
+    An optical gain makes them fewer, the two passes of a day twice as many.
+    """
+    if TWICE[0] < ratio < TWICE[1] and not double_pass:
+        return (
+            f"the RTC's own matrix expects {ratio:.2f} times the model's slopes: its commands are "
+            "metres of surface, not of OPD, or it was measured in double pass ([instrument] "
+            "double_pass = true)"
+        )
+    if LIKELY[0] < ratio < LIKELY[1]:
+        return ""
+    return (
+        f"the RTC's own matrix expects {ratio:.2g} times the model's slopes: {_unit_named(ratio)}"
+    )
+
+
+def _unit_named(ratio: float) -> str:
+    """Return which unit of commands makes them answer so many times as metres of OPD would."""
+    unit = unit_like(1.0 / max(ratio, 1e-30), _UNIT_DECADES)
+    if unit:
+        return f"commands look like {unit}; metres of OPD are expected"
+    return "commands are in another unit than metres of OPD, or decoded wrongly"
+
+
+def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:
+    """Return slopes ``(n_lines, n_slopes)`` as maps ``(n_planes, n, n, n_lines)``.
+
+    Of the sensor's axes; ``mask`` ``(n, n)`` [y, x] are the valid subapertures in the RTC's own.
+    """
+    listed = to_conventions(rows.T, slopes, mask)
+    n_planes = slopes.kind.n_planes
+    planes = np.zeros((n_planes, *mask.shape, len(rows)), dtype=listed.dtype)
+    seen = turned_mask(mask, slopes.assumed_orientation)
+    planes[:, seen] = listed.reshape(n_planes, -1, len(rows))
+    return planes
+
+
+def _resemblance(seen: Array, model: Array) -> float:
+    """Return the mean correlation of the lines, -1..1: one sign for all, no lag."""
+    lines = (0, 1, 2)
+    along = np.sum(seen * model.conj(), axis=lines).real
+    size = np.sqrt(np.sum(np.abs(seen) ** 2, axis=lines) * np.sum(np.abs(model) ** 2, axis=lines))
+    return float(np.mean(along / size))

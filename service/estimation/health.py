@@ -1,0 +1,354 @@
+"""Whether the loop holds, whether the mirror's edge is where it was, and what vibrates.
+
+**The loop** is watched on the commands of the highest controlled modes: a mis-registered loop goes
+unstable there first, while slopes and wavefront error look healthy almost to the end.
+
+**The outer ring** of the mirror is watched on the commands as well. A segment at the edge of the
+pupil can slip by wavelengths and stay there: the sensor sees little light across it, its slopes
+look healthy, and only the command shows the step. On the diffractive telescope the slowly averaged
+position of the outermost actuators stays below 2.2 times what turbulence asks of them in every loop
+that held. A slip takes it to 7 to 18, or leaves it at 3 for seconds while the wavefront is lost
+already (docs/results/edge_slip.md).
+
+**Vibrations** are lines in the slopes; no dither is put on one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock
+from service.model.kinds import SignalKind
+from service.model.misregistration import unit_like
+from service.model.slopes import TO_SLOPES
+
+Array = NDArray[Any]
+
+DIVERGING_RATIO = 10.0
+"""Times the expected turbulence that the upper half of the controlled modes may reach."""
+
+CALM_RATIO = 5.0
+"""Below this a loop that was diverging counts as holding again."""
+
+ABSURD_RATIO = 1e4
+"""Times the expected turbulence that no mirror reaches: commands are in another unit."""
+
+_MEMORY_S = 0.5
+
+_CALMING_S = 0.05
+"""The same for a loop that diverged and carries less: one that was a thousand times beyond and
+holds again shows it within a second, not after seven memories."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopHealth:
+    """Forgetting mean of how far the high modes are beyond what turbulence asks of them."""
+
+    ratio: float = 0.0
+    """RMS of the command in the upper half of the controlled modes over its expectation."""
+
+    diverging: bool = False
+    absurd: bool = False
+    """Whether commands are beyond any mirror and came there at once, as no loop does."""
+
+    @property
+    def unit(self) -> str:
+        """What the unit of absurd commands looks like."""
+        unit = unit_like(max(self.ratio, 1.0), 2.1)
+        if not unit:
+            return "they are in another unit than metres of OPD, or decoded wrongly"
+        return f"they look like {unit}, metres of OPD are expected"
+
+
+def observe(
+    health: LoopHealth,
+    block: FrameBlock,
+    mode_variance_m2: NDArray[np.float64],
+    in_loop: NDArray[np.intp],
+) -> LoopHealth:
+    """Return the health of a loop of these modes after one more block; open, it is well."""
+    if not len(in_loop):
+        return LoopHealth()
+    upper = in_loop[len(in_loop) // 2 :]
+    commands = block.commands_m[:, upper]
+    expected = float(mode_variance_m2[upper].sum())
+    if expected <= 0.0:
+        return health
+    levels = np.sqrt(np.einsum("km,km->k", commands, commands).astype(float) / expected)
+    absurd = _absurd(health, levels)
+    if absurd != health.absurd:
+        health = LoopHealth(ratio=float(np.sqrt(np.mean(levels**2))))
+    power = float(np.mean(levels**2))
+    calming = health.diverging and power < health.ratio**2
+    memory_s = _CALMING_S if calming else _MEMORY_S
+    fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / memory_s))
+    ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power))
+    limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
+    return LoopHealth(ratio=ratio, diverging=not absurd and ratio > limit, absurd=absurd)
+
+
+def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:
+    """Return whether the frames are in another unit: one that runs away passes what is possible."""
+    beyond = levels > ABSURD_RATIO
+    if health.absurd or not beyond.any():
+        return health.absurd and bool(beyond[-1])
+    before = levels[: int(np.argmax(beyond))]
+    return not health.diverging and not bool((before > DIVERGING_RATIO).any())
+
+
+SLIPPED_RATIO = 4.5
+"""Averaged position of an outer actuator, in σ of turbulence, that no healthy loop shows."""
+
+SUSPECT_RATIO = 2.5
+"""What no healthy loop shows for longer than ``SUSPECT_FOR_S``; below it, a ring that had slipped
+is back."""
+
+SUSPECT_FOR_S = 0.5
+
+LOW_MODES = 30
+"""Left out: tip, tilt and their like move the whole mirror by more than any slip."""
+
+LOOK_FRAMES = 50
+"""One of so many frames is looked at, however long a block is."""
+
+_EDGE_MEMORY_S = 0.25
+"""Turbulence of higher modes has forgotten itself after this; a slip has not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Actuators:
+    """Where the actuators are, and how far each mode moves them."""
+
+    positions: NDArray[np.float64]
+    """``(n_actuators, 2)`` in any unit."""
+
+    strokes: NDArray[np.float64]
+    """``(n_actuators, n_modes)`` position for a unit command of each mode."""
+
+    @property
+    def outer(self) -> NDArray[np.bool_]:
+        """``(n_actuators,)`` within 4 % of the largest radius: one ring of FLAO's fourteen."""
+        radius = np.hypot(*self.positions.T)
+        return np.asarray(radius > 0.96 * radius.max())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeWatch:
+    """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
+
+    modes: NDArray[np.intp]
+    """``(n_watched,)`` those of the loop that are not left out."""
+
+    outer: NDArray[np.float32]
+    """``(n_outer, n_watched)`` of the outermost ring."""
+
+    inner: NDArray[np.float32]
+    """``(n_watched, n_watched)`` mean products of all others: a form of the command, their
+    mean square, which tells how strong the turbulence is tonight."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeHealth:
+    """Forgetting means of what the two parts of the mirror do."""
+
+    position: NDArray[np.float32] | None = None
+    """``(n_outer,)`` averaged position, in σ of the turbulence the basis was made for."""
+
+    turbulence: float = 1.0
+    """RMS of the inner actuators in the same unit."""
+
+    ratio: float = 0.0
+    """Largest averaged position of an outer actuator over ``turbulence``."""
+
+    suspect_s: float = 0.0
+    """For how long the ratio has been above ``SUSPECT_RATIO``."""
+
+    slipped: bool = False
+
+
+def edge_watch(
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
+) -> EdgeWatch | None:
+    """Return what to watch in a loop of these modes; None when they are too few to say.
+
+    The same when nothing is known of the turbulence in the modes.
+    """
+    high, outer = in_loop[in_loop >= LOW_MODES], actuators.outer
+    strokes = actuators.strokes[:, high]
+    expected = np.sqrt(strokes**2 @ mode_variance_m2[high])
+    if len(high) <= LOW_MODES or expected.min() <= 0.0:
+        return None
+    shapes = strokes / expected[:, None]
+    inner = shapes[~outer].T @ shapes[~outer] / np.count_nonzero(~outer)
+    return EdgeWatch(
+        modes=high, outer=shapes[outer].astype(np.float32), inner=inner.astype(np.float32)
+    )
+
+
+def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
+    """Return the health after one more block, of which a frame now and then is looked at."""
+    n_frames = np.diff([*range(0, block.n_frames, LOOK_FRAMES), block.n_frames])
+    moved = block.commands_m[np.cumsum(n_frames) - 1][:, watch.modes]
+    inner = np.einsum("km,km->k", moved @ watch.inner, moved)
+    each = zip(moved @ watch.outer.T, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
+    for outer, mean_square, lasted_s in each:
+        health = _seen(health, outer, float(mean_square), float(lasted_s))
+    return health
+
+
+def _seen(
+    health: EdgeHealth, outer: NDArray[np.float32], inner: float, lasted_s: float
+) -> EdgeHealth:
+    """Return the health after positions of the ring that stand for so much time."""
+    fade = float(np.exp(-lasted_s / _EDGE_MEMORY_S))
+    position = (1.0 - fade) * outer
+    if health.position is not None:
+        position += fade * health.position
+    power = fade * health.turbulence**2 + (1.0 - fade) * max(inner, 0.0)
+    turbulence = float(np.sqrt(power))
+    ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
+    suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR_S
+    return EdgeHealth(
+        position=position,
+        turbulence=turbulence,
+        ratio=ratio,
+        suspect_s=suspect_s,
+        slipped=slipped or (health.slipped and suspect_s > 0.0),
+    )
+
+
+SEGMENT_FRAMES = 1024
+"""Length of a spectrum: 1 Hz per bin at 1 kHz."""
+
+MIN_SEGMENTS = 8
+"""Fewer spectra scatter too much for a line to be told from noise."""
+
+LINE_RATIO = 8.0
+"""Power of a line over its neighbourhood's median: a mean of eight spectra of noise never gets
+there, so that what does is worth moving a dither for."""
+
+LOOK_SEGMENTS = 4
+"""Spectra between two looks for lines: a look costs as much as hundreds of frames."""
+
+_NEIGHBOURHOOD = 20
+_MEMORY_SEGMENTS = 32.0
+_N_PATTERNS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SlopeSpectra:
+    """Mean spectra of a few combinations of slopes."""
+
+    views: NDArray[np.float32]
+    """``(n_views, n_slopes)``: tip, tilt, and patterns that every other mode is seen by."""
+
+    power: NDArray[np.float64] | None = None
+    """``(n_views, n_bins)`` forgetting mean."""
+
+    n_segments: int = 0
+    frame_rate_hz: float = 0.0
+    next_seq: int = -1
+    session: str = ""
+    collected: NDArray[np.float32] | None = None
+    """``(n, n_views)`` of the segment under way."""
+
+    def with_frames(self, block: FrameBlock) -> SlopeSpectra:
+        """Return the spectra after a block; a gap or a new session starts the segment anew."""
+        rows = (block.slopes @ self.views.T).astype(np.float32)
+        unbroken = (block.session, block.first_seq) == (self.session, self.next_seq)
+        if unbroken and self.collected is not None:
+            rows = np.vstack([self.collected, rows])
+        spectra = self
+        while len(rows) >= SEGMENT_FRAMES:
+            spectra = spectra._with_segment(rows[:SEGMENT_FRAMES])
+            rows = rows[SEGMENT_FRAMES:]
+        return replace(
+            spectra,
+            frame_rate_hz=1e9 / block.dt_ns,
+            session=block.session,
+            next_seq=block.next_seq,
+            collected=rows,
+        )
+
+    def lines_hz(self, known_hz: tuple[float, ...] = ()) -> tuple[float, ...]:
+        """Return the vibration lines, lowest first, without those known: the dither's own.
+
+        A bin is a line when in any view it stands ``LINE_RATIO`` above the median of its
+        neighbourhood and is the highest within two bins. Below 2 % of the frame rate turbulence
+        falls too steeply for a neighbourhood to tell, and no dither goes there.
+        """
+        if self.power is None or self.n_segments < MIN_SEGMENTS:
+            return ()
+        around = (1, 2 * _NEIGHBOURHOOD + 1)
+        typical = scipy.ndimage.median_filter(self.power, around, mode="mirror")
+        highest = scipy.ndimage.maximum_filter(self.power, (1, 5), mode="constant")
+        peaks = (self.power > LINE_RATIO * typical) & (self.power == highest)
+        step = self.frame_rate_hz / SEGMENT_FRAMES
+        found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD]
+        return tuple(
+            float(f) for f in found if all(abs(f - known) > 3.0 * step for known in known_hz)
+        )
+
+    def _with_segment(self, rows: Array) -> SlopeSpectra:
+        window = np.hanning(SEGMENT_FRAMES)[:, None]
+        power = np.abs(np.fft.rfft((rows - rows.mean(axis=0)) * window, axis=0)).T ** 2
+        share = max(1.0 / (self.n_segments + 1), 1.0 / _MEMORY_SEGMENTS)
+        if self.power is not None:
+            power = (1.0 - share) * self.power + share * power
+        return replace(self, power=power, n_segments=self.n_segments + 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class VibrationMonitor:
+    """What vibrates while no dither plays, and under one: feed it blocks with ``update``.
+
+    Apart, because only a pause tells a vibration from a dither that plays on it.
+    """
+
+    quiet: SlopeSpectra
+    dithered: SlopeSpectra
+    dither_hz: tuple[float, ...] = ()
+    """Lines of the dither that ``dithered`` was seen under."""
+
+    lines_hz: tuple[float, ...] = ()
+    """Vibration lines as of the last look, lowest first."""
+
+    @classmethod
+    def begin(cls, n_slopes: int, kind: SignalKind = SignalKind.XY) -> VibrationMonitor:
+        """Return the monitor of signals of which nothing has been seen yet.
+
+        It looks at the mean x and y slopes, and at fixed patterns of random signs.
+        """
+        views = np.zeros((2 + _N_PATTERNS, n_slopes), np.float32)
+        tilts = np.repeat(TO_SLOPES[kind], n_slopes // kind.n_planes, axis=1)
+        views[:2, : tilts.shape[1]] = tilts / np.sqrt((tilts[0] != 0.0).sum())
+        signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(_N_PATTERNS, n_slopes))
+        views[2:] = signs / np.sqrt(n_slopes)
+        return cls(quiet=SlopeSpectra(views=views), dithered=SlopeSpectra(views=views))
+
+    def update(self, block: FrameBlock, dither_hz: tuple[float, ...]) -> VibrationMonitor:
+        """Return it after a block played under these dither lines; lines are sought now and then.
+
+        Another dither's spectra begin anew.
+        """
+        quiet, dithered = self.quiet, self.dithered
+        if block.dither_m is None:
+            quiet, dither_hz = quiet.with_frames(block), self.dither_hz
+        else:
+            if dither_hz != self.dither_hz:
+                dithered = SlopeSpectra(views=dithered.views)
+            dithered = dithered.with_frames(block)
+        before = self.quiet.n_segments + self.dithered.n_segments
+        n_segments = quiet.n_segments + dithered.n_segments
+        state = replace(self, quiet=quiet, dithered=dithered, dither_hz=dither_hz)
+        if n_segments == before or n_segments % LOOK_SEGMENTS:
+            return state
+        lines = quiet.lines_hz()
+        under = dithered.lines_hz((*dither_hz, *lines))
+        return replace(state, lines_hz=tuple(sorted((*lines, *under))))

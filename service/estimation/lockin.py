@@ -1,0 +1,430 @@
+"""Registration from windows of sines: demodulation at the lines, then a fit of what stands there.
+
+Telemetry is demodulated, as it comes, at the dither's frequencies and beside them, where the noise
+is read off. The command carries turbulence, so regressing slopes on commands is biased (by 6 % of a
+subaperture on a faint star). What the closed loop makes of the known dither alone is therefore the
+instrumental variable; only its correlation with the slopes is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from service.errors import ModelError
+from service.estimation.comb import SIDE_OFFSETS_HZ, Comb
+from service.estimation.estimate import DitheredEstimate
+from service.estimation.frames import FrameBlock
+from service.estimation.windows import (
+    ClosedLoop,
+    Telemetry,
+    Window,
+    WindowCutter,
+    WindowPlan,
+    WindowRefused,
+)
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+
+Array = NDArray[Any]
+
+CUT_PERIODS = 0.01
+"""Of a line, by which a window may be too long or too short: a rate of the RTC's that differs by
+parts per million. The Hann window keeps what that costs below 1e-4 of the amplitude."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LockInPlan(WindowPlan):
+    """What is demodulated: one sinusoid on each of a few modes.
+
+    A window is an integer number of periods of every frequency.
+    """
+
+    frequencies_hz: tuple[float, ...]
+    """One for each mode."""
+
+    frame_rate_hz: float
+
+    def __post_init__(self) -> None:
+        """Refuse a plan whose lines or side bins would leave the spectrum or be cut short.
+
+        Raises
+        ------
+        ModelError
+            If the lists differ in length, a frequency leaves (20 Hz, Nyquist - 20 Hz), two lines
+            lie within 4 bins of one another, or the window cuts a period.
+        """
+        lines = np.array(self.frequencies_hz)
+        edge = SIDE_OFFSETS_HZ.max()
+        if not len(self.modes) == len(lines) == len(self.amplitude_m) > 0:
+            raise ModelError("lock-in: modes, frequencies and amplitudes differ in length")
+        if lines.min() <= edge or lines.max() >= self.frame_rate_hz / 2 - edge:
+            raise ModelError(
+                f"lock-in: found lines at {lines.min()} to {lines.max()} Hz; expected between "
+                f"{edge} and {self.frame_rate_hz / 2 - edge} Hz, room for the side bins"
+            )
+        periods = lines * self.n_frames / self.frame_rate_hz
+        if np.abs(periods - np.round(periods)).max() > CUT_PERIODS:
+            raise ModelError(
+                f"lock-in: {self.n_frames} frames cut a period of {lines} Hz; expected whole ones"
+            )
+        gaps = np.diff(np.sort(lines)) * self.n_frames / self.frame_rate_hz
+        if gaps.size and gaps.min() < 4:
+            raise ModelError(f"lock-in: lines {lines} Hz closer than 4 bins in one window")
+
+    @property
+    def comb(self) -> Comb:
+        """What a window is summed with."""
+        return Comb(
+            lines_hz=self.frequencies_hz, frame_rate_hz=self.frame_rate_hz, n_frames=self.n_frames
+        )
+
+    @property
+    def bins_hz(self) -> NDArray[np.float64]:
+        """``(n_lines, 1 + n_side)`` frequencies: each line, then its side bins."""
+        lines = np.array(self.frequencies_hz)[:, None]
+        return np.hstack([lines, lines + SIDE_OFFSETS_HZ])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spectra(Telemetry):
+    """One window of telemetry at the plan's bins: sums of ``h_k x_k exp(-i w k)``, Hann h.
+
+    Frames that never came count as zeros, which the side bins notice. Of joined windows it is the
+    mean.
+    """
+
+    plan: LockInPlan
+    slopes: NDArray[np.complex64]
+    """``(n_lines, 1 + n_side, n_slopes)``."""
+
+    commands: NDArray[np.complex64]
+    """``(n_lines, 1 + n_side, n_modes)`` total command on the mirror, metres."""
+
+    dither: NDArray[np.complex64]
+    """``(n_lines, n_modes)`` its known dither part at the lines, metres."""
+
+    @property
+    def window_s(self) -> float:
+        """Seconds of telemetry in it."""
+        return self.n_windows * self.plan.n_frames / self.plan.frame_rate_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LockInSums:
+    """Sums so far."""
+
+    slopes: Array
+    """As :meth:`Comb.empty` has them; so the commands. They are added to where they are."""
+
+    commands: Array
+    dither: Array
+    """``(2 * n_lines, n_modes)``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
+    """Windows of sines under way."""
+
+    @override
+    def begin(self, block: FrameBlock) -> LockInSums:
+        """Return empty sums for frames like these."""
+        comb, n_modes = self.plan.comb, block.commands_m.shape[1]
+        return LockInSums(
+            slopes=comb.empty(block.slopes.shape[1]),
+            commands=comb.empty(n_modes),
+            dither=np.zeros((2 * len(self.plan.modes), n_modes), np.float32),
+        )
+
+    @override
+    def add(self, sums: LockInSums, block: FrameBlock, place: int) -> LockInSums:
+        """Return the sums with a block that begins at this place of the window."""
+        comb = self.plan.comb
+        # no block without dither columns comes this far
+        dither = block.commands_m if block.dither_m is None else block.dither_m
+        comb.add(sums.slopes, block.slopes, place)
+        comb.add(sums.commands, block.commands_m, place)
+        return replace(sums, dither=sums.dither + comb.at_lines(dither, place))
+
+    @override
+    def close(self, window: Window[LockInSums]) -> Spectra | WindowRefused:
+        """Return the finished window, or why its dither is not the one asked for."""
+        plan, sums = self.plan, window.sums
+        real, imaginary = np.split(sums.dither, 2)
+        dither = (real + 1j * imaginary).astype(np.complex64)
+        weight = 0.5 * plan.n_frames / np.sqrt(2.0)
+        applied = np.abs(dither[np.arange(len(plan.modes)), list(plan.modes)]) / weight
+        reason = plan.refusal(applied, tuple(f"{line} Hz" for line in plan.frequencies_hz))
+        if reason is not None:
+            return WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
+        return Spectra(
+            plan=plan,
+            slopes=plan.comb.at_bins(sums.slopes),
+            commands=plan.comb.at_bins(sums.commands),
+            dither=dither,
+            **window.telemetry,
+        )
+
+
+def joined(one: Spectra, other: Spectra) -> Spectra | None:
+    """Return two windows of the same dither, one right after the other, as a longer one.
+
+    Their mean, each bin turned to the phase it has in the first: what the loop and the sensor make
+    of a line is the same in both, and the noise at the side bins falls as it does at the lines.
+    None: they are of different loops or dithers, or too far apart.
+    """
+    later = other.first_seq - one.first_seq
+    follows = later // one.plan.n_frames in {one.n_windows, one.n_windows + 1}
+    if not follows or not one.is_like(other):
+        return None
+    turns = np.exp(-2j * np.pi * later * one.plan.bins_hz / one.plan.frame_rate_hz)
+    n_windows = one.n_windows + other.n_windows
+    share = np.float32(one.n_windows / n_windows)
+    turned = ((1 - share) * turns).astype(np.complex64)[:, :, None]
+    return replace(
+        other,
+        first_seq=one.first_seq,
+        n_missing=one.n_missing + other.n_missing,
+        slopes=share * one.slopes + turned * other.slopes,
+        commands=share * one.commands + turned * other.commands,
+        dither=share * one.dither + turned[:, 0] * other.dither,
+        n_windows=n_windows,
+    )
+
+
+N_STEPS = 5
+"""Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
+
+_MOST_TERMS = 40
+"""Of a series; one that needs more is given up, and the loop's equations are solved."""
+
+_GROWN = 10.0
+"""A term this much larger than the first is one of a series that does not end."""
+
+_ROUNDING = 1e-7
+"""Of single precision."""
+
+LIKER = 3.0
+"""Another mode explains more of a line than the line's own by this factor, if it is that mode."""
+
+CERTAIN = 6.0
+"""And more than it explains beside the line, root mean square."""
+
+MAX_LAG_FRAMES = 0.2
+"""A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WindowEstimate(DitheredEstimate):
+    """What one window of sines says of the registration.
+
+    Gains and lags are of the lines: complex, for a lag turns a line's phase. The misfit is the
+    residual power at the lines over that at the side bins.
+    """
+
+    dither_m: float = 0.0
+    """RMS of all lines together as they were on the mirror, metres OPD; 0: not known."""
+
+    window_s: float = 0.0
+    """Length of the window, seconds; 0: not known."""
+
+
+def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> WindowEstimate:
+    """Estimate α from one window, to first order about the linearisation.
+
+    Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per
+    line; C the command at the line, Z the instrument, ``F(v) = [γ S_j v, D v, i D v]``,
+    ``r = S - γ D(α) C``. When ``step`` is not small the caller linearises anew at the estimate.
+    """
+    matrix = linearisation.matrix
+    coupling = loop.reconstructor @ matrix
+    slopes = spectra.slopes[:, 0]
+    seen = _images(linearisation, spectra.commands[:, 0])
+    known = _apply(matrix, _instrument(spectra, coupling, loop, np.ones(len(slopes))))
+    # the first guess: <D Z, S> / <D Z, D C>
+    gains = np.sum(known.conj() * slopes, axis=1) / np.sum(known.conj() * seen[:, 0], axis=1)
+    known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
+    step = np.zeros(4)
+    for _ in range(N_STEPS):
+        normal, score = _normal_equations(slopes, seen, known, gains, step)
+        change = np.linalg.solve(normal, score)
+        step = step + change[:4]
+        gains = gains + change[4::2] + 1j * change[5::2]
+    normal, _ = _normal_equations(slopes, seen, known, gains, step)
+    spread, misfit = _side_bins(spectra, linearisation, seen, known, gains, step)
+    inverse = np.linalg.inv(normal)
+    every = inverse @ spread @ inverse.T
+    covariance = every[:4, :4]
+    turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
+    return WindowEstimate(
+        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        covariance=(covariance + covariance.T) / 2,
+        optical_gain=gains,
+        lag_frames=-np.angle(gains) / turns,
+        misfit=misfit,
+        step=step,
+        t_ns_utc=spectra.t_end_ns_utc,
+        cm_id=spectra.cm_id,
+        session=spectra.session,
+        modes=spectra.plan.modes,
+        gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
+        answers_as=_answers_as(spectra, matrix),
+        dither_m=_total_dither_m(spectra),
+        window_s=spectra.window_s,
+    )
+
+
+def _instrument(spectra: Spectra, coupling: Array, loop: ClosedLoop, gains: Array) -> Array:
+    """Return ``(n_lines, n_modes)`` the command each line's dither alone would cause."""
+    return closed_loop_responses(spectra.dither, coupling, loop, spectra.plan.frequencies_hz, gains)
+
+
+def closed_loop_responses(
+    dither: Array,
+    coupling: Array,
+    loop: ClosedLoop,
+    frequencies_hz: tuple[float, ...],
+    gains: Array,
+) -> Array:
+    """Return the total commands ``(n_lines, n_modes)`` that dithers of these amplitudes lead to.
+
+    ``Z = [I + g R D γ e^{-iwd} / (1 - leak e^{-iw})]^{-1} U``, solved in the controlled modes;
+    ``coupling`` is R D ``(n_controlled, n_modes)``, ``gains`` ``(n_lines,)`` the sensor's.
+
+    The instrument need not be better known than D: single precision is enough, and so is the
+    series ``1 - F + F^2 - ...`` where it converges, as it does above a sixth of the frame rate.
+    """
+    n = len(coupling)
+    w = 2 * np.pi * np.array(frequencies_hz) / loop.frame_rate_hz
+    integrator = np.exp(-1j * w * loop.delay_frames) / (1.0 - loop.leak * np.exp(-1j * w))
+    answer = (np.outer(loop.gains[:n], integrator * gains)).astype(np.complex64)
+    own = np.ascontiguousarray(coupling[:, :n])
+    first = -answer * _apply(coupling, dither).T
+    reply = _summed(first, answer, own)
+    if reply is None:
+        around = answer.T[:, :, None] * own + np.eye(n, dtype=np.complex64)
+        reply = np.linalg.solve(around, first.T[:, :, None])[:, :, 0].T
+    total = dither.astype(complex)
+    total[:, :n] += reply.T
+    return total
+
+
+def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
+    """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
+    reply, largest = first, np.abs(first).max(initial=0.0)
+    for _ in range(_MOST_TERMS):
+        before, reply = reply, first - answer * _apply(coupling, reply.T).T
+        change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
+        if change <= _ROUNDING * size:  # zeros are settled, too
+            return np.asarray(reply)
+        if not change < _GROWN * largest:
+            return None
+    return None
+
+
+def _images(linearisation: Linearisation, vectors: Array) -> Array:
+    """Return what the sensor makes of modal vectors, ``(n_lines, 5, n_slopes)``.
+
+    Index 0 is D v, then the four derivatives of D applied to v.
+    """
+    operators = (linearisation.matrix, *linearisation.derivatives)
+    return np.stack([_apply(operator, vectors) for operator in operators], axis=1, dtype=complex)
+
+
+def _apply(operator: Array, vectors: Array) -> Array:
+    """Return ``operator @ v`` for complex rows v and a real operator, ``(n_vectors, n_slopes)``."""
+    single = vectors.astype(np.complex64)
+    both = operator @ np.concatenate([single.real, single.imag]).T
+    return np.asarray((both[:, : len(single)] + 1j * both[:, len(single) :]).T)
+
+
+def _modulus_sigma(gains: Array, covariance: Array) -> Array:
+    """Return ``(n_lines,)`` 1 σ of ``|γ|``, from the covariance of every gain's two parts."""
+    found = []
+    for line, gain in enumerate(gains):
+        part = slice(2 * line, 2 * line + 2)
+        along = np.array([gain.real, gain.imag]) / abs(gain)
+        found.append(np.sqrt(along @ covariance[part, part] @ along))
+    return np.array(found)
+
+
+def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
+    """Return the mode of the model that each line's slopes are most like.
+
+    Another than the line's own only where it explains far more, and far more than beside the line.
+    """
+    slopes, own = spectra.slopes, np.array(spectra.plan.modes)
+    unit = matrix / np.maximum(np.linalg.norm(matrix, axis=0), np.finfo(np.float32).tiny)
+    size = np.abs(_apply(unit.T, slopes[:, 0]))
+    best = np.argmax(size, axis=1)
+    lines = np.arange(len(own))
+    for line in np.flatnonzero(size[lines, best] > LIKER * size[lines, own]):
+        beside = np.abs(slopes[line, 1:] @ unit[:, best[line]])
+        if size[line, best[line]] < CERTAIN * np.sqrt(np.mean(beside**2)):
+            best[line] = own[line]
+    clear = size[lines, best] > LIKER * size[lines, own]
+    return tuple(np.where(clear, best, own).tolist())
+
+
+def _total_dither_m(spectra: Spectra) -> float:
+    """Return the RMS of all lines together, from the dither columns of the window."""
+    amplitudes = np.abs(spectra.dither).max(axis=1) * np.sqrt(2.0) / (0.5 * spectra.plan.n_frames)
+    return float(np.sqrt(np.sum(amplitudes**2)))
+
+
+def _regressors(images: Array, gain: complex, step: Array) -> Array:
+    """Return ``(6, n_slopes)``: four derivatives by α, then by the two parts of the gain."""
+    response = images[0] + step @ images[1:]
+    return np.vstack([gain * images[1:], response, 1j * response])
+
+
+def _unknowns(line: int) -> Array:
+    """Return where the six unknowns of a line stand among all: α is common, the gain its own."""
+    return np.array([0, 1, 2, 3, 4 + 2 * line, 5 + 2 * line])
+
+
+def _normal_equations(
+    slopes: Array, seen: Array, known: Array, gains: Array, step: Array
+) -> tuple[Array, Array]:
+    """Return ``M`` and ``b`` of the instrumental-variable step over all lines."""
+    n = 4 + 2 * len(gains)
+    normal, score = np.zeros((n, n)), np.zeros(n)
+    for line, gain in enumerate(gains):
+        conjugate = _regressors(known[line], gain, step).conj()
+        response = _regressors(seen[line], gain, step)
+        residual = slopes[line] - gain * response[4]
+        at = _unknowns(line)
+        normal[np.ix_(at, at)] += (conjugate @ response.T).real
+        score[at] += (conjugate @ residual).real
+    return normal, score
+
+
+def _side_bins(
+    spectra: Spectra,
+    linearisation: Linearisation,
+    seen: Array,
+    known: Array,
+    gains: Array,
+    step: Array,
+) -> tuple[Array, float]:
+    """Return the covariance of the score, from the bins beside the lines, and the misfit.
+
+    What remains there after the same model is noise with the very spectrum the lines suffer from.
+    """
+    n = 4 + 2 * len(gains)
+    spread = np.zeros((n, n))
+    misfit = []
+    matrix = linearisation.matrix_by(step)
+    for line, gain in enumerate(gains):
+        explained = gain * _apply(matrix, spectra.commands[line, 1:])
+        residual = spectra.slopes[line, 1:] - explained
+        score = _regressors(known[line], gain, step).conj() @ residual.T
+        at = _unknowns(line)
+        spread[np.ix_(at, at)] += 0.5 * (score @ score.conj().T).real / score.shape[1]
+        left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[4]
+        misfit.append(np.sum(np.abs(left) ** 2) / np.mean(np.sum(np.abs(residual) ** 2, axis=1)))
+    return spread, float(np.mean(misfit))

@@ -1,0 +1,351 @@
+"""Whether the commands obey the loop that the RTC tells: ``c[k+d] = leak c[k+d-1] - g R s[k]``.
+
+Telemetry holds the commands after clipping, and names the reconstructor, gains and delay that made
+them. Where they do not follow from the slopes the mirror is saturated, or the RTC's account of
+itself is wrong.
+
+Every mode is looked at, on a few frames. Both sides are differenced twice: what else moves the
+mirror (turbulence played on it by day, a vibration) is slow, the sensor's noise is not. Then a mode
+that takes the share r of its steps shows r, whatever the turbulence does. A command that stays
+exactly where it was though it was asked to move is at a limit. ``looplaw`` looks at a few modes, on
+every frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock, joined_frames
+from service.estimation.windows import ClosedLoop
+
+Array = NDArray[Any]
+
+SAMPLES_PER_S = 20.0
+"""Frames looked at: at 1 kHz one in 50."""
+
+BATCH = 32
+"""Samples that may wait to be multiplied: the reconstructor is read once for all of them."""
+
+KEPT_SAMPLES = 512
+"""The oldest give way."""
+
+ENOUGH_SAMPLES = 20
+"""Fewer judge nothing."""
+
+TOLERANCE = 0.2
+"""A mode that takes less than 0.8 or more than 1.2 of its steps does not obey."""
+
+SIGNIFICANCE = 5.0
+"""Standard errors beyond the tolerance before a mode counts: hundreds are looked at each second."""
+
+COMMON_TOLERANCE = 0.12
+"""The same for the mean of all modes; a mirror that lags by 0.64 frames is short of 0.05."""
+
+LARGEST_DELAY_FRAMES = 8
+
+HELD_SHARE = 0.1
+"""Of the samples in which a mode may stay where it is though asked to move."""
+
+_STILL_M = 1e-12
+"""Steps of a mode smaller than this, RMS, are rounding."""
+
+_STEPS = 3
+"""Steps that two differences take."""
+
+_TAPS = 3
+"""Frames whose slopes may have a part in one step: a mirror's lag, a part of a frame's delay."""
+
+_SPANS_NAMED = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopCheck:
+    """Samples of a loop that has not changed: feed it blocks with ``observe``."""
+
+    from_seq: int = 0
+    """Frames before this may have been made by another loop."""
+
+    cm_id: str | None = None
+    """The reconstructor all samples are of; None: there are none."""
+
+    tail: FrameBlock | None = None
+    """The last few frames, for those that come."""
+
+    waiting: tuple[_Sample, ...] = ()
+    """Samples not multiplied yet."""
+
+    batches: tuple[_Batch, ...] = ()
+    """Oldest first, bounded."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sample:
+    """One frame, both sides of the equation differenced twice."""
+
+    seq: int
+    slopes: Array
+    """``(_TAPS, n_slopes)``: ``floor(d)`` frames before, one and two frames before that."""
+
+    steps_m: Array
+    """``(n_controlled,)``."""
+
+    held: Array
+    """``(n_controlled,)`` whether the command stayed exactly where it was."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Batch:
+    """Samples with what the loop asks for."""
+
+    seq: Array
+    """``(n_samples,)``."""
+
+    asked_m: Array
+    """``(_TAPS, n_samples, n_controlled)``, by the slopes of each frame."""
+
+    taken_m: Array
+    """``(n_samples, n_controlled)``."""
+
+    held: Array
+    """``(n_samples, n_controlled)``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Obedience:
+    """How far each mode follows the loop."""
+
+    share: NDArray[np.float64]
+    """``(n_controlled,)`` of the steps asked for; 1: obeys, NaN: was asked for none."""
+
+    held: NDArray[np.float64]
+    """``(n_controlled,)`` share of the frames in which it did not move at all."""
+
+    disobeys: NDArray[np.bool_]
+    """``(n_controlled,)``."""
+
+    cm_id: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether every mode obeys."""
+        return not self.disobeys.any()
+
+    @property
+    def text(self) -> str:
+        """Return which modes do not, by how much, and what may be the cause."""
+        off = np.flatnonzero(self.disobeys)
+        shares = self.share[off]
+        worst = int(off[np.argmin(shares)])
+        return (
+            f"commands are off the loop equation: {len(off)} of {len(self.share)} modes "
+            f"({_spans(off)}) take {np.median(shares):.2f} of the steps asked for (median; least "
+            f"mode {worst}: {self.share[worst]:.2f}) and stay where they are in up to "
+            f"{self.held[off].max():.0%} of the frames: the mirror is saturated, or the RTC's "
+            f"gains, its delay or its reconstructor are not those it names ({self.cm_id})"
+        )
+
+
+def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
+    """Return the check after one more block, as far as it is of this loop."""
+    n_delay = int(loop.delay_frames)
+    if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != loop.cm_id:
+        return replace(check, tail=None)
+    if check.cm_id != loop.cm_id:  # frames of another matrix come before the status that tells it
+        check = LoopCheck(from_seq=check.from_seq, cm_id=loop.cm_id)
+    depth = n_delay + _STEPS + _TAPS - 1
+    tail = check.tail
+    if tail is not None and not _goes_on(tail, block):
+        tail = None
+    stride = max(1, round(loop.frame_rate_hz / SAMPLES_PER_S))
+    waiting = list(check.waiting)
+    for row in range(-block.first_seq % stride, block.n_frames, stride):
+        if row + 1 < depth:
+            frames = _last(tail, block.rows(0, row + 1), depth)
+        else:
+            frames = block.rows(row + 1 - depth, row + 1).without_dither()
+        if frames.n_frames == depth and frames.first_seq >= check.from_seq:
+            waiting.append(_sample(frames, loop))
+    check = replace(check, tail=_last(tail, block, depth), waiting=tuple(waiting))
+    return _multiplied(check, loop) if len(waiting) >= BATCH else check
+
+
+def obedience(
+    check: LoopCheck,
+    loop: ClosedLoop,
+    first_seq: int,
+    last_seq: int,
+    enough: int = ENOUGH_SAMPLES,
+) -> tuple[LoopCheck, Obedience | None]:
+    """Return how the modes obeyed in a span of frames, both ends included.
+
+    None: too few of this reconstructor have been seen.
+
+    The delay's part of a frame, and a mirror's lag, are fitted to all modes together: a lag is no
+    disobedience.
+    """
+    if check.cm_id != loop.cm_id:
+        return check, None
+    check = _multiplied(check, loop)
+    near = [b for b in check.batches if b.seq[-1] >= first_seq and b.seq[0] <= last_seq]
+    seq = np.concatenate([batch.seq for batch in near] or [np.empty(0, int)])
+    chosen = (seq >= first_seq) & (seq <= last_seq)
+    if np.count_nonzero(chosen) < enough:
+        return check, None
+    asked = np.concatenate([batch.asked_m for batch in near], axis=1)[:, chosen].astype(float)
+    taken = np.concatenate([batch.taken_m for batch in near])[chosen].astype(float)
+    held = np.concatenate([batch.held for batch in near])[chosen].mean(axis=0)
+    return check, _judged(asked, taken, held, loop)
+
+
+def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
+    """Return the span of the last ``ENOUGH_SAMPLES`` samples up to a frame; None: too few."""
+    seq = np.array([k for b in check.batches for k in b.seq] + [s.seq for s in check.waiting])
+    seq = seq[seq <= before_seq][-ENOUGH_SAMPLES:]
+    return (int(seq[0]), int(seq[-1])) if len(seq) == ENOUGH_SAMPLES else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Products:
+    """All that samples tell of how modes obey: sums of their products over the samples."""
+
+    n_samples: int
+    asked: Array
+    """``(_TAPS, _TAPS, n_modes)`` steps asked for by one frame and another, metres²."""
+
+    common: Array
+    """``(_TAPS, n_modes)`` steps asked for and taken."""
+
+    taken: Array
+    """``(n_modes,)`` steps taken."""
+
+    @classmethod
+    def of(cls, asked: Array, taken: Array) -> _Products:
+        """Return them of ``(_TAPS, n_samples, n_modes)`` and ``(n_samples, n_modes)``."""
+        return cls(
+            n_samples=len(taken),
+            asked=np.einsum("ikm,jkm->ijm", asked, asked),
+            common=np.einsum("ikm,km->im", asked, taken),
+            taken=np.einsum("km,km->m", taken, taken),
+        )
+
+    def only(self, modes: Array) -> _Products:
+        """Return them of some modes alone."""
+        return _Products(
+            n_samples=self.n_samples,
+            asked=self.asked[:, :, modes],
+            common=self.common[:, modes],
+            taken=self.taken[modes],
+        )
+
+    def power(self, weights: Array) -> Array:
+        """Return ``(n_modes,)`` of what is asked for by frames with these weights."""
+        return np.asarray(np.einsum("i,j,ijm->m", weights, weights, self.asked))
+
+
+def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Obedience:
+    products = _Products.of(asked, taken)
+    weights = _lag(products, loop)
+    obeys = np.abs(_shares(products, weights)[0] - 1.0) < TOLERANCE
+    if obeys.any():
+        # those that do not must not decide how late the others are
+        weights = _lag(products.only(obeys), loop)
+    share, error = _shares(products, weights)
+    asked_for = products.power(weights) > products.n_samples * _STILL_M**2
+    off = (np.abs(share - 1.0) > TOLERANCE + SIGNIFICANCE * error) | (held > HELD_SHARE)
+    if asked_for.any():
+        mean = abs(share[asked_for].mean() - 1.0)
+        uncertain = np.linalg.norm(error[asked_for]) / np.count_nonzero(asked_for)
+        if mean > COMMON_TOLERANCE + SIGNIFICANCE * uncertain:
+            off |= np.abs(share - 1.0) > COMMON_TOLERANCE
+    return Obedience(
+        share=np.where(asked_for, share, np.nan),
+        held=held,
+        disobeys=off & asked_for,
+        cm_id=loop.cm_id or "unknown",
+    )
+
+
+def _shares(products: _Products, weights: Array) -> tuple[Array, Array]:
+    """Return ``(n_controlled,)`` regressions of what was taken on what was asked, and 1 σ."""
+    power = products.power(weights) + _STILL_M**2
+    common = weights @ products.common
+    left = np.maximum(products.taken - common**2 / power, 0.0)
+    return common / power, np.sqrt(left / power / (products.n_samples - 1))
+
+
+def _lag(products: _Products, loop: ClosedLoop) -> Array:
+    """Return ``(_TAPS,)`` weights of the frames, adding up to 1: how late the modes are.
+
+    Fitted with every mode counting alike; where the fit is no delay the status' word stands.
+    """
+    late = loop.delay_frames - int(loop.delay_frames)
+    scale = np.trace(products.asked) + products.n_samples * _STILL_M**2
+    fitted = np.linalg.lstsq(
+        (products.asked / scale).sum(axis=2), (products.common / scale).sum(axis=1)
+    )[0]
+    if fitted.sum() > TOLERANCE and (fitted > -0.1 * fitted.sum()).all():
+        return np.asarray(fitted / fitted.sum())
+    return np.array([1.0 - late, late, 0.0])
+
+
+def _last(tail: FrameBlock | None, block: FrameBlock, n: int) -> FrameBlock:
+    """Return the last ``n`` frames of both, or as many as there are, the dither taken off."""
+    part = block.last(n).without_dither()
+    if tail is None or part.n_frames == n:
+        return part
+    return joined_frames((tail, part)).last(n)
+
+
+def _goes_on(tail: FrameBlock, block: FrameBlock) -> bool:
+    """Return whether a block goes on where the tail ends, by the clock too and one matrix."""
+    late_ns = abs(block.t0_ns_utc - tail.next_t_ns)
+    return block.follows(tail) and block.cm_id == tail.cm_id and late_ns <= block.dt_ns / 2
+
+
+def _sample(frames: FrameBlock, loop: ClosedLoop) -> _Sample:
+    commands = frames.commands_m[-_STEPS - 1 :, : len(loop.gains)]
+    # the frames reach back over the delay, the differences and the taps
+    slopes = frames.slopes[: _TAPS + _STEPS - 1]
+    return _Sample(
+        seq=frames.first_seq + frames.n_frames - 1,
+        slopes=_twice(slopes)[::-1],
+        steps_m=_twice(commands[1:] - np.float32(loop.leak) * commands[:-1])[0],
+        held=commands[-1] == commands[-2],
+    )
+
+
+def _twice(rows: Array) -> Array:
+    """Return the second differences of rows."""
+    return np.asarray(rows[2:] - 2 * rows[1:-1] + rows[:-2])
+
+
+def _multiplied(check: LoopCheck, loop: ClosedLoop) -> LoopCheck:
+    if not check.waiting:
+        return check
+    slopes = np.stack([sample.slopes for sample in check.waiting], axis=1)
+    asked = (loop.reconstructor @ slopes.reshape(-1, slopes.shape[-1]).T).T
+    batch = _Batch(
+        seq=np.array([sample.seq for sample in check.waiting]),
+        asked_m=(-loop.gains.astype(np.float32) * asked).reshape(_TAPS, len(check.waiting), -1),
+        taken_m=np.array([sample.steps_m for sample in check.waiting]),
+        held=np.array([sample.held for sample in check.waiting]),
+    )
+    kept = (*check.batches, batch)
+    while sum(len(b.seq) for b in kept) > KEPT_SAMPLES:
+        kept = kept[1:]
+    return replace(check, waiting=(), batches=kept)
+
+
+def _spans(modes: Array) -> str:
+    """Return modes as ranges: 0-5, 9, ..."""
+    runs = [list(run) for _, run in groupby(enumerate(modes), key=lambda pair: pair[1] - pair[0])]
+    spans = [
+        str(run[0][1]) if len(run) == 1 else f"{run[0][1]}-{run[-1][1]}"
+        for run in runs[:_SPANS_NAMED]
+    ]
+    return ", ".join(spans) + (", ..." if len(runs) > _SPANS_NAMED else "")

@@ -1,0 +1,214 @@
+"""Which loop the commands show: ``c[k+1] = leak c[k] - sum_d h_d (R s)[k+1-d]``.
+
+A few modes are followed, on every frame. An RTC that does what it says leaves nothing over: its
+commands follow from slopes and commands before them to the last digit. So the leak, the gain and
+the delay that a few modes show are known far better than they need be, whatever turbulence and
+noise are; where something is left over (clipping, turbulence played on the mirror, another matrix)
+nothing is said here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock
+from service.estimation.loopcheck import SIGNIFICANCE
+from service.estimation.windows import ClosedLoop
+from service.model.misregistration import unit_like
+
+Array = NDArray[Any]
+
+MODES_WATCHED = 12
+"""Spread over those in the loop."""
+
+KEPT_FRAMES = 640
+"""Frames remembered."""
+
+ENOUGH_FRAMES = 240
+"""Frames with all before them that they follow from; fewer say nothing."""
+
+JUDGED_EVERY = 200
+"""Frames between two verdicts."""
+
+MORE_TAPS = 4
+"""Frames looked back beyond the delay told: it may be longer, or the mirror lag."""
+
+EXPLAINED = 0.002
+"""Largest share of the steps' power that a mode may leave over to be believed."""
+
+LEAK_TOLERANCE = 0.004
+GAIN_TOLERANCE = 0.15
+"""Relative: gains may follow the seeing between two status messages."""
+
+DELAY_TOLERANCE = 0.75
+"""Frames: a mirror that takes 0.7 of one to rise is none of the loop's delay."""
+
+_STILL_M = 1e-13
+"""Steps of a mode smaller than this, RMS, are rounding."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopLaw:
+    """Frames of a loop that has not changed: feed it blocks with ``follow``."""
+
+    from_seq: int = 0
+    """Frames before this may have been made by another loop."""
+
+    cm_id: str | None = None
+    """The matrix that made them."""
+
+    modes: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    """``(n_watched,)``."""
+
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """``(n_frames,)`` oldest first, holes where frames were lost."""
+
+    commands_m: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """``(n_frames, n_watched)`` the integrator's own: no dither."""
+
+    seen_m: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """``(n_frames, n_watched)`` R s."""
+
+    judged_seq: int = -JUDGED_EVERY
+    """Up to here a verdict has been given."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundLaw:
+    """What the frames say of the loop, and what was told."""
+
+    leak: float
+    gain: float
+    """Over the gain told; negative: of the other sign."""
+
+    delay_frames: float
+    wrong: str = ""
+    """What disagrees, found and told; empty: nothing does."""
+
+
+def follow(law: LoopLaw, block: FrameBlock, loop: ClosedLoop) -> LoopLaw:
+    """Return the law after one more block, as far as it is of this loop."""
+    if block.first_seq < law.from_seq or _has_time(law, block):
+        return law
+    if law.cm_id != block.cm_id or not len(law.seq):
+        # the first frames of a matrix follow from slopes that another one multiplied
+        law = _begun(law, block.cm_id, loop)
+    if not len(law.modes):
+        return law
+    own = block.commands_m[:, law.modes]
+    if block.dither_m is not None:
+        own = own - block.dither_m[:, law.modes]
+    seen = block.slopes @ loop.reconstructor[law.modes].T
+    seq = np.arange(block.first_seq, block.next_seq)
+    return replace(
+        law,
+        seq=np.concatenate([law.seq, seq])[-KEPT_FRAMES:],
+        commands_m=np.concatenate([law.commands_m, own])[-KEPT_FRAMES:],
+        seen_m=np.concatenate([law.seen_m, seen])[-KEPT_FRAMES:],
+    )
+
+
+def _has_time(law: LoopLaw, block: FrameBlock) -> bool:
+    """Return whether these frames will be forgotten before the next verdict on their matrix."""
+    first_seq = law.judged_seq + JUDGED_EVERY - KEPT_FRAMES
+    return block.next_seq <= first_seq and block.cm_id == law.cm_id
+
+
+def judged(law: LoopLaw, loop: ClosedLoop, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
+    """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
+    if last_seq - law.judged_seq < JUDGED_EVERY:
+        return law, None
+    n_taps = int(loop.delay_frames) + MORE_TAPS
+    at = np.flatnonzero(law.seq <= last_seq)[n_taps:]
+    # a frame counts where none of those before it was lost
+    at = at[law.seq[at] - law.seq[at - n_taps] == n_taps]
+    if len(at) < ENOUGH_FRAMES:
+        return law, None
+    law = replace(law, judged_seq=int(law.seq[at[-1]]))
+    fits = _fitted(law.commands_m.astype(float), law.seen_m.astype(float), at, n_taps)
+    clear = np.flatnonzero(fits.clear)
+    if 2 * len(clear) < len(law.modes) or not len(clear):
+        return law, None
+    return law, _compared(fits, clear, loop.gains[law.modes].astype(float), loop)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Fits:
+    """The law of every mode watched, ``(n_watched,)`` each."""
+
+    clear: NDArray[np.bool_]
+    """Whether the mode moves and follows a law."""
+
+    leak: Array
+    leak_sigma: Array
+    gain: Array
+    delay_frames: Array
+
+
+def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
+    """Return the law of every mode, by the normal equations: a few unknowns, hundreds of frames.
+
+    A constant is free for every mode, and leaves with the means.
+    """
+    taps = np.arange(1, n_taps + 1)
+    moved, answered = np.ascontiguousarray(commands.T), np.ascontiguousarray(seen.T)
+    target, before = moved[:, at], moved[:, at - 1]
+    inputs = np.stack([before, *(answered[:, at - tap] for tap in taps)], axis=1)
+    inputs -= inputs.mean(axis=2, keepdims=True)
+    scale = np.sqrt(np.einsum("mkn,mkn->mk", inputs, inputs))
+    scale[scale == 0.0] = 1.0
+    inputs /= scale[:, :, None]
+    wanted = (target - target.mean(axis=1, keepdims=True))[:, :, None]
+    inverse = np.linalg.pinv(inputs @ inputs.transpose(0, 2, 1), hermitian=True)
+    weights = inverse @ (inputs @ wanted)
+    missed = wanted - inputs.transpose(0, 2, 1) @ weights
+    left, steps = np.sum(missed**2, axis=(1, 2)), target - before
+    weights = weights[:, :, 0] / scale
+    gain = -weights[:, 1:].sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        late = -(weights[:, 1:] @ taps) / gain
+    return _Fits(
+        clear=(steps.std(axis=1) >= _STILL_M) & (left <= EXPLAINED * np.sum(steps**2, axis=1)),
+        leak=weights[:, 0],
+        leak_sigma=np.sqrt(inverse[:, 0, 0] * left / len(at)) / scale[:, 0],
+        gain=gain,
+        delay_frames=np.where(gain == 0.0, np.inf, late),
+    )
+
+
+def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> FoundLaw:
+    leak, sigma, late = (
+        float(np.median(found[clear])) for found in (fits.leak, fits.leak_sigma, fits.delay_frames)
+    )
+    ratios = fits.gain[clear] / gains[clear]
+    gain, spread = float(np.median(ratios)), float(np.median(np.abs(ratios - np.median(ratios))))
+    wrong = []
+    if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE * sigma:
+        wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} told")
+    tolerance = GAIN_TOLERANCE + SIGNIFICANCE * min(spread, abs(gain)) / np.sqrt(len(clear))
+    if abs(gain - 1.0) > tolerance:
+        wrong.append(f"gain {gain:.3g} times the one told{_hint(gain)}")
+    if abs(late - loop.delay_frames) > DELAY_TOLERANCE:
+        wrong.append(f"delay {late:.2f} frames found, {loop.delay_frames:.2f} told")
+    return FoundLaw(leak=leak, gain=gain, delay_frames=late, wrong="; ".join(wrong))
+
+
+def _hint(gain: float) -> str:
+    """Return what a gain that no loop has looks like."""
+    if gain < 0.0:
+        return ": slopes or commands have the other sign than the matrix that the RTC names"
+    unit = unit_like(max(gain, 1.0 / max(gain, 1e-30)), 1.0)
+    whose = "commands" if gain > 1.0 else "the matrix's commands"
+    return f": {whose} look like {unit}, metres of OPD are expected" if unit else ""
+
+
+def _begun(law: LoopLaw, cm_id: str | None, loop: ClosedLoop) -> LoopLaw:
+    in_loop = np.flatnonzero(loop.gains > 0.0)
+    chosen = np.unique(np.linspace(0, len(in_loop) - 1, MODES_WATCHED).round().astype(int))
+    modes = in_loop[chosen] if len(in_loop) else in_loop
+    none = np.zeros((0, len(modes)), np.float32)
+    return LoopLaw(from_seq=law.from_seq, cm_id=cm_id, modes=modes, commands_m=none, seen_m=none)

@@ -1,0 +1,168 @@
+"""Registration from nothing known: a few smooth modes dithered with the loop open.
+
+With the loop open a dithered line is a measured column of the interaction matrix, so that no loop
+has to be known, let alone be stable, and the fit is that of a small matrix: Gauss-Newton steps,
+halved where they make it worse, every column with a gain of its own. An open loop leaves the
+pyramid a seventh of its response in 1" seeing and another mean shape of it: the result is good to
+some per cent of a subaperture, which is what closing a loop takes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation import solver
+from service.estimation.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
+from service.estimation.solver import LONGEST_STEP, Columns
+from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
+
+Array = NDArray[Any]
+
+APPROACHED = np.array([0.02, 0.02, np.deg2rad(0.1), 2e-3])
+"""A step shorter than this leaves the rest to the finer model (numeric units)."""
+
+LIMIT = np.array([3.0, 3.0, np.deg2rad(20.0), 0.15])
+"""Nobody looks further than this from the nominal registration (numeric units)."""
+
+UNEXPLAINED = 0.2
+"""Largest share of the columns' power, noise taken off, that the right registration may leave."""
+
+FAINTEST = 5.0
+"""σ of a line's gain from which on it is seen."""
+
+LARGEST_GAIN = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FarEstimate:
+    """Where the mirror is, from one window with the loop open."""
+
+    estimate: WindowEstimate
+    """Its covariance is the noise's alone."""
+
+    unexplained: float
+    """Share of the columns' power, noise taken off, that the model leaves."""
+
+    n_starts: int
+    """Starts that were tried."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FarSearch:
+    """Where to look, and with what."""
+
+    far: InteractionModel
+    """Of the dithered modes alone, columns in the order of the lines. Coarse: leads."""
+
+    near: InteractionModel
+    """The same, fine: decides."""
+
+    nominal: Misregistration
+    """Centre of the range."""
+
+    starts: tuple[Misregistration, ...]
+    """Tried in this order."""
+
+    def reaches(self, vector: Array) -> bool:
+        """Return whether a registration ``(4,)`` is within the range."""
+        return bool(np.all(np.abs(vector - self.nominal.vector) < LIMIT))
+
+
+def find(spectra: Spectra, search: FarSearch) -> FarEstimate | WindowRefused:
+    """Return where the first start leads from which the model explains the columns."""
+    columns, noise = _columns(spectra)
+    loop = ClosedLoop(
+        reconstructor=np.zeros((0, len(columns.matrix)), np.float32),
+        gains=np.zeros(0),
+        leak=1.0,
+        delay_frames=1.0,
+        frame_rate_hz=spectra.plan.frame_rate_hz,
+    )
+    modes = list(spectra.plan.modes)
+    # only the dithered modes are left, in the order of the lines
+    alone = replace(
+        spectra, commands=spectra.commands[:, :, modes], dither=spectra.dither[:, modes]
+    )
+    reason = "no start was given"
+    for tried, start in enumerate(search.starts, start=1):
+        landed = solver.approach(
+            search.far, columns, start.vector, approached=APPROACHED, allowed=search.reaches
+        )
+        if not landed.converged:
+            reason = f"steps from {start} do not converge"
+            continue
+        there = search.near.linearise(Misregistration.from_vector(landed.vector))
+        estimate = fit_window(alone, there, loop)
+        left = _unexplained(columns, noise, search.near.interaction_matrix(estimate.alpha))
+        found = FarEstimate(estimate=estimate, unexplained=left, n_starts=tried)
+        why_not = _why_not(found, search)
+        if why_not is None:
+            return found
+        reason = why_not
+    return not_found(reason, spectra)
+
+
+def not_found(reason: str, spectra: Spectra) -> WindowRefused:
+    """Return the refusal of a window of an open loop that led nowhere."""
+    return WindowRefused(
+        reason=f"registration not found: {reason}",
+        t_ns_utc=spectra.t_end_ns_utc,
+        kind=RefusalKind.NOT_FOUND,
+    )
+
+
+def _columns(spectra: Spectra) -> tuple[Columns, Array]:
+    """Return what the lines show of the interaction matrix, and the power of each one's noise.
+
+    The slopes at the lines over the known dither; the noise ``(n_lines,)`` is that of the bins
+    beside.
+    """
+    lines = np.arange(len(spectra.plan.modes))
+    known = spectra.dither[lines, list(spectra.plan.modes)].astype(complex)
+    beside = np.sum(np.abs(spectra.slopes[:, 1:]) ** 2, axis=2).mean(axis=1)
+    measured = (spectra.slopes[:, 0] / known[:, None]).real.T
+    columns = Columns(
+        matrix=measured,
+        weights=1.0 / np.sum(measured**2, axis=0),
+        rows=np.ones(len(measured), dtype=np.bool_),
+        signed=False,
+    )
+    # half of a complex bin's noise is in its real part
+    return columns, 0.5 * beside / np.abs(known) ** 2
+
+
+def _unexplained(columns: Columns, noise: Array, matrix: Array) -> float:
+    """Return the mean share of the columns that a matrix leaves, the noise taken off both."""
+    power, total = np.sum(matrix**2, axis=0), np.sum(columns.matrix**2, axis=0)
+    along = np.maximum(np.sum(matrix * columns.matrix, axis=0), 0.0)
+    left = total - along**2 / power - noise
+    return float(np.mean(left / np.maximum(total - noise, 0.1 * total)))
+
+
+def _why_not(found: FarEstimate, search: FarSearch) -> str | None:
+    """Return why an estimate is not believed, or None."""
+    estimate = found.estimate
+    gains = np.abs(estimate.optical_gain)
+    if estimate.gain_sigma is not None and np.any(gains < FAINTEST * estimate.gain_sigma):
+        return "the dither is not seen in the slopes: raise its amplitude or the window's length"
+    if gains.max() > LARGEST_GAIN:
+        return f"optical gains up to {gains.max():.1f}: the instrument file is another's"
+    lag = float(np.median(estimate.lag_frames))
+    if abs(lag) > MAX_LAG_FRAMES:
+        return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
+    if not search.reaches(estimate.alpha.vector):
+        return f"{estimate.alpha} is out of range"
+    if np.any(np.abs(estimate.step) > LONGEST_STEP):
+        return f"the finer model leads away from {estimate.alpha}"
+    if found.unexplained > UNEXPLAINED:
+        return (
+            f"{estimate.alpha} leaves {found.unexplained:.0%} of the response unexplained, "
+            f"expected at most {UNEXPLAINED:.0%}"
+        )
+    return None

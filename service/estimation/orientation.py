@@ -1,0 +1,263 @@
+"""Axes and signs of an RTC's slopes, and the rough rotation of the mirror, from its lowest orders.
+
+Which way the RTC counts rows and columns, which light it counts as positive and how the mirror is
+turned all show in tip, tilt and the few shapes after them. The gains of all shapes share one sign
+here: with a free sign for each, four orientations explain any matrix equally well, and tip and tilt
+alone leave two that differ by half a turn.
+
+Turning the mirror by a quarter and the axes of the slopes back is no change that any measurement
+could see. Among such equivalents the nominal rotation of the mirror decides when it is told; else
+the orientation with the fewest flips, and the least rotation among those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.models import LowOrder, coarse_sampling, low_order_of
+from service.estimation.reference import Reference, Target, target_of
+from service.estimation.solver import vertex
+from service.model.instrument import Instrument
+from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.kinds import SlopeOrder
+from service.model.misregistration import Misregistration, rotation, wrapped
+from service.model.modes import Basis
+from service.model.pyramid import Mapper
+from service.model.slopes import FLIPS, Orientation, SlopeRecipe, turned_mask
+
+Array = NDArray[np.float64]
+
+ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
+"""Rotations tried; shapes of degree 5 have lost a tenth half-way between two of them."""
+
+LEAST_LEAD = 0.08
+"""Another class of orientations must correlate worse by this much to be told apart."""
+
+LEAST_CORRELATION = 0.4
+"""Below, no orientation explains the lowest orders."""
+
+
+DOUBTFUL = 0.8
+"""Below, others than a stated orientation are looked at as well."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pose:
+    """One orientation of the slopes with the rotation at which it explains them best."""
+
+    slopes: SlopeRecipe
+    rotation_rad: float
+    correlation: float
+    """Mean correlation of the lowest orders with the model, one sign for all, -1..1."""
+
+    @property
+    def turned_class(self) -> tuple[SlopeOrder, int, int, bool]:
+        """What remains of it when quarter turns of everything do not count."""
+        axes = self.slopes.assumed_orientation
+        return self.slopes.order, axes.sign_x, axes.sign_y, self.mirrored
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the grid of the slopes is seen as in a looking-glass."""
+        return self.n_changes % 2 == 1
+
+    @property
+    def n_changes(self) -> int:
+        """Flips and swaps of the axes."""
+        return sum(getattr(self.slopes.assumed_orientation, name) for name in FLIPS)
+
+    def told(self) -> str:
+        """Return it in the words of the instrument file."""
+        return f"{setting_written(self.slopes)} at {np.rad2deg(self.rotation_rad):.0f} deg"
+
+
+def setting_written(slopes: SlopeRecipe) -> str:
+    """Return order and orientation of slopes as the instrument file says them."""
+    axes = slopes.assumed_orientation
+    flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
+    words = ", ".join([*flags, sign_written(axes)])
+    return f'order = "{slopes.order}", orientation = {{ {words} }}'
+
+
+def sign_written(axes: Orientation) -> str:
+    """Return the signs of an orientation as the instrument file says them."""
+    if axes.sign_x == axes.sign_y:
+        return f"sign = {axes.sign_x}"
+    return f"sign = [{axes.sign_x}, {axes.sign_y}]"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """What the lowest orders say."""
+
+    best: Pose
+    ties: tuple[Pose, ...]
+    """Others that explain them as well; empty: it is unique."""
+
+    @property
+    def refusal(self) -> str:
+        """Why no orientation can be told; empty: one can."""
+        if self.best.correlation < LEAST_CORRELATION:
+            return (
+                f"no orientation of the slopes explains the lowest orders (correlation "
+                f"{self.best.correlation:.2f}): the modes are another basis, or the matrix "
+                "another instrument's"
+            )
+        if self.ties:
+            named = "; ".join(pose.told() for pose in (self.best, *self.ties))
+            return (
+                f"the orientation is ambiguous: {named} explain the lowest orders equally well; "
+                "state [slopes] orientation, or measure more of the low modes"
+            )
+        return ""
+
+
+def overruled(stated: Pose, found: Pose) -> str:
+    """Return why a stated orientation cannot be the RTC's; empty: it may be."""
+    if found.correlation < stated.correlation + 2.0 * LEAST_LEAD:
+        return ""
+    told = (
+        f"with {setting_written(stated.slopes)} the lowest orders correlate with the model by "
+        f"{stated.correlation:.2f}, with {found.told()} by {found.correlation:.2f}"
+    )
+    if found.mirrored is not stated.mirrored:
+        return (
+            f"{told}: the slopes' grid is mirrored, or the actuators' coordinates are (parity = "
+            "-1) or are exchanged"
+        )
+    return f"{told}: correct [slopes]"
+
+
+def find_orientation(
+    instrument: Instrument, reference: Reference, basis: Basis, *, mapper: Mapper = map
+) -> Search:
+    """Return the orientation and rough rotation that explain the lowest orders best.
+
+    ``basis`` holds the columns of ``reference``. Shift and magnification are taken as nominal:
+    the lowest orders hardly feel them.
+    """
+    stated = instrument.slopes
+    settings = [stated] if stated.orientation is not None else list(_settings(stated))
+    poses = poses_of(instrument, reference, basis, settings, mapper=mapper)
+    return _judged(poses, instrument.mirror.nominal_rotation_rad)
+
+
+def poses_of(
+    instrument: Instrument,
+    reference: Reference,
+    basis: Basis,
+    settings: Sequence[SlopeRecipe],
+    *,
+    mapper: Mapper = map,
+) -> list[Pose]:
+    """Return how well each of these orders and orientations explains the lowest orders."""
+    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper)
+    low = replace(
+        reference,
+        matrix=turned.lowest.measured(reference.matrix),
+        modes=None,
+        noise=None,
+    )
+    return [
+        turned.pose(target_of(low, replace(instrument, slopes=slopes)), slopes)
+        for slopes in settings
+    ]
+
+
+def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> InteractionModel:
+    """Return a coarse model of every subaperture that some orientation calls valid."""
+    mask = rtc_valid_subapertures(instrument)
+    flags = (False, True)
+    turned = [
+        turned_mask(mask, Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y))
+        for swap, flip_x, flip_y in product(flags, flags, flags)
+    ]
+    every = replace(instrument.wfs, valid_subapertures=np.any(turned, axis=0))
+    order = instrument.slopes.kind.orders[0]
+    plain = replace(instrument.slopes, order=order, orientation=Orientation())
+    seen = replace(instrument, wfs=every, slopes=plain)
+    sampling = coarse_sampling(instrument)
+    return InteractionModel(
+        seen, basis, pupil_sampling=sampling, detector_nodes=sampling, mapper=mapper
+    )
+
+
+def _settings(told: SlopeRecipe) -> Iterator[SlopeRecipe]:
+    """Yield every orientation, and the components exchanged where the order can say that."""
+    order = told.order
+    plain, exchanged = order.kind.orders[:2]
+    others = {plain: [exchanged], exchanged: [plain]}
+    yield from settings_of(told, [order, *others.get(order, [])])
+
+
+def settings_of(told: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator[SlopeRecipe]:
+    """Yield every orientation and pair of signs in each of these orders."""
+    flags = (False, True)
+    for listed, swap, flip_x, flip_y, sign_x, sign_y in product(
+        orders, flags, flags, flags, (1, -1), (1, -1)
+    ):
+        axes = Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y, sign_x=sign_x, sign_y=sign_y)
+        yield replace(told, order=listed, orientation=axes)
+
+
+def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
+    best = max(pose.correlation for pose in poses)
+    near = [pose for pose in poses if pose.correlation > best - LEAST_LEAD]
+    leader = max(near, key=lambda pose: pose.correlation)
+
+    def preference(pose: Pose) -> tuple[float, float]:
+        if nominal_rad is not None:
+            return abs(wrapped(pose.rotation_rad - nominal_rad)), pose.n_changes
+        return pose.n_changes, abs(pose.rotation_rad)
+
+    classes: dict[object, list[Pose]] = {}
+    for pose in near:
+        classes.setdefault(pose.turned_class, []).append(pose)
+    chosen = min(classes.pop(leader.turned_class), key=preference)
+    ties = tuple(min(others, key=preference) for others in classes.values())
+    return Search(best=chosen, ties=ties)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Turned:
+    """What a coarse model says of the lowest orders at every rotation."""
+
+    lowest: LowOrder
+    columns: Array
+    """``(n_low, n_angles, n_slopes)`` the model's answer at each of ``ANGLES_RAD``."""
+
+    valid: NDArray[np.bool_]
+    """``(n, n)`` [y, x] subapertures of these slopes."""
+
+    @classmethod
+    def of(cls, model: InteractionModel, mapper: Mapper) -> _Turned:
+        """Turn the smoothest shapes of a model's modes round."""
+        lowest = low_order_of(model)
+        jacobian = np.asarray(model.sensor_jacobian(Misregistration()), dtype=np.float64)
+        points = model.pupil.points
+
+        def at(angle: int) -> Array:
+            return jacobian @ lowest.shapes.render(points @ rotation(ANGLES_RAD[angle]))
+
+        turned = np.array(list(mapper(at, range(len(ANGLES_RAD)))))
+        columns = np.ascontiguousarray(turned.transpose(2, 0, 1))
+        return cls(lowest=lowest, columns=columns, valid=model.valid)
+
+    def pose(self, target: Target, slopes: SlopeRecipe) -> Pose:
+        """Return the rotation at which the model explains these columns best."""
+        low = target.matrix / np.linalg.norm(target.matrix, axis=0)
+        seen = np.tile(target.valid[self.valid], slopes.kind.n_planes)
+        columns = self.columns if seen.all() else self.columns[:, :, seen]
+        along = np.matmul(columns, low.T[:, :, None])[:, :, 0]
+        norm = np.sqrt(np.einsum("las,las->la", columns, columns))
+        correlation = (along / norm).mean(axis=0)
+        best = int(np.argmax(correlation))
+        before, at, after = np.take(correlation, [best - 1, best, best + 1], mode="wrap")
+        step = vertex(before, at, after)
+        angle = ANGLES_RAD[best] + step * (ANGLES_RAD[1] - ANGLES_RAD[0])
+        return Pose(slopes=slopes, rotation_rad=wrapped(float(angle)), correlation=float(at))

@@ -1,0 +1,269 @@
+"""Which modes the RTC's own matrix controls, in which order, with which sign and how strongly.
+
+An RTC whose mode 10 has the other sign, or whose modes 3 and 40 are exchanged, closes its own loop
+as well as any other: its matrix knows. A matrix made by the model would drive that one mode apart.
+The pseudo-inverse of the RTC's matrix is the interaction matrix as that RTC knows it. Each of its
+columns is held against every mode of the model, at the registration that explains most of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.dialect import LARGEST_CONDITION
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+
+Array = NDArray[Any]
+
+RECOGNISED = 0.5
+"""Least correlation of a column with a mode for which it may be taken."""
+
+ADVANTAGE = 1.3
+"""A column is another mode's where it correlates better with that one by this factor."""
+
+FIRST_COLUMNS = 20
+"""Lowest columns that a far registration is found by: their waves are long."""
+
+GROWTH = 3
+"""Each next fit has so many times the columns of the last."""
+
+STEPS = 6
+"""Of each fit at most."""
+
+SETTLED = np.array([0.003, 0.003, 3e-4, 3e-4])
+"""A shorter step ends a fit, numeric units."""
+
+LINEAR = np.array([0.1, 0.1, np.deg2rad(0.5), 0.005])
+"""Further from where it was taken a linearisation is made anew, numeric units."""
+
+LONGEST_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
+"""Of one iteration, numeric units."""
+
+MOST_STRANGE = 0.3
+"""Share of columns that may be no mode of the model before all are taken for another basis."""
+
+UNLIKE_NEIGHBOURS = 1.6
+"""A mode that answers so many times as its neighbours do, or one over that, is named: those of
+healthy telescopes are within 1.12, but for the last of a basis that has all of a mirror's."""
+
+NEIGHBOURS = 10
+"""Modes on either side that a mode's response is compared with."""
+
+ROLLED = 0.8
+"""Share of misplaced modes that are so by as many places, when all are said to be rolled."""
+
+_NAMED = 8
+"""Modes that a sentence names at most."""
+
+LineariseAt = Callable[[Misregistration], Linearisation]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OwnMatrix:
+    """What the RTC's own matrix says of each mode that it controls."""
+
+    alpha: Misregistration
+    """Registration at which the model explains most of its columns."""
+
+    columns: NDArray[np.intp]
+    """``(n,)`` modes that it controls, in the RTC's numbering."""
+
+    modes: NDArray[np.intp]
+    """``(n,)`` mode of the model that each of them is; -1: none was recognised."""
+
+    response: NDArray[np.float64]
+    """``(n,)`` slopes per unit of command over the model's, signed; NaN: not recognised."""
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """``(n,)`` which columns are the mode that their number says, with the model's sign."""
+        return np.asarray((self.modes == self.columns) & (np.nan_to_num(self.response) > 0.0))
+
+    @property
+    def wrong(self) -> str:
+        """Which modes have another sign or place than the instrument file says; empty: none."""
+        strange = self.modes < 0
+        if strange.mean() > MOST_STRANGE:
+            return (
+                f"{int(strange.sum())} of the {len(self.modes)} modes that the RTC's own matrix "
+                "controls are none of the instrument file's: its slopes are listed in another "
+                "order, or its modes are another basis"
+            )
+        found = [self._order(), self._signs()]
+        return "; ".join(part for part in found if part)
+
+    @property
+    def uneven(self) -> str:
+        """Which modes answer otherwise than their neighbours; empty: none."""
+        recognised = np.flatnonzero(self.modes >= 0)
+        size = np.abs(self.response)
+        ratio = {
+            int(self.columns[k]): float(
+                size[k] / np.median(size[recognised[np.abs(recognised - k) <= NEIGHBOURS]])
+            )
+            for k in recognised
+        }
+        odd = [
+            f"mode {mode} {times:.2g} times"
+            for mode, times in ratio.items()
+            if not 1.0 / UNLIKE_NEIGHBOURS < times < UNLIKE_NEIGHBOURS
+        ]
+        if not odd:
+            return ""
+        return f"by the RTC's own matrix {_listed(odd)} as strongly as its neighbours"
+
+    @property
+    def typical_response(self) -> float | None:
+        """Median response of the modes that are known, over the drawing's; None: none is."""
+        return float(np.median(self.response[self.known])) if self.known.any() else None
+
+    @property
+    def text(self) -> str:
+        """What an operator should know of it, in one sentence."""
+        if self.wrong:
+            return self.wrong
+        size = self.typical_response
+        found = f"{int(self.known.sum())} of {len(self.columns)} modes are the instrument file's"
+        if size is not None and abs(size - 1.0) > 0.1:
+            found += f" and answer {size:.2f} times as drawn"
+        return f"{found}; {self.uneven}" if self.uneven else found
+
+    def _signs(self) -> str:
+        turned = self.columns[np.nan_to_num(self.response) < 0.0]
+        if not len(turned):
+            return ""
+        if len(turned) == 1:
+            return f"mode {turned[0]} has the other sign by the RTC's own matrix"
+        return f"modes {_listed(turned)} have the other sign by the RTC's own matrix"
+
+    def _order(self) -> str:
+        elsewhere = (self.modes >= 0) & (self.modes != self.columns)
+        if not elsewhere.any():
+            return ""
+        columns, modes = self.columns[elsewhere], self.modes[elsewhere]
+        by, times = np.unique(modes - columns, return_counts=True)
+        if times.max() > max(ROLLED * len(columns), 2):
+            whole = np.flatnonzero(modes - columns == by[times.argmax()])
+            return (
+                f"modes are rolled by {by[times.argmax()]:+d} by the RTC's own matrix: its mode "
+                f"{columns[whole[0]]} is the instrument file's {modes[whole[0]]}, and so on for "
+                f"{len(whole)} modes"
+            )
+        place = dict(zip(columns.tolist(), modes.tolist(), strict=True))
+        pairs = [(one, to) for one, to in place.items() if place.get(to) == one and one < to]
+        if 2 * len(pairs) == len(columns):
+            return (
+                f"modes {_listed([f'{one} and {to}' for one, to in pairs])} are exchanged by the "
+                "RTC's own matrix"
+            )
+        told = _listed([f"{one} is the instrument file's {to}" for one, to in place.items()])
+        return f"modes have other places by the RTC's own matrix: {told}"
+
+
+def recognise_modes(
+    reconstructor: NDArray[np.float32], linearise: LineariseAt, start: Misregistration
+) -> OwnMatrix | None:
+    """Return what a reconstructor ``(n_controlled, n_slopes)``, metres per slope, says of modes.
+
+    The registration is found from the lowest columns first, then from more and more of them, with
+    a free gain for each; columns that are recognised as no mode or as another one do not spoil it.
+    None: the matrix commands nothing, or holds numbers that are not finite.
+
+    Parameters
+    ----------
+    reconstructor
+        As the RTC multiplies with it; rows of zeros control nothing.
+    linearise
+        Makes the model's response at a registration, ``(n_slopes, n_modes)``.
+    start
+        Where the mirror is thought to be.
+    """
+    if not np.isfinite(reconstructor).all():
+        return None
+    columns = np.flatnonzero(np.any(reconstructor != 0.0, axis=1))
+    if not len(columns):
+        return None
+    inverse = np.linalg.pinv(reconstructor[columns].astype(float), rcond=1.0 / LARGEST_CONDITION)
+    seen = inverse / np.maximum(np.linalg.norm(inverse, axis=0), np.finfo(float).tiny)
+    alpha, near = start, linearise(start)
+    n = min(FIRST_COLUMNS, len(columns))
+    while True:
+        alpha, near = _registered(seen[:, :n], columns[:n], alpha, near, linearise)
+        if n == len(columns):
+            break
+        n = min(GROWTH * n, len(columns))
+    response = near.matrix_at(alpha)
+    modes = _recognised(seen, columns, response)
+    gains = np.full(len(columns), np.nan)
+    for k in np.flatnonzero(modes >= 0):
+        mode = response[:, modes[k]]
+        gains[k] = mode @ inverse[:, k] / (mode @ mode)
+    return OwnMatrix(alpha=alpha, columns=columns, modes=modes, response=gains)
+
+
+def _registered(
+    seen: Array,
+    columns: NDArray[np.intp],
+    alpha: Misregistration,
+    near: Linearisation,
+    linearise: LineariseAt,
+) -> tuple[Misregistration, Linearisation]:
+    """Return the registration that explains these columns of unit length, and a model near it."""
+    for _ in range(STEPS):
+        if np.any(np.abs(alpha.vector - near.alpha.vector) > LINEAR):
+            near = linearise(alpha)
+        response = near.matrix_at(alpha)
+        modes = _recognised(seen, columns, response)
+        usable = np.flatnonzero(modes >= 0)
+        if len(usable) < 3:
+            return alpha, near
+        step = _step(
+            seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
+        )
+        step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        alpha = Misregistration.from_vector(alpha.vector + step)
+        if np.all(np.abs(step) < SETTLED):
+            break
+    return alpha, near
+
+
+def _recognised(
+    seen: Array, columns: NDArray[np.intp], response: NDArray[np.float32]
+) -> NDArray[np.intp]:
+    """Return the mode that each column is, ``(n,)``; -1: none.
+
+    A column is the mode of its own number unless another one fits it clearly better.
+    """
+    size = np.maximum(np.linalg.norm(response, axis=0), np.finfo(np.float32).tiny)
+    likeness = np.abs((response / size).T @ seen)
+    own = likeness[columns, np.arange(len(columns))]
+    best = np.argmax(likeness, axis=0)
+    highest = likeness[best, np.arange(len(columns))]
+    modes = np.where(ADVANTAGE * own >= highest, columns, best)
+    taken = likeness[modes, np.arange(len(columns))]
+    return np.where(taken >= RECOGNISED, modes, -1)
+
+
+def _step(seen: Array, response: Array, derivatives: Array) -> Array:
+    """Return the step ``(4,)`` of α that explains columns of unit length, each with a free gain."""
+    length = np.linalg.norm(response, axis=0)
+    unit, moved = response / length, derivatives / length
+    gains = np.einsum("sm,sm->m", unit, seen)
+    # of every derivative only what is no gain of the mode itself
+    moved = moved - unit * np.einsum("sm,ksm->km", unit, moved)[:, None, :]
+    left = seen / gains - unit
+    normal = np.einsum("jsm,ksm->jk", moved, moved)
+    return np.asarray(np.linalg.solve(normal, np.einsum("jsm,sm->j", moved, left)))
+
+
+def _listed(things: Sequence[object] | NDArray[np.intp]) -> str:
+    """Return the first of some things in words, and how many more there are."""
+    first = [str(thing) for thing in things[:_NAMED]]
+    more = len(things) - len(first)
+    return ", ".join(first) + (f" and {more} more" if more else "")

@@ -1,0 +1,435 @@
+"""What ordinary telemetry, without a dither, says of the registration.
+
+Turbulence sits below a tenth of the frame rate, and there commands and slopes have it in common: a
+regression of one on the other is biased, by a third of a subaperture on a bright star in 20 m/s.
+Above it moves mostly the sensor's own noise, which the loop returns as commands ``d`` frames later:
+a dither that costs nothing. A filter that lets only that pass makes an instrument (in the sense of
+instrumental variables) of the commands, and sums over every frame make a noisy interaction matrix
+of it: a measurement to fit a model to, never a matrix to control with.
+
+The turbulence that is left in the filtered commands biases the shifts by the wind, steadily, and no
+integration removes it: docs/results/passive.md has by how much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from typing_extensions import override
+
+from service.errors import ModelError
+from service.estimation.estimate import Estimate
+from service.estimation.frames import FrameBlock, joined_frames
+from service.estimation.solver import Columns
+from service.estimation.windows import CHUNK_FRAMES
+from service.model.interaction import Linearisation
+from service.model.misregistration import Misregistration
+
+Array = NDArray[Any]
+
+N_TAPS = 11
+"""Longer filters know turbulence from noise no better, and lose more frames at every gap."""
+
+CORNER = 0.08
+"""Of the frame rate. Above 0.1 a bright star leaves too little signal; below 0.06 a wind of 20 m/s
+is let in."""
+
+BAND_FRAMES = 32
+"""Filtered in one product: more are mostly products with nothing, fewer mostly calls."""
+
+LEAST_DELAY_FRAMES = 2
+"""With less the instrument may not look ahead, and a tenth of the signal is left."""
+
+_LOOP_GAIN = 0.35
+"""Of a loop at gain 0.6 and an optical gain of 0.6: where its noise is amplified."""
+
+_TURBULENCE_SLOPE = 34.0 / 3.0
+"""Of the squared temporal spectrum of a mode above its corner: twice 17/3 (Conan et al. 1995)."""
+
+_LOWEST = 0.015
+"""Of the frame rate: below it turbulence is as strong as here."""
+
+TAPER_FRAMES = 32
+"""Frames over which a run of telemetry fades in after a gap, and out before the next. Turbulence is
+a thousand times stronger than the noise that is looked for: a sum of their products that is cut off
+is worse than none. Runs of less than twice as many frames are left out."""
+
+MOST_OTHER_MODES = 8
+"""Modes outside the loop that a dither of sines may move; where more move it is turbulence or
+random signs, which the filtered commands have nothing in common with."""
+
+SAMPLES_KEPT = 64
+"""Filtered frames kept, from which the fit learns how noisy slopes are."""
+
+SAMPLE_FRAMES = 128
+"""One sample in as many frames."""
+
+BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
+"""1 σ nobody may go below without a dither: the wind's bias, and the model's own error."""
+
+BIAS_OVER_SCATTER = np.array([10.0, 10.0, 2.0, 0.0])
+"""Where the loop's own noise hardly shows (a bright star in 25 m/s) the scatter grows, and the bias
+with it: a quarter of a subaperture was seen at a scatter of 0.014. On 12 subapertures a bright star
+turns it, too: by up to 1 deg at a scatter of 0.4, in OOPAO's loops."""
+
+SHRUNK = 0.2
+"""Share of the correlations between parameters that is not believed. They are estimated from the
+few errors of columns that are independent of one another, and what seems known best of all is what
+chance has made small: one look in 60 lay five of its own σ away in such a direction."""
+
+MIN_FRAMES_PER_MODE = 5
+"""Fewer effective frames leave the command covariance too noisy to invert."""
+
+MIN_SAMPLES = 8
+"""Fewer filtered frames do not tell how noisy the slopes are."""
+
+_REACH = N_TAPS - 1
+"""Frames besides its own that a filtered one is made of."""
+
+_RANK = 1e-6
+"""Of the largest singular value: what is smaller is rounding."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HighPass:
+    """A finite filter of commands: ``z_k = sum_j taps_j c_{k + ahead - j}``."""
+
+    taps: NDArray[np.float32]
+    """``(n_taps,)``, the largest 1 either way; they add up to 0."""
+
+    ahead: int
+    """Frames after k that z_k depends on: their commands do not know the noise of frame k."""
+
+    band: NDArray[np.float32]
+    """``(BAND_FRAMES, BAND_FRAMES + n_taps - 1)`` the taps, a column further in each row."""
+
+    def __call__(self, commands: Array) -> Array:
+        """Return ``(n_rows - n_taps + 1, n_modes)`` of contiguous commands ``(n_rows, n_modes)``.
+
+        Row i belongs to frame ``i + behind``.
+        """
+        reach = len(self.taps) - 1
+        out = np.empty((len(commands) - reach, commands.shape[1]), np.float32)
+        for start in range(0, len(out), BAND_FRAMES):
+            part = out[start : start + BAND_FRAMES]
+            n = len(part)
+            np.matmul(self.band[:n, : n + reach], commands[start : start + n + reach], out=part)
+        return out
+
+    @property
+    def behind(self) -> int:
+        """Frames before k that z_k depends on."""
+        return len(self.taps) - 1 - self.ahead
+
+
+@cache
+def high_pass(delay_frames: float) -> HighPass:
+    """Return the filter for a loop of this delay.
+
+    It makes ``E[z c]``, the response to the sensor's noise, as large as it can be for the noise of
+    ``sum z s``, turbulence counted as noise that is ``CORNER`` away from being as strong: with a
+    loop's reply to white noise, ``P = 1 / |1 - z^-1 + g z^-d|^2``, taps solve ``M a = v``, where
+    ``v`` is the inverse transform of P and ``M`` that of ``P (1 + W)``.
+
+    Raises
+    ------
+    ModelError
+        If the delay is shorter than ``LEAST_DELAY_FRAMES``.
+    """
+    if delay_frames < LEAST_DELAY_FRAMES:
+        raise ModelError(
+            f"passive estimate: found a delay of {delay_frames:g} frames, expected at least "
+            f"{LEAST_DELAY_FRAMES}: a loop as quick answers noise before it can be told from the "
+            "response"
+        )
+    ahead = int(delay_frames) - 1
+    turns = (np.arange(4096) + 0.5) / 8192
+    z = np.exp(-2j * np.pi * turns)
+    power = 1.0 / np.abs(1.0 - 0.999 * z + _LOOP_GAIN * z ** round(delay_frames)) ** 2
+    turbulence = (CORNER / np.maximum(turns, _LOWEST)) ** _TURBULENCE_SLOPE
+    shifted = np.exp(-2j * np.pi * np.outer(np.arange(N_TAPS) - ahead, turns))
+    signal = (shifted * power).real.mean(axis=1)
+    noise = ((shifted * power * (1.0 + turbulence)) @ shifted.conj().T).real / len(turns)
+    taps = np.linalg.solve(noise, signal)
+    taps -= taps.mean()
+    taps = (taps / np.abs(taps).max()).astype(np.float32)
+    none = np.zeros(BAND_FRAMES - 1, np.float32)
+    band = scipy.linalg.toeplitz([taps[-1], *none], [*taps[::-1], *none])
+    return HighPass(taps=taps, ahead=ahead, band=band)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PassiveEstimate(Estimate):
+    """What ordinary telemetry says of the registration.
+
+    The covariance is of the scatter alone: the bias is not in it. A misfit of NaN: too young to
+    tell.
+    """
+
+    @property
+    def bias_excess(self) -> NDArray[np.float64]:
+        """``(4,)`` variance that the scatter tells the bias to have beyond ``BIAS_FLOOR``."""
+        return np.asarray(np.diag(self.covariance) * BIAS_OVER_SCATTER**2)
+
+    @property
+    @override
+    def sigma(self) -> NDArray[np.float64]:
+        """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
+        return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2 + self.bias_excess))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Passive:
+    """Forgetting sums over filtered commands: feed it blocks with ``accumulate``."""
+
+    n_modes: int
+    """Controlled modes: the only ones that move by themselves."""
+
+    memory_frames: float
+    """Frames after which a sample's weight has fallen to 1/e."""
+
+    delay_frames: float = 2.0
+    """Of the loop; with less than two nothing is summed."""
+
+    sums: tuple[NDArray[np.float32], ...] = ()
+    """Of s z^T ``(n_slopes, n_modes)``, metres, of c z^T and z z^T ``(n_modes, n_modes)``, metres²;
+    z are the filtered commands. Empty: of no frame."""
+
+    n_effective: float = 0.0
+    """Frames in the sums, forgetting included."""
+
+    samples: tuple[tuple[Array, Array], ...] = ()
+    """Filtered slopes ``(n_slopes,)`` and commands ``(n_modes,)`` of single frames."""
+
+    tail: FrameBlock | None = None
+    """The last frames, as many as the filter reaches back."""
+
+    waiting: tuple[FrameBlock, ...] = ()
+    """Frames that are not multiplied yet and, before them, those that the filter reaches back to;
+    each block follows the one before."""
+
+    n_others: int = 0
+    """Modes outside the loop that move in them."""
+
+    begun: bool = False
+    """Whether frames of this run have been multiplied."""
+
+    from_seq: int = 0
+    """Frames before this one are left out."""
+
+    since_ns_utc: int = 0
+    """No frame in the sums is older, by the RTC's clock; 0: not known."""
+
+    @property
+    def n_waiting(self) -> int:
+        """Frames that the filter reaches both ends of and that are not multiplied yet."""
+        return max(sum(block.n_frames for block in self.waiting) - _REACH, 0)
+
+    @property
+    def why_unusable(self) -> str | None:
+        """Return why this loop's telemetry says nothing, or None."""
+        if self.delay_frames >= LEAST_DELAY_FRAMES:
+            return None
+        return (
+            f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
+            f"{LEAST_DELAY_FRAMES} are needed to tell the mirror's response from noise"
+        )
+
+
+def accumulate(state: Passive, block: FrameBlock) -> Passive:
+    """Add a block of frames.
+
+    What moves outside the loop is taken out of the instrument, where its response would pass for
+    that of controlled modes; and so is a dither of sines of modes in the loop. Windows read that,
+    and a look that did so too would have another bias than one of the loop's own noise.
+    """
+    if state.why_unusable is not None or block.first_seq < state.from_seq:
+        return state
+    n_columns, block = block.commands_m.shape[1], _with_dither_beside(state, block)
+    if state.tail is not None and not _follows(block, state.tail):
+        state = replace(_ended(state), tail=None)
+    before = () if state.tail is None else (state.tail,)
+    n_others = len(_others(state, *before, block))
+    if state.n_waiting and n_others != state.n_others:
+        # a dither begins or ends: what it is taken out of must hold it from end to end
+        state = _ended(state)
+    if block.commands_m.shape[1] == n_columns:  # a dither of the loop's modes is no noise
+        state = _sampled(state, *before, block)
+    tail = block if block.n_frames >= _REACH else joined_frames((*before, block))
+    waiting = (*(state.waiting or before), block)
+    state = replace(state, tail=tail.last(_REACH), waiting=waiting, n_others=n_others)
+    if state.n_waiting < CHUNK_FRAMES + TAPER_FRAMES:
+        return state
+    frames = joined_frames(waiting)
+    state = _summed(state, frames.rows(0, frames.n_frames - TAPER_FRAMES), last=False)
+    return replace(state, waiting=(frames.last(_REACH + TAPER_FRAMES),), begun=True)
+
+
+def _with_dither_beside(state: Passive, block: FrameBlock) -> FrameBlock:
+    """Return a block whose commands have the dither of controlled modes as further columns."""
+    dither, block = block.dither_m, replace(block, dither_m=None)
+    if dither is None:
+        return block
+    moved = np.flatnonzero(dither[:, : state.n_modes].any(axis=0))
+    if not 0 < len(moved) <= MOST_OTHER_MODES:
+        return block
+    return replace(block, commands_m=np.hstack([block.commands_m, dither[:, moved]]))
+
+
+def _follows(block: FrameBlock, tail: FrameBlock) -> bool:
+    """Return whether frames go on where others end, and have as many columns."""
+    return block.follows(tail) and block.commands_m.shape[1] == tail.commands_m.shape[1]
+
+
+def _ended(state: Passive) -> Passive:
+    """Return the state after the end of a run: what waits fades out, or was too short to count."""
+    if state.n_waiting >= (1 if state.begun else 2 * TAPER_FRAMES):
+        state = _summed(state, joined_frames(state.waiting), last=True)
+    return replace(state, waiting=(), begun=False)
+
+
+def _others(state: Passive, *blocks: FrameBlock) -> NDArray[np.intp]:
+    """Return which modes outside the loop move; none where more do than any dither of sines."""
+    moves = [block.commands_m[:, state.n_modes :].any(axis=0) for block in blocks]
+    others = state.n_modes + np.flatnonzero(np.any(moves, axis=0))
+    return others[:0] if len(others) > MOST_OTHER_MODES else others
+
+
+def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
+    """Keep one filtered frame in ``SAMPLE_FRAMES``; all blocks but the last are short."""
+    first, n_rows = blocks[0].first_seq, sum(block.n_frames for block in blocks) - _REACH
+    n_due = (first + n_rows) // SAMPLE_FRAMES - first // SAMPLE_FRAMES
+    if n_rows < 1 or not n_due:
+        return state
+    head = joined_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
+    n_before, chosen = n_rows + _REACH - blocks[-1].n_frames, high_pass(state.delay_frames)
+    later = range(SAMPLE_FRAMES - n_before, n_rows - n_before, SAMPLE_FRAMES)[: n_due - 1]
+    samples = list(state.samples)
+    for rows in (head, *(blocks[-1].rows(start, start + N_TAPS) for start in later)):
+        filtered = chosen(rows.commands_m[:, : state.n_modes])[0]
+        samples.append((chosen.taps[::-1] @ rows.slopes, filtered))
+    return replace(state, samples=tuple(samples[-SAMPLES_KEPT:]))
+
+
+def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
+    """Add frames to the sums: the first of a run, the last, or some between."""
+    chosen, commands = high_pass(state.delay_frames), frames.commands_m
+    # those that the filter reaches both ends of
+    now = slice(chosen.behind, frames.n_frames - chosen.ahead)
+    before = slice(now.start - 1, now.stop - 1)
+    filtered, n = chosen(commands[:, : state.n_modes]), frames.n_frames - _REACH
+    others = _others(state, frames)
+    if len(others):
+        moving = np.hstack([commands[now][:, others], commands[before][:, others]])
+        shapes, size, _ = np.linalg.svd(moving.astype(float), full_matrices=False)
+        known = shapes[:, size > _RANK * size[0]].astype(np.float32)
+        filtered -= known @ (known.T @ filtered)
+    weight = np.ones((n, 1), np.float32)
+    rise = np.sin(np.pi / 2 * (np.arange(TAPER_FRAMES) + 0.5) / TAPER_FRAMES)[:, None] ** 2
+    if not state.begun:
+        weight[:TAPER_FRAMES] *= rise[:n]
+    if last:
+        weight[-TAPER_FRAMES:] *= rise[::-1][-n:]
+    filtered *= weight
+    with_z = (frames.slopes[now], commands[now, : state.n_modes], filtered)
+    sums = tuple(rows.T @ filtered for rows in with_z)
+    fade = np.float32(np.exp(-n / state.memory_frames))
+    for new, old in zip(sums, state.sums, strict=False):
+        new += fade * old
+    n_effective = float(fade) * state.n_effective + float(weight.sum())
+    return replace(state, sums=sums, n_effective=n_effective)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PassiveMatrix:
+    """What the telemetry makes of the interaction matrix."""
+
+    matrix: NDArray[np.float64]
+    """``(n_slopes, n_modes)`` of the controlled modes, slope per metre OPD."""
+
+    shape: NDArray[np.float64]
+    """``(n_modes, n_modes)`` covariance of the columns' errors, for slopes with noise of 1."""
+
+
+def passive_matrix(state: Passive) -> PassiveMatrix | None:
+    """Return the noisy interaction matrix, or None when the telemetry is too young.
+
+    ``D = (sum s z^T) (sum c z^T)^-1``, as z is independent of the noise of its frame. The errors of
+    its columns go as ``X^-T (sum z z^T) X^-1`` with ``X = sum c z^T``.
+    """
+    if not state.sums or state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
+        return None
+    cross, moved, power = (part.astype(np.float64) for part in state.sums)
+    own = np.diag(power)
+    if not own.any():
+        return None
+    # relative to each mode's own power, or the strongest would drown the weakest, with just
+    # enough of the mean for a mode that never moves
+    ridge = np.diag(1e-6 * own + 1e-9 * own.mean())
+    inverse = np.linalg.inv(moved + ridge)
+    return PassiveMatrix(
+        matrix=cross @ inverse,
+        shape=inverse.T @ power @ inverse,
+    )
+
+
+def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
+    """Fit α and a free gain per mode to the noisy matrix; None when too few frames came.
+
+    By :mod:`service.estimation.solver`, each mode weighted by its noise. The errors of the columns
+    are not independent (Q), nor are those of the slopes (S): fast turbulence looks like modes. With
+    both, ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S. ``SHRUNK`` of its
+    correlations is taken away.
+    """
+    found = passive_matrix(state)
+    if found is None:
+        return None
+    modes = slice(0, state.n_modes)
+    noise = np.diag(found.shape)
+    # a mode that never moves has no noise, and no weight
+    least = noise[noise > 0.0].min()
+    weights = np.where(noise > 0.0, least / np.maximum(noise, least), 0.0)
+    every = np.ones(len(found.matrix), dtype=np.bool_)
+    seen = Columns(matrix=found.matrix, weights=weights, rows=every).project(
+        linearisation.matrix[:, modes], linearisation.derivatives[:, :, modes]
+    )
+    normal = np.linalg.inv(seen.normal)
+    step = normal @ seen.scores.sum(axis=1)
+    left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
+    freedom = (len(left) - 1) * (weights @ noise) - 4 * least
+    variance = float(np.sum(left**2, axis=0) @ weights / freedom)
+    scores = _patterns(left, noise).T @ (seen.jacobian * weights)
+    spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
+    covariance = variance * normal @ spread @ normal
+    return PassiveEstimate(
+        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        covariance=(1.0 - SHRUNK) * covariance + SHRUNK * np.diag(np.diag(covariance)),
+        optical_gain=seen.gains,
+        misfit=variance / _slope_variance(state, found.matrix),
+        step=step,
+    )
+
+
+def _patterns(left: Array, noise: Array) -> Array:
+    """Return what is left of every mode's column as patterns P of the slopes' errors: S = P P^T.
+
+    Their trace is the number of slopes: errors without correlation would make the unit matrix.
+    """
+    moving = noise > 0.0
+    patterns = left[:, moving] / np.sqrt(noise[moving])
+    return np.asarray(patterns * np.sqrt(len(left) / np.sum(patterns**2)))
+
+
+def _slope_variance(state: Passive, matrix: Array) -> float:
+    """Return the variance of a slope's noise at the frequencies of the filter."""
+    if len(state.samples) < MIN_SAMPLES:
+        return float("nan")
+    slopes = np.array([slopes for slopes, _ in state.samples])
+    commands = np.array([commands for _, commands in state.samples])
+    passed = float(np.sum(high_pass(state.delay_frames).taps ** 2))
+    return float(np.mean((slopes - commands @ matrix.T) ** 2)) / passed

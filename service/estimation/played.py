@@ -1,0 +1,330 @@
+"""What the frames hold of a dither: whether it is what was asked for, whether the slopes answer.
+
+The telemetry has the dither's part of every command in columns of its own, and modes outside the
+loop move by nothing else. Once a second the strength of each mode, on its line, is compared with
+what was asked for, and the power of the slopes on the lines with what a mirror that obeys would
+make of it; the noise of that is read off beside the lines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.comb import cosines_and_sines
+from service.estimation.frames import FrameBlock
+
+Array = NDArray[Any]
+
+CHECK_S = 1.0
+"""Of frames that hold the dither, between two findings."""
+
+LEAST_FRAMES = 50
+
+LOUDER, WEAKER = 1.25, 0.5
+"""Of what was asked for: a mode that is beyond is named."""
+
+AMPLIFIED = 3.0
+"""Times what its column says a mode may carry that the loop has just begun to control: its status
+tells so up to a second later than the frames show it."""
+
+STRAY = 0.2
+"""Share of what was asked for in all that modes nobody asked for may carry together."""
+
+_NAMED = 4
+
+_GLANCED = 8
+"""Slopes of a frame that tell whether all need be compared."""
+
+SIDES_HZ = (-11, -7, -3, 3, 7, 11)
+"""Where the noise of the slopes is measured, relative to a line; whole periods of a second."""
+
+HEARD_LINES = 4
+"""Lines on which the slopes are looked at: those that should show most."""
+
+UNANSWERED = 0.03
+"""Share of the power expected below which, by 3 σ, nothing has moved: an optical gain of 0.17."""
+
+REPEATED = 0.02
+"""Share of frames with the very slopes of the frame before: these are frozen, and tell nothing."""
+
+_nothing = partial(np.zeros, (), np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Asked:
+    """A dither as the service asked for it."""
+
+    modes: tuple[int, ...]
+    """0-based basis indices."""
+
+    amplitude_m: tuple[float, ...]
+    """RMS of each, metres OPD."""
+
+    frequency_hz: tuple[float, ...]
+    """One for each mode of a sine; random signs have none."""
+
+    frame_rate_hz: float
+    first_seq: int
+    stop_seq: int
+    """First frame that holds it, and the first that holds it no more."""
+
+    own: tuple[bool, ...]
+    """Whether a mode is outside the loop: all that its command does is the dither. In the loop it
+    is amplified, and its column alone tells how strong it is."""
+
+    response: tuple[float, ...] = ()
+    """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
+
+    @property
+    def heard(self) -> list[int]:
+        """Which of the modes asked for are looked for in the slopes."""
+        if not self.frequency_hz or not self.response:
+            return []
+        expected = np.square(self.amplitude_m) * self.response
+        return [int(k) for k in np.argsort(expected)[::-1][:HEARD_LINES]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """What a second of frames holds of a dither."""
+
+    found_m: float
+    """RMS of all modes together, metres OPD."""
+
+    asked_m: float
+    text: str
+    """What is otherwise than it was asked for; empty: nothing."""
+
+    unanswered: str | None = None
+    """How the slopes do not answer it; empty: they do; None: there is too little light to tell."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Meter:
+    """Sums over the frames of a dither: feed it blocks with ``measured``."""
+
+    asked: Asked
+    n_frames: int = 0
+    """Summed so far."""
+
+    squares: Array = field(default_factory=_nothing)
+    """``(n_modes,)`` sum of the squares of the dither columns, metres²."""
+
+    lines: Array = field(default_factory=_nothing)
+    """``(2, n_asked)`` dither columns and steps of the commands of the asked modes, demodulated."""
+
+    last_m: Array | None = None
+    """``(n_asked,)`` commands of the frame before the next block; None: it is not known."""
+
+    next_seq: int = 0
+    """The frame those are followed by."""
+
+    slopes: Array = field(default_factory=_nothing)
+    """``(2 * n_heard * (1 + n_sides), n_slopes)`` slopes times cosines, then sines, on and beside
+    each line heard."""
+
+    n_repeated: int = 0
+    """Frames with the very slopes of the frame before."""
+
+    doubted: bool = False
+    """Whether the second before held what the loop may have made of modes outside it."""
+
+    powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the slopes on the lines, its variance, and what is expected, summed until it can be told
+    whether they answer."""
+
+
+def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
+    """Add a block of frames; return what was found if a second of them is full."""
+    asked, found = meter.asked, None
+    start = max(asked.first_seq - block.first_seq, 0)
+    stop = max(min(asked.stop_seq - block.first_seq, block.n_frames), 0)
+    while start < stop:
+        end = min(start + _enough(asked) - meter.n_frames, stop)
+        meter, new = _added(meter, block.rows(start, end))
+        start, found = end, new or found
+    return meter, found
+
+
+def asked_anew(meter: Meter, asked: Asked) -> Meter:
+    """Return the meter of the same dither whose modes have come into the loop, or left it."""
+    return meter if asked.own == meter.asked.own else Meter(asked=asked)
+
+
+def _enough(asked: Asked) -> int:
+    return max(round(CHECK_S * asked.frame_rate_hz), LEAST_FRAMES)
+
+
+def _added(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
+    """Add frames that fill a second at most."""
+    asked, dither = meter.asked, block.dither_m
+    if dither is None or not block.is_dithered:
+        return meter, None
+    squares = np.einsum("km,km->m", dither, dither).astype(float)
+    meter, lines = _demodulated(meter, block, dither[:, list(asked.modes)])
+    meter = _heard(meter, block.slopes, block.first_seq)
+    meter = replace(
+        meter,
+        n_frames=meter.n_frames + len(dither),
+        squares=meter.squares + squares,
+        lines=meter.lines + lines,
+    )
+    if meter.n_frames < _enough(asked):
+        return meter, None
+    powers = _powers(meter)
+    unanswered = _unanswered(powers, asked)
+    found, doubted = _found(meter)
+    begun = Meter(asked=asked, last_m=meter.last_m, next_seq=meter.next_seq, doubted=doubted)
+    if unanswered is None:
+        begun = replace(begun, powers=powers)
+    return begun, replace(found, unanswered=unanswered)
+
+
+def _demodulated(meter: Meter, block: FrameBlock, dither: Array) -> tuple[Meter, Array]:
+    """Return ``(2, n_asked)`` sums at the lines; random signs have none and are left out.
+
+    Of the commands the steps from frame to frame: turbulence that is played on the mirror is slow.
+    """
+    asked = meter.asked
+    if not asked.frequency_hz:
+        return meter, np.zeros((2, len(asked.modes)), complex)
+    commands = block.commands_m[:, list(asked.modes)].astype(float)
+    follows = meter.last_m is not None and meter.next_seq == block.first_seq
+    before = meter.last_m if follows else commands[0]
+    steps = np.diff(commands, axis=0, prepend=np.asarray(before)[None])
+    seq = block.first_seq + np.arange(len(commands))
+    phasors = np.exp(-2j * np.pi * np.outer(seq / asked.frame_rate_hz, asked.frequency_hz))
+    meter = replace(meter, last_m=commands[-1], next_seq=block.next_seq)
+    return meter, np.stack([(phasors * dither).sum(axis=0), (phasors * steps).sum(axis=0)])
+
+
+def _heard(meter: Meter, slopes: Array, first_seq: int) -> Meter:
+    """Add slopes to the sums on and beside the lines."""
+    asked = meter.asked
+    lines = np.array(asked.frequency_hz)[asked.heard]
+    if not len(lines):
+        return meter
+    bins_hz = (lines[:, None] + np.array([0, *SIDES_HZ])).ravel()
+    seq = first_seq - asked.first_seq + np.arange(len(slopes))
+    turns = np.outer(bins_hz / asked.frame_rate_hz, seq)
+    summed = np.concatenate(cosines_and_sines(turns)) @ slopes
+    return replace(
+        meter,
+        slopes=meter.slopes + summed,
+        n_repeated=meter.n_repeated + _repeated(slopes),
+    )
+
+
+def _repeated(slopes: Array) -> int:
+    """Return how many frames have the very slopes of the frame before."""
+    first = slopes[:, :_GLANCED]
+    again = 1 + np.flatnonzero((first[1:] == first[:-1]).all(axis=1))
+    return int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
+
+
+def _powers(meter: Meter) -> tuple[float, float, float]:
+    """Return the power on the lines beyond the noise, its variance, and what is expected.
+
+    What earlier seconds have told is in it, where that was too little for a verdict.
+    """
+    asked, heard, before = meter.asked, meter.asked.heard, meter.powers
+    if not heard or meter.n_repeated > REPEATED * meter.n_frames:
+        return before
+    parts = np.einsum("ks,ks->k", meter.slopes, meter.slopes).astype(float)
+    power = parts.reshape(2, len(heard), -1).sum(axis=0)
+    sides = power[:, 1:]
+    beyond = np.sum(power[:, 0] - sides.mean(axis=1))
+    variance = np.sum(sides.var(axis=1, ddof=1)) * (1.0 + 1.0 / sides.shape[1])
+    expected = np.sum(np.abs(meter.lines[0][heard]) ** 2 * np.array(asked.response)[heard])
+    return before[0] + beyond, before[1] + variance, before[2] + expected
+
+
+def _unanswered(powers: tuple[float, float, float], asked: Asked) -> str | None:
+    """Return how the slopes do not answer the dither; empty: they do; None: nobody can tell."""
+    beyond, variance, expected = powers
+    if not expected:
+        return None
+    share, sigma = beyond / expected, np.sqrt(variance) / expected
+    if share - 3.0 * sigma > UNANSWERED:
+        return ""
+    if share + 3.0 * sigma > UNANSWERED:
+        return None
+    modes = ", ".join(str(asked.modes[k]) for k in sorted(asked.heard))
+    return (
+        f"the slopes hold {100.0 * max(share, 0.0):.1f} ± {100.0 * sigma:.1f} % of the power that "
+        f"modes {modes} should put on their lines"
+    )
+
+
+def _found(meter: Meter) -> tuple[Finding, bool]:
+    """Return what a second of frames holds, and whether the loop may have made it of its dither."""
+    asked = meter.asked
+    rms = np.sqrt(meter.squares / meter.n_frames)
+    wanted, modes = np.array(asked.amplitude_m), list(asked.modes)
+    told, moved = np.abs(meter.lines) * np.sqrt(2.0) / meter.n_frames
+    carried, own, doubted = rms[modes], np.array(asked.own), False
+    if asked.frequency_hz:
+        fraction = np.array(asked.frequency_hz) / asked.frame_rate_hz
+        moved = moved / np.abs(2.0 * np.sin(np.pi * fraction))
+        beyond = own & (moved > LOUDER * told)
+        doubted = bool(np.any(beyond & (moved <= AMPLIFIED * told)))
+        if doubted and not meter.doubted:
+            own = own & (moved > AMPLIFIED * told)
+        # a mode of the loop answers the dither: there its column alone tells how strong it is
+        carried = np.maximum(carried, np.where(own, moved, 0.0))
+    stray = rms.copy()
+    stray[modes] = 0.0
+    total = float(np.sqrt(np.sum(carried**2) + np.sum(stray**2)))
+    wanted_total = float(np.sqrt(np.sum(wanted**2)))
+    said = [
+        *_off(asked, carried, wanted, told),
+        *_strays(stray, wanted_total),
+        *_hidden(asked, own, told, moved),
+    ]
+    head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in all, {1e9 * wanted_total:.3g} nm"
+    text = f"{head} were asked for: {'; '.join(said)}" if said else ""
+    return Finding(found_m=total, asked_m=wanted_total, text=text), doubted
+
+
+def _off(asked: Asked, carried: Array, wanted: Array, told: Array) -> list[str]:
+    """Return which of the modes asked for are too strong, too weak, or at another frequency."""
+    ratio, said = carried / wanted, []
+    for k in np.flatnonzero((ratio > LOUDER) | (ratio < WEAKER))[:_NAMED]:
+        found = f"mode {asked.modes[k]} carries {1e9 * carried[k]:.3g} nm"
+        said.append(f"{found} instead of {1e9 * wanted[k]:.3g} nm")
+    if not asked.frequency_hz:
+        return said
+    for k in np.flatnonzero((ratio >= WEAKER) & (told < WEAKER * carried))[:_NAMED]:
+        line = f"{asked.frequency_hz[k]:g} Hz"
+        said.append(f"mode {asked.modes[k]} moves at another frequency than {line}")
+    return said
+
+
+def _strays(stray: Array, wanted_m: float) -> list[str]:
+    """Return which modes carry a dither that nobody asked for."""
+    together = float(np.sqrt(np.sum(stray**2)))
+    if together <= STRAY * wanted_m:
+        return []
+    worst = np.argsort(stray)[::-1]
+    worst = worst[stray[worst] > 0.0]
+    named = ", ".join(str(mode) for mode in sorted(worst[:_NAMED].tolist()))
+    more = ", ..." if len(worst) > _NAMED else ""
+    return [f"modes nobody asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
+
+
+def _hidden(asked: Asked, own: Array, told: Array, moved: Array) -> list[str]:
+    """Return which modes outside the loop move more than the columns of the dither say."""
+    if not asked.frequency_hz:
+        return []
+    much = moved > LOUDER * told + WEAKER * np.array(asked.amplitude_m)
+    hidden = np.flatnonzero(own & much)
+    return [
+        f"the commands of mode {asked.modes[k]} hold {1e9 * moved[k]:.3g} nm at "
+        f"{asked.frequency_hz[k]:g} Hz, its dither column {1e9 * told[k]:.3g} nm"
+        for k in hidden[:_NAMED]
+    ]

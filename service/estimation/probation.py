@@ -1,0 +1,313 @@
+"""Whether the loop is worse with a matrix than with the one before, seeing taken into account.
+
+A matrix at the edge of stability makes a few modes ring near a tenth of the frame rate, while
+slopes and wavefront error hardly change: a pyramid that saturates holds what runs away. So every
+mode's steps are compared with its own under the matrix before. A step of the integrator is
+``g R s``, the residual as the loop sees it; its change over ``LAG`` frames keeps what rings and
+leaves turbulence out. What all modes have in common, their median, is seeing, light, optical gain.
+
+Whatever single modes do, the residual as a whole is compared as well, as the matrix before reads it
+(``residual``); and the slopes, block by block, for a loop that is lost has no tenth of a second.
+
+Numbers are from docs/results/probation.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.comparison import (
+    INNER,
+    OUTER,
+    SLOPES,
+    Before,
+    Part,
+    ProbationFinding,
+    Verdict,
+    compared,
+    not_compared,
+)
+from service.estimation.frames import FrameBlock
+from service.estimation.health import EdgeWatch
+from service.estimation.residual import Reader
+
+Array = NDArray[np.float64]
+
+WITHIN_S = 3.0
+"""Telemetry with the new matrix that is looked at; the verdict comes at the latest then."""
+
+PART_S = 0.1
+"""Between two looks."""
+
+LONGEST_PART_S = 0.2
+"""A block that lasts longer makes more than one part."""
+
+LEAST_PART = 50
+"""Frames: fewer scatter too much to be looked at."""
+
+LEAST_BEFORE_S = 0.8
+"""Telemetry with the matrix before; with less nothing is said."""
+
+SETTLING_S = 0.03
+"""After a swap the loop goes over from one equilibrium to the other."""
+
+LAG = 5
+"""Frames: what rings at a tenth of the frame rate shows twice, what is slow not at all. An optical
+gain of a half makes loops ring at a twentieth; with 3 it shows half as well, with 8 none at an
+eighth."""
+
+RUNAWAY = 9.0
+"""Power of the slopes of one frame over that of the strongest frame before, in so many of those
+looked at in a row (``RUNAWAY_FRAMES``): nothing but a loop that is lost does that, and at once."""
+
+RUNAWAY_FRAMES = 4
+
+RETURNED_S = 1.0
+"""With the matrix before in use again, until the loop is said to be as it was, or lost."""
+
+RETURNED_PARTS = 10
+"""Last parts by which that is told."""
+
+_REACH = LAG + 1
+_SAMPLED = 4
+"""One of so many frames is looked at for the power of all slopes."""
+
+_SPARSE = 7
+"""One of so many frames is looked at for a dither: odd, or a sine of half or a quarter of the frame
+rate may be 0 in all of them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Comparison:
+    """Telemetry with the matrix in use and with the one before: feed it blocks with ``observe``."""
+
+    cm_id: str | None = None
+    """Of the last block."""
+
+    modes: NDArray[np.intp] | None = None
+    """In the loop, by the last block."""
+
+    tail: FrameBlock | None = None
+    """The last frames, as many as a step and its change reach back."""
+
+    n_skipped: int = 0
+    """Frames since the swap that do not count yet."""
+
+    parts: tuple[Part, ...] = ()
+    """Of the matrix in use, oldest first, as many as may count; the last one is under way."""
+
+    before: Before | None = None
+    """None: nothing is being compared."""
+
+    reader: Reader | None = None
+    """Reads the residual: of the matrix in use, or of the one before while it is compared."""
+
+    healthy: Before | None = None
+    """What the last matrix found worse was compared with: the next one is compared with it, too."""
+
+    returned: bool = False
+    """Whether it is: the one in use has taken the place of a worse one."""
+
+    n_runaway: int = 0
+    """Frames looked at in a row that are beyond all before."""
+
+    dithered: frozenset[int] = frozenset()
+    """Modes that a dither has moved: they do not count."""
+
+    found: ProbationFinding | None = None
+    """Of the last swap; None: it is being looked at, or there was none."""
+
+
+def begun_anew(state: Comparison, why: str) -> Comparison:
+    """Return a comparison that knows nothing; one that was under way ends without a verdict."""
+    found = state.found
+    if state.before is not None and state.cm_id is not None:
+        found = not_compared(state.before.id, state.cm_id, why)
+    return Comparison(cm_id=state.cm_id, found=found)
+
+
+def observe(
+    state: Comparison,
+    block: FrameBlock,
+    modes: NDArray[np.intp],
+    lines_hz: tuple[float, ...] = (),
+    edge: EdgeWatch | None = None,
+    matrix: NDArray[np.float32] | None = None,
+) -> Comparison:
+    """Add a block of a closed loop of these modes.
+
+    ``lines_hz`` are those of the dither that plays; frames of a dither without lines do not count.
+    ``matrix`` is the one that multiplied its slopes; None: its numbers are not known. A long block
+    makes several parts: they scatter as those do that come one by one.
+    """
+    n_parts = int(np.ceil(block.n_frames * block.dt_ns * 1e-9 / LONGEST_PART_S))
+    cuts = np.linspace(0, block.n_frames, max(n_parts, 1) + 1).astype(int).tolist()
+    for start, stop in pairwise(cuts):
+        some = block.rows(start, stop)
+        if some.cm_id != state.cm_id or (state.tail and some.session != state.tail.session):
+            state = _swapped(state, some)
+        if state.before is None and state.healthy is None:
+            state = replace(state, reader=_reader(state.reader, matrix))
+        state = _observed(_watched(state, some), some, modes, lines_hz, edge)
+    return state
+
+
+def _reader(reader: Reader | None, matrix: NDArray[np.float32] | None) -> Reader | None:
+    if matrix is None:
+        return None
+    return reader if reader is not None and reader.matrix is matrix else Reader.of(matrix)
+
+
+def _watched(state: Comparison, block: FrameBlock) -> Comparison:
+    """Look at the slopes frame by frame: a loop that is lost at once waits for no part."""
+    before = state.before
+    if before is None or not before.peak or block.cm_id is None or state.returned:
+        return state
+    looked, n_runaway = block.slopes[::_SAMPLED], state.n_runaway
+    for power in np.einsum("ks,ks->k", looked, looked).tolist():
+        n_runaway = n_runaway + 1 if power > RUNAWAY * before.peak else 0
+    state = replace(state, n_runaway=n_runaway)
+    if n_runaway < RUNAWAY_FRAMES:
+        return state
+    text = (
+        f"the slopes of {n_runaway} frames in a row, one of {_SAMPLED}, are over "
+        f"{np.sqrt(RUNAWAY):.0f} times the strongest with {before.id}"
+    )
+    found = ProbationFinding(
+        verdict=Verdict.WORSE, before=before.id, after=block.cm_id, text=text, lost=True
+    )
+    return _ended(state, found)
+
+
+def _ended(state: Comparison, found: ProbationFinding) -> Comparison:
+    """Return what is left of a comparison that is over."""
+    healthy = state.before if found.verdict is Verdict.WORSE else None
+    return replace(state, found=found, before=None, healthy=healthy, n_runaway=0)
+
+
+def _observed(
+    state: Comparison,
+    block: FrameBlock,
+    modes: NDArray[np.intp],
+    lines_hz: tuple[float, ...],
+    edge: EdgeWatch | None,
+) -> Comparison:
+    tail, state = state.tail, replace(state, modes=modes)
+    some = None if block.dither_m is None else block.dither_m[::_SPARSE].any(axis=0)
+    moved = () if some is None else np.flatnonzero(some).tolist()
+    n_modes = int(modes[-1]) + 1
+    rows = block.commands_m[:, :n_modes]
+    if tail is not None and block.follows(tail):
+        rows = np.concatenate((tail.commands_m[:, :n_modes], rows))
+    state = replace(state, tail=block.last(_REACH) if block.n_frames >= _REACH else None)
+    if moved and not lines_hz:
+        return state
+    if not state.dithered.issuperset(moved):
+        state = replace(state, dithered=state.dithered.union(moved))
+    if state.n_skipped < SETTLING_S * 1e9 / block.dt_ns:
+        return replace(state, n_skipped=state.n_skipped + block.n_frames)
+    steps = _changes(rows)
+    lines = tuple(f * block.dt_ns * 1e-9 for f in lines_hz) if moved else ()
+    reader, residual = (None, None) if state.reader is None else state.reader.read(block)
+    state = replace(state, reader=reader)
+    if len(steps) < 3 * (1 + 2 * len(lines)):
+        return state
+    part = replace(_part(block, steps, lines, edge), residual=residual)
+    return _looked(_added(state, part, block), block)
+
+
+def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
+    """Return what is compared from now on: what there is of the matrix until now is the before."""
+    same_session = state.tail is not None and state.tail.session == block.session
+    fresh = Comparison(cm_id=block.cm_id, dithered=state.dithered)
+    if state.healthy is not None and block.cm_id is not None and same_session:
+        return replace(fresh, before=state.healthy, reader=state.reader, returned=True)
+    if state.cm_id is None or block.cm_id is None or state.modes is None or not same_session:
+        return fresh
+    lasted_s = sum(part.n_frames for part in state.parts) * block.dt_ns * 1e-9
+    if lasted_s < LEAST_BEFORE_S:
+        why = f"only {lasted_s:.1f} s of telemetry with {state.cm_id} to compare with"
+        return replace(fresh, found=not_compared(state.cm_id, block.cm_id, why))
+    before = Before.of(state.cm_id, state.parts, state.modes)
+    return replace(fresh, before=before, reader=state.reader)
+
+
+def _changes(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return ``(n_rows - LAG - 1, n_modes)`` how each step differs from that ``LAG`` frames ago."""
+    steps = rows[1:] - rows[:-1]
+    return np.asarray(steps[LAG:] - steps[:-LAG])
+
+
+def _part(
+    block: FrameBlock,
+    steps: NDArray[np.float32],
+    lines: tuple[float, ...],
+    edge: EdgeWatch | None,
+) -> Part:
+    """Return the sums of one block; sines of these frequencies, cycles per frame, are left out."""
+    n_frames = float(len(steps))
+    power = np.zeros(block.commands_m.shape[1] + 3)
+    moved = np.einsum("km,km->m", steps, steps)
+    if lines:
+        sines = _sines(len(steps), lines)
+        played = sines.T @ steps
+        # of a basis: what is left has as much less power
+        moved = np.maximum(moved - np.einsum("km,km->m", played, played), 0.0)
+        moved *= n_frames / (n_frames - sines.shape[1])
+    power[: steps.shape[1]] = moved
+    looked = block.slopes[::_SAMPLED]
+    power[SLOPES] = n_frames * np.vdot(looked, looked) / len(looked)
+    peak = float(np.einsum("ks,ks->k", looked, looked).max())
+    if edge is not None:
+        last = block.commands_m[-1, edge.modes]
+        outer = edge.outer @ last
+        power[OUTER] = n_frames * (outer @ outer) / len(outer)
+        power[INNER] = n_frames * max(float(last @ (edge.inner @ last)), 0.0)
+    return Part(n_frames=n_frames, power=power, peak=peak)
+
+
+@cache
+def _sines(n_frames: int, lines: tuple[float, ...]) -> NDArray[np.float32]:
+    """Return ``(n_frames, 2 n_lines)`` an orthonormal basis of sines, whatever their phases."""
+    angles = 2.0 * np.pi * np.outer(np.arange(n_frames), lines)
+    basis, _ = np.linalg.qr(np.hstack([np.cos(angles), np.sin(angles)]))
+    return np.asarray(basis, np.float32)
+
+
+def _added(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
+    """Add sums to the part under way, or begin another one."""
+    dt_s, parts = block.dt_ns * 1e-9, state.parts
+    length = max(PART_S / dt_s, LEAST_PART)
+    last = parts[-1] if parts else None
+    if last is not None and last.n_frames < length - _REACH:
+        part, parts = last.plus(part), parts[:-1]
+    kept = round(WITHIN_S / dt_s / length)
+    return replace(state, parts=(*parts, part)[-kept:])
+
+
+def _looked(state: Comparison, block: FrameBlock) -> Comparison:
+    """Judge what there is, at the end of each part; say nothing before there is enough."""
+    before = state.before
+    if before is None or block.cm_id is None:
+        return state
+    dt_s = block.dt_ns * 1e-9
+    # a block that does not follow another loses some frames to the filter
+    if state.parts[-1].n_frames < max(PART_S / dt_s, LEAST_PART) - _REACH:
+        return state
+    known = np.intersect1d(before.modes, () if state.modes is None else state.modes)
+    modes = np.setdiff1d(known, np.fromiter(state.dithered, np.intp))
+    after_s = sum(part.n_frames for part in state.parts) * dt_s
+    if state.returned and after_s < RETURNED_S:
+        return state
+    looked_at = state.parts[-RETURNED_PARTS:] if state.returned else state.parts
+    found = compared(before, looked_at, modes.astype(np.intp), block.cm_id)
+    over = after_s >= WITHIN_S - PART_S
+    waits = found.verdict is (Verdict.WORSE if state.returned else Verdict.AS_GOOD)
+    if waits and not over and not (state.returned and found.lost):
+        return state
+    return _ended(state, replace(found, after_s=after_s))

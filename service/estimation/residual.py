@@ -1,0 +1,185 @@
+"""How large the residual is that a loop leaves, with the seeing taken out.
+
+A matrix that is believed reads the residual from the slopes, whichever matrix closes the loop. With
+the command taken off, it is the turbulence itself; how far that moves in a few hundredths of a
+second tells how hard the loop's work is just now. Both are compared mode by mode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.frames import FrameBlock
+
+Array = NDArray[np.float64]
+
+STRIDE = 8
+"""One of so many frames is looked at."""
+
+LAG = 4
+"""Samples between two positions of the turbulence whose difference counts."""
+
+GROUP = 5
+"""Parts that are taken together to see how much the residual scatters."""
+
+WORSE = 1.21
+"""Residual power, seeing taken out, that is worse: 1.1 in wavefront error."""
+
+SIGMAS = 4.0
+"""Of the scatter beyond that: it is known from a few groups only."""
+
+LEAST_SCATTER = 0.12
+"""Of the logarithm of the residual's power in one group: turbulence is never steadier."""
+
+LEAST_PARTS = GROUP + 1
+"""Fewer say nothing: what is worse by far shows in the steps and in the slopes."""
+
+LATELY = 3
+"""Parts by which it is told whether a loop is lost."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Residual:
+    """Sums over some frames, ``(n_modes,)`` of squares in metres²."""
+
+    n_seen: int
+    seen: Array
+    """Of the residual."""
+
+    n_moved: int
+    moved: Array
+    """Of how far the turbulence has moved between samples."""
+
+    commanded: Array
+    """Of the command, over the samples of ``seen``."""
+
+    def plus(self, other: Residual | None) -> Residual:
+        """Return the sums over both."""
+        if other is None or len(other.seen) != len(self.seen):
+            return self
+        return Residual(
+            n_seen=self.n_seen + other.n_seen,
+            seen=self.seen + other.seen,
+            n_moved=self.n_moved + other.n_moved,
+            moved=self.moved + other.moved,
+            commanded=self.commanded + other.commanded,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reader:
+    """The matrix that reads the residual, and where it saw the turbulence last."""
+
+    matrix: NDArray[np.float32]
+    """``(n_modes, n_slopes)``."""
+
+    seq: NDArray[np.int64]
+    """``(n,)`` of the last samples, ``LAG`` at most."""
+
+    turbulence_m: NDArray[np.float32]
+    """``(n, n_modes)`` where it was then."""
+
+    @classmethod
+    def of(cls, matrix: NDArray[np.float32]) -> Reader:
+        """Return one that has seen nothing yet."""
+        none = np.zeros((0, len(matrix)), np.float32)
+        return cls(matrix=matrix, seq=np.zeros(0, np.int64), turbulence_m=none)
+
+    def read(self, block: FrameBlock) -> tuple[Reader, Residual | None]:
+        """Return what a block holds; None: none of its frames is looked at."""
+        rows = np.arange(-block.first_seq % STRIDE, block.n_frames, STRIDE)
+        if not len(rows):
+            return self, None
+        n_modes = len(self.matrix)
+        residual = block.slopes[rows] @ self.matrix.T
+        commands = block.commands_m[rows, :n_modes]
+        seq = np.concatenate([self.seq, block.first_seq + rows])
+        turbulence = np.concatenate([self.turbulence_m, residual - commands])
+        moved = turbulence[LAG:] - turbulence[:-LAG]
+        moved = moved[seq[LAG:] - seq[:-LAG] == LAG * STRIDE]
+        sums = Residual(
+            n_seen=len(rows),
+            seen=_squares(residual),
+            n_moved=len(moved),
+            moved=_squares(moved),
+            commanded=_squares(commands),
+        )
+        return replace(self, seq=seq[-LAG:], turbulence_m=turbulence[-LAG:]), sums
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualLevel:
+    """The residual of a loop that is believed: what another one is compared with."""
+
+    total: Residual
+    scatter: float
+    """1 σ of the logarithm of the residual's power in one group, seeing taken out."""
+
+    n_groups: int
+
+    @classmethod
+    def of(cls, parts: tuple[Residual, ...]) -> ResidualLevel | None:
+        """Return what these parts come to; None: they are too few to tell."""
+        total = total_of(parts)
+        groups = [total_of(parts[k : k + GROUP]) for k in range(0, len(parts) - GROUP + 1, GROUP)]
+        if total is None or not total.n_moved or len(groups) < 2:
+            return None
+        modes = np.arange(len(total.seen))
+        known = [g for g in groups if g is not None and g.n_moved]
+        logs = [np.log(ratio(total, group, modes)) for group in known]
+        scatter = max(float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0, LEAST_SCATTER)
+        return cls(total=total, scatter=scatter, n_groups=len(known))
+
+    def limit(self, n_parts: int) -> float:
+        """Return the ratio of powers beyond which so many parts are worse."""
+        n_groups = max(n_parts / GROUP, 0.2)
+        scatter = self.scatter * np.sqrt(1.0 / self.n_groups + 1.0 / n_groups)
+        return float(WORSE * np.exp(SIGMAS * scatter))
+
+    def lost(self, parts: tuple[Residual, ...]) -> bool:
+        """Return whether the loop does no longer what it is for.
+
+        Its residual is as large as the turbulence that the mirror followed before, or the mirror
+        moves by far more than that.
+        """
+        last = total_of(parts[-LATELY:])
+        if last is None or not last.n_seen:
+            return False
+        followed = self.total.commanded.sum() / self.total.n_seen
+        left, moves = last.seen.sum() / last.n_seen, last.commanded.sum() / last.n_seen
+        return bool(left > followed or moves > 10.0 * followed)
+
+
+def total_of(parts: tuple[Residual, ...]) -> Residual | None:
+    """Return the sums over parts; None: there is none."""
+    total = None
+    for part in parts:
+        total = part.plus(total)
+    return total
+
+
+def ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:
+    """Return the residual's power in these modes over that before, seeing taken out.
+
+    How the turbulence moves in a mode that runs away is told wrongly: no mode is forgiven more than
+    twice what the median mode is.
+    """
+    if not len(modes) or not after.n_seen:
+        return 1.0
+    was, now = (r.seen[modes] / r.n_seen for r in (before, after))
+    harder = np.ones(len(modes))
+    if before.n_moved and after.n_moved:
+        moved, moves = (r.moved[modes] / r.n_moved for r in (before, after))
+        harder = np.where(moved > 0.0, moves / np.where(moved > 0.0, moved, 1.0), 1.0)
+        common = float(np.median(harder))
+        # half its own, for that scatters; noise does not become less with the seeing
+        harder = np.clip(np.sqrt(harder * common), 1.0, max(2.0 * common, 1.0))
+    total = float(was.sum())
+    return float((now / harder).sum() / total) if total > 0.0 else 1.0
+
+
+def _squares(rows: NDArray[np.float32]) -> Array:
+    return np.asarray(np.einsum("km,km->m", rows, rows), np.float64)

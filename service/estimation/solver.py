@@ -1,0 +1,428 @@
+"""The registration that explains measured columns: variable projection, step by step.
+
+Every mode has a gain of its own, which is linear and therefore known once the rest is:
+``g_j = D_j·Y_j / D_j·D_j``. What remains is a problem in the registration alone, with the Jacobian
+``J_jk = g_j (1 - P_j) dD_j/dα_k``, P_j the projection on D_j. Matrices that were measured and those
+that telemetry shows are fitted alike.
+
+All four parameters move together: far steps on few modes and a coarse grid, near ones on all. The
+lowest modes lead from afar, for their slopes change smoothly over more than a subaperture; high
+modes are precise, and blind beyond half their own wavelength.
+
+Unknowns beside the registration are small, linear, and held back by what is usual: each is one more
+derivative in the projection, with a prior of its own. A turn of the slope axes is always among
+them: a pyramid whose edges are turned by a degree would otherwise turn the registration by 0.007
+deg with 400 modes, and by 0.06 deg with the lowest 40.
+
+References
+----------
+Kaufman 1975, BIT 15, 49; Golub & Pereyra 2003, Inverse Problems 19, R1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.models import FitModels, Optic
+from service.model.interaction import InteractionModel
+from service.model.kinds import SignalKind
+from service.model.misregistration import Misregistration
+from service.model.slopes import signals_of_slopes, slopes_of
+
+Array = NDArray[np.float64]
+
+LONGEST_STEP = np.array([0.8, 0.8, np.deg2rad(4.0), 0.04])
+"""A step further than this trusts the derivatives too far (numeric units)."""
+
+APPROACHED = np.array([0.02, 0.02, np.deg2rad(0.05), 1e-3])
+"""A coarse step shorter than this leaves the rest to the fine grid."""
+
+SETTLED = np.array([5e-4, 5e-4, np.deg2rad(5e-4), 1e-5])
+"""A fine step shorter than this is the last."""
+
+LIMIT = np.array([4.0, 4.0, np.inf, 0.25])
+"""No registration lies further from the nominal one (numeric units; any rotation may)."""
+
+MOST_FAR_STEPS = 12
+MOST_NEAR_STEPS = 6
+_HALVINGS = 3
+
+SLOPE_TURN_SIGMA_RAD = np.deg2rad(1.5)
+"""A pyramid is aligned to the pixels to a degree or two."""
+
+GAIN_MAP_ORDER = 4
+"""Of the polynomial in x and y that the gain over the pupil is."""
+
+GAIN_MAP_SIGMA = 0.3
+"""Of each coefficient of the gain map."""
+
+ANAMORPHOSIS_SIGMA = 0.02
+"""Half the stretch of the mirror's image along one axis over the other."""
+
+OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.MODULATION: 0.5}
+"""How far what a file says of an instrument may be off, as a logarithm: a coupling of 0.35 might be
+0.18 or 0.53."""
+
+UNKNOWN_SIGMA = 1.0
+"""The same of what a file says to be unknown."""
+
+LONGEST_OPTIC_STEP = 0.4
+"""A step of such a logarithm beyond this trusts the derivatives too far."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Columns:
+    """Measured columns of an interaction matrix, and how much each counts."""
+
+    matrix: Array
+    """``(n_slopes, n_columns)`` slope per unit command."""
+
+    weights: Array
+    """``(n_columns,)`` each column's share in χ²."""
+
+    rows: NDArray[np.bool_]
+    """``(n_slopes,)`` slopes that count."""
+
+    signed: bool = True
+    """Whether a gain may be negative; if not, such a column has nothing in common with the model,
+    and does not pull."""
+
+    def project(self, model: NDArray[Any], derivatives: NDArray[Any]) -> Projection:
+        """Return the gains, residual and Jacobian of a model ``(n_slopes, n_columns)``.
+
+        ``derivatives`` is ``(n_unknowns, n_slopes, n_columns)``.
+        """
+        matrix = np.asarray(model[self.rows], dtype=np.float64)
+        measured = self.matrix[self.rows]
+        power = np.sum(matrix**2, axis=0)
+        gains = np.sum(matrix * measured, axis=0) / power
+        if not self.signed:
+            gains = np.maximum(gains, 0.0)
+        jacobian = derivatives[:, self.rows].astype(np.float64)
+        along = np.einsum("ksm,sm->km", jacobian, matrix) / power
+        for k, part in enumerate(along):
+            jacobian[k] -= matrix * part
+        jacobian *= gains
+        return Projection(
+            gains=gains,
+            residual=measured - matrix * gains,
+            jacobian=jacobian,
+            weights=self.weights,
+        )
+
+    def misfit(self, model: NDArray[Any]) -> float:
+        """Return χ² per unit weight at the best gains: 0 is perfect, 1 nothing in common.
+
+        A column whose best gain is negative has nothing in common with the model.
+        """
+        matrix = np.asarray(model[self.rows], dtype=np.float64)
+        measured = self.matrix[self.rows]
+        along = np.sum(matrix * measured, axis=0)
+        explained = np.maximum(along, 0.0) ** 2 / np.sum(matrix**2, axis=0)
+        total = np.sum(measured**2, axis=0)
+        return float((total - explained) @ self.weights / (total @ self.weights))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Projection:
+    """The measurement against the model at one registration, to first order about it."""
+
+    gains: Array
+    """``(n_modes,)`` best gain of each mode."""
+
+    residual: Array
+    """``(n_rows, n_modes)`` measurement less model, its gains applied."""
+
+    jacobian: Array
+    """``(n_unknowns, n_rows, n_modes)`` change of the model, its part along the mode removed."""
+
+    weights: Array
+    """``(n_modes,)`` of each mode in χ²."""
+
+    @property
+    def chi(self) -> float:
+        """Weighted sum of squares of the residual."""
+        return float(np.sum(self.residual**2, axis=0) @ self.weights)
+
+    @property
+    def chi_at_best(self) -> float:
+        """What is left of it at the best step to first order."""
+        return self.chi - float(self.scores.sum(axis=1) @ self.best_step)
+
+    @property
+    def best_step(self) -> Array:
+        """``(n_unknowns,)`` the step to where least is left, to first order."""
+        held = self.normal + 1e-9 * np.diag(np.diag(self.normal))
+        return np.linalg.solve(held, self.scores.sum(axis=1))
+
+    @property
+    def scores(self) -> Array:
+        """``(n_unknowns, n_modes)`` what each mode says each unknown should do."""
+        along = np.einsum("ksm,sm->km", self.jacobian, self.residual)
+        return np.asarray(along * self.weights)
+
+    @property
+    def normal(self) -> Array:
+        """Normal matrix of all modes together, ``(n_unknowns, n_unknowns)``."""
+        picked = self.jacobian * np.sqrt(self.weights)
+        flat = picked.reshape(len(picked), -1)
+        return np.asarray(flat @ flat.T)
+
+    @property
+    def normals(self) -> Array:
+        """Normal matrix of every mode, ``(n_modes, n_unknowns, n_unknowns)``."""
+        by_mode = self.jacobian.transpose(2, 0, 1)
+        return np.asarray(by_mode @ by_mode.transpose(0, 2, 1) * self.weights[:, None, None])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Approach:
+    """Where a start led on the coarse grid."""
+
+    vector: Array
+    """``(4,)`` numeric units."""
+
+    misfit: float
+    """Share of χ² not explained, 0..1."""
+
+    converged: bool
+    n_matrices: int = 0
+    """Interaction matrices computed on the way, those for derivatives included."""
+
+
+def within_limits(vector: Array) -> bool:
+    """Return whether a registration is one that an instrument could have."""
+    return bool(np.all(np.abs(vector - [0.0, 0.0, 0.0, 1.0]) < LIMIT))
+
+
+def approach(
+    model: InteractionModel,
+    columns: Columns,
+    start: Array,
+    *,
+    approached: Array = APPROACHED,
+    allowed: Callable[[Array], bool] = within_limits,
+) -> Approach:
+    """Return where Gauss-Newton steps on few modes lead from a start.
+
+    A step that makes the misfit worse is halved; a start from which none makes it better has
+    failed, as has one at which no column has anything in common with the model.
+    """
+    vector = start.astype(float)
+    matrix = model.interaction_matrix(Misregistration.from_vector(vector))
+    misfit, n = columns.misfit(matrix), 1
+    converged = False
+    for _ in range(MOST_FAR_STEPS):
+        derivatives = model.derivatives(Misregistration.from_vector(vector))
+        seen, n = columns.project(matrix, derivatives), n + 4
+        if not seen.gains.any():
+            break
+        damped = seen.normal + 1e-6 * np.diag(np.diag(seen.normal))
+        step = np.linalg.solve(damped, seen.scores.sum(axis=1))
+        step /= max(1.0, float(np.max(np.abs(step) / LONGEST_STEP)))
+        converged, tried = bool(np.all(np.abs(step) < approached)), step
+        for _ in range(_HALVINGS):
+            if allowed(vector + tried):
+                found = model.interaction_matrix(Misregistration.from_vector(vector + tried))
+                left, n = columns.misfit(found), n + 1
+                if left <= misfit * (1.0 + 1e-9):
+                    vector, matrix, misfit = vector + tried, found, left
+                    break
+            tried = tried / 2.0
+        else:
+            break
+        if converged:
+            break
+    return Approach(vector=vector, misfit=misfit, converged=converged, n_matrices=n)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Nuisances:
+    """The unknowns beside the registration, in their order."""
+
+    maps: Array
+    """``(n_maps, n_slopes)`` gain over the pupil of each coefficient of the gain map."""
+
+    anamorphosis: bool
+    """Whether the two stretches are unknown."""
+
+    optics: tuple[tuple[Optic, float], ...] = ()
+    """What of the instrument is unknown, and how far the models are already from what the file
+    says, as a logarithm: the prior is about the file."""
+
+    unknown: frozenset[Optic] = frozenset()
+    """What of it the file says to be unknown."""
+
+    @property
+    def sigma(self) -> Array:
+        """``(n_nuisances,)`` how large each may be, 1 σ."""
+        stretches = [ANAMORPHOSIS_SIGMA] * (2 if self.anamorphosis else 0)
+        optics = [
+            UNKNOWN_SIGMA if optic in self.unknown else OPTIC_SIGMA[optic]
+            for optic, _ in self.optics
+        ]
+        maps = [GAIN_MAP_SIGMA] * len(self.maps)
+        return np.array([SLOPE_TURN_SIGMA_RAD, *stretches, *optics, *maps])
+
+    @property
+    def first_optic(self) -> int:
+        """Index of the first unknown of the instrument among the nuisances."""
+        return 3 if self.anamorphosis else 1
+
+    def from_prior(self, values: Array) -> Array:
+        """Return values ``(n_nuisances,)`` as distances from what is expected of them."""
+        distance = values.astype(float)
+        for k, (_, offset) in enumerate(self.optics, self.first_optic):
+            distance[k] += offset
+        return distance
+
+    def changes(self, values: Array) -> dict[Optic, float]:
+        """Return by how much each of the instrument's unknowns differs from the file, as ln."""
+        distance = self.from_prior(values)
+        return {
+            optic: float(distance[k]) for k, (optic, _) in enumerate(self.optics, self.first_optic)
+        }
+
+    @property
+    def prior(self) -> Array:
+        """``(4 + n_nuisances,)`` reciprocal variances: the registration itself has no prior."""
+        return np.concatenate([np.zeros(4), 1.0 / self.sigma**2])
+
+    def derivatives(self, models: FitModels, alpha: Misregistration, matrix: NDArray[Any]) -> Array:
+        """Return ``(n_nuisances, n_slopes, n_modes)``: change of the matrix with each of them."""
+        model = models.cheap
+        kind = model.instrument.slopes.kind
+        along_x, along_y = slopes_of(matrix, kind)
+        found = [signals_of_slopes(np.stack([-along_y, along_x]), kind)]
+        if self.anamorphosis:
+            found += list(model.stretch_derivatives(alpha))
+        found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
+        found += [pattern[:, None] * matrix for pattern in self.maps]
+        return np.array(found)
+
+    def gain_map(self, values: Array, valid: NDArray[np.bool_]) -> Array | None:
+        """Return the gain over the pupil ``(n, n)``, mean 1; None without a gain map."""
+        if not len(self.maps):
+            return None
+        gain = np.full(valid.shape, np.nan)
+        coefficients = values[len(values) - len(self.maps) :]
+        gain[valid] = 1.0 + coefficients @ self.maps[:, : int(valid.sum())]
+        return gain
+
+    def stretches(self, values: Array) -> Array | None:
+        """Return the two stretches; None when they are not unknown."""
+        return values[1:3].copy() if self.anamorphosis else None
+
+
+def nuisances_of(
+    valid: NDArray[np.bool_],
+    kind: SignalKind,
+    *,
+    gain_map: bool = False,
+    anamorphosis: bool = False,
+    optics: Sequence[Optic] = (),
+    unknown: frozenset[Optic] = frozenset(),
+) -> Nuisances:
+    """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
+    as_told = tuple((optic, 0.0) for optic in optics)
+    n = len(valid)
+    y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
+    if not gain_map:
+        none = np.empty((0, kind.n_planes * len(x)))
+        return Nuisances(maps=none, anamorphosis=anamorphosis, optics=as_told, unknown=unknown)
+    order = GAIN_MAP_ORDER
+    powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
+    centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
+    orthonormal, _ = np.linalg.qr(centred.T)
+    maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
+    return Nuisances(maps=maps, anamorphosis=anamorphosis, optics=as_told, unknown=unknown)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Solution:
+    """Where the fine grid came to rest."""
+
+    vector: Array
+    """``(4,)`` numeric units."""
+
+    nuisances: Array
+    """``(n_nuisances,)``."""
+
+    matrix: NDArray[np.float32]
+    """``(n_slopes, n_modes)`` the model there."""
+
+    derivatives: NDArray[np.float32]
+    """``(4, n_slopes, n_modes)`` of the model, taken nearby."""
+
+    nuisance_derivatives: Array
+    """``(n_nuisances, n_slopes, n_modes)`` the same of the unknowns beside the registration."""
+
+    projection: Projection
+    converged: bool
+
+
+def refine(
+    models: FitModels,
+    columns: Columns,
+    start: Array,
+    nuisances: Nuisances,
+    most_steps: int = MOST_NEAR_STEPS,
+) -> Solution:
+    """Return the minimum on the fine grid, with derivatives frozen on a cheaper one.
+
+    Near the minimum the derivatives' own error only slows the last steps down: what decides is
+    the residual, and that is the fine grid's.
+    """
+    vector, values = start.astype(float), np.zeros(len(nuisances.sigma))
+    here = Misregistration.from_vector(vector)
+    models.counter.n += 4
+    frozen = models.cheap.derivatives(here)
+    matrix = models.matrix(models.fine, vector)
+    extra = nuisances.derivatives(models, here, matrix)
+    every = np.concatenate([frozen, extra])
+    seen, converged = columns.project(matrix, every), False
+    for _ in range(most_steps):
+        step = _bounded_step(seen, values, nuisances)
+        if not within_limits(vector + step[:4]):
+            break
+        vector, values = vector + step[:4], values + step[4:]
+        matrix = models.matrix(models.fine, vector)
+        seen = columns.project(matrix + np.tensordot(values, extra, axes=1), every)
+        if np.all(np.abs(_bounded_step(seen, values, nuisances)[:4]) < SETTLED):
+            converged = True
+            break
+    return Solution(
+        vector=vector,
+        nuisances=values,
+        matrix=matrix,
+        derivatives=frozen,
+        nuisance_derivatives=extra,
+        projection=seen,
+        converged=converged,
+    )
+
+
+def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Array:
+    """Return the step of the registration, then of the nuisances, these held by their prior."""
+    noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
+    prior = nuisances.prior * noise
+    pull = prior * np.concatenate([np.zeros(4), nuisances.from_prior(values)])
+    step = np.linalg.solve(seen.normal + np.diag(prior), seen.scores.sum(axis=1) - pull)
+    excess = np.abs(step[:4]) / LONGEST_STEP
+    first = 4 + nuisances.first_optic
+    optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP
+    return np.asarray(step / max(1.0, float(np.max(np.concatenate([excess, optics])))))
+
+
+def vertex(before: float, at: float, after: float) -> float:
+    """Return where a parabola through three equidistant values turns, in steps from the middle.
+
+    0 where it does not bend.
+    """
+    bend = before + after - 2.0 * at
+    return float((before - after) / (2.0 * bend)) if bend else 0.0

@@ -1,0 +1,314 @@
+"""Windows: equal runs of telemetry in a closed loop, cut as a dither allows; why one is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.loop import ControlLoop
+from service.estimation.frames import FrameBlock, joined_frames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ClosedLoop(ControlLoop):
+    """The loop that runs; its optical gains are not known."""
+
+    reconstructor: NDArray[np.float32]
+    """``(n_controlled, n_slopes)`` metres per slope; row i commands mode i."""
+
+    cm_id: str | None = None
+    """Of the reconstructor; None: the RTC does not know."""
+
+
+CHUNK_FRAMES = 512
+"""Frames multiplied at once: the sums, some MB, are read from memory once for all of them."""
+
+ENOUGH_FRAMES = 256
+"""With so many the sums need not wait for more."""
+
+MAX_MISSING_FRACTION = 0.05
+"""A window with more frames missing than this is refused."""
+
+AMPLITUDE_RATIO = (0.5, 1.5)
+"""A dither weaker or stronger than these shares of its request was not applied as asked."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowPlan:
+    """What is known of the windows of a dither before they begin."""
+
+    modes: tuple[int, ...]
+    """0-based basis indices."""
+
+    amplitude_m: tuple[float, ...]
+    """RMS of each mode's dither, metres OPD."""
+
+    n_frames: int
+    """Length of a window."""
+
+    first_seq: int
+    """No window starts before this frame: the dither is on and the loop has settled."""
+
+    def refusal(self, applied_m: NDArray[Any], lines: tuple[str, ...] = ()) -> str | None:
+        """Return why a dither of ``applied_m`` ``(n_modes,)`` RMS is not the one asked for.
+
+        None: it is. ``lines`` says of every mode where in frequency it was looked for.
+        """
+        ratio = applied_m / np.array(self.amplitude_m)
+        weak = ratio.min() < AMPLITUDE_RATIO[0]
+        if not weak and ratio.max() <= AMPLITUDE_RATIO[1]:
+            return None
+        worst = int(ratio.argmin() if weak else ratio.argmax())
+        see = "see whether the RTC clips it" if weak else "see the RTC's units"
+        place = f" at {lines[worst]}" if lines else ""
+        return (
+            f"mode {self.modes[worst]} carries {applied_m[worst] * 1e9:.2f} nm of dither{place}, "
+            f"{self.amplitude_m[worst] * 1e9:.2f} nm were asked for: {see}"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Telemetry:
+    """Which telemetry a finished window is of."""
+
+    session: str
+    cm_id: str | None
+    """The reconstructor in use, at the end where windows are joined; None: the RTC did not know."""
+
+    first_seq: int
+    t_end_ns_utc: int
+    """End of exposure of its last frame."""
+
+    n_missing: int
+    """Frames that never came."""
+
+    plan: WindowPlan
+    """What it was cut by."""
+
+    n_windows: int = 1
+    """Windows, one after the other, that are joined here."""
+
+    def is_like(self, other: Telemetry) -> bool:
+        """Return whether both are windows of one dither and one loop."""
+        return (self.session, self.cm_id, replace(self.plan, first_seq=0)) == (
+            other.session,
+            other.cm_id,
+            replace(other.plan, first_seq=0),
+        )
+
+
+class RefusalKind(StrEnum):
+    """Kinds of windows that give no estimate, as far as anything follows from it."""
+
+    OTHER = "other"
+    """It is counted, and no more."""
+
+    CUT_SHORT = "cut-short"
+    """Its reconstructor or its dither ended in it, which they do when all is well."""
+
+    VOID = "void"
+    """It was taken while nothing could be measured, for a reason that is known."""
+
+    MISALIGNED = "misaligned"
+    """The slopes of a row are not those that its commands were sent for."""
+
+    OUT_OF_REACH = "out-of-reach"
+    """The registration is too far from where the fit began."""
+
+    NOT_FOUND = "not-found"
+    """It was good, of an open loop, and no registration explains it."""
+
+    MISTOLD = "mistold"
+    """It shows that slopes or commands are not what the instrument file says."""
+
+
+Why = tuple[RefusalKind, str]
+"""Of what kind a refusal is, and what is said of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowRefused:
+    """A window that gave no estimate."""
+
+    reason: str
+    """What was found, and what to do about it."""
+
+    t_ns_utc: int
+    """When it was given up."""
+
+    kind: RefusalKind = RefusalKind.OTHER
+
+
+P = TypeVar("P", bound=WindowPlan)
+S = TypeVar("S")
+F = TypeVar("F")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Window(Generic[S]):
+    """A window under way."""
+
+    session: str
+    cm_id: str | None
+    first_seq: int
+    next_seq: int
+    """The frame expected next."""
+
+    next_t_ns: int
+    """End of exposure of that frame."""
+
+    dt_ns: int
+    sums: S
+    """What the estimator has made of the frames so far."""
+
+    n_missing: int = 0
+    """Frames before ``next_seq`` that never came."""
+
+    waiting: tuple[FrameBlock, ...] = ()
+    """Frames that are not in the sums yet, or are needed for the next; each follows the one
+    before."""
+
+    @property
+    def telemetry(self) -> dict[str, Any]:
+        """Return the fields of ``Telemetry``, once it is finished."""
+        return {
+            "session": self.session,
+            "cm_id": self.cm_id,
+            "first_seq": self.first_seq,
+            "t_end_ns_utc": self.next_t_ns - self.dt_ns,
+            "n_missing": self.n_missing,
+        }
+
+    def without_rest(self, n_frames: int) -> Window[S]:
+        """Return a window of ``n_frames`` whose last frames never came."""
+        lost = self.first_seq + n_frames - self.next_seq
+        return replace(
+            self,
+            next_seq=self.next_seq + lost,
+            next_t_ns=self.next_t_ns + lost * self.dt_ns,
+            n_missing=self.n_missing + lost,
+        )
+
+    def why_broken(self, block: FrameBlock, n_frames: int) -> Why | None:
+        """Return why a window of ``n_frames`` cannot take this block, or None."""
+        expected_ns = self.next_t_ns + (block.first_seq - self.next_seq) * block.dt_ns
+        if block.session != self.session:
+            return RefusalKind.OTHER, "the RTC started a new session inside the window"
+        if block.cm_id != self.cm_id:
+            changed = f"{self.cm_id} -> {block.cm_id}"
+            return RefusalKind.CUT_SHORT, f"the reconstructor changed inside the window: {changed}"
+        if block.dither_m is None:
+            return RefusalKind.CUT_SHORT, "the dither ended inside the window"
+        if abs(block.t0_ns_utc - expected_ns) > block.dt_ns / 2:
+            return RefusalKind.OTHER, "the RTC's clock stepped or it paused inside the window"
+        end_seq = self.first_seq + n_frames
+        missing = self.n_missing + min(block.first_seq, end_seq) - self.next_seq
+        if missing > MAX_MISSING_FRACTION * n_frames:
+            share = f"more than {MAX_MISSING_FRACTION:.0%}"
+            text = f"{missing} of {n_frames} frames missing, {share}: check the link to the RTC"
+            return RefusalKind.OTHER, text
+        return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WindowCutter(Generic[P, S, F]):
+    """Windows of a dither under way, each of one session, one reconstructor and one clock.
+
+    Feed it blocks with ``accumulate``.
+    """
+
+    plan: P
+    window: Window[S] | None = None
+
+    overlap: ClassVar[int] = 0
+    """Frames before its own that a frame is summed with."""
+
+    def begin(self, block: FrameBlock) -> S:
+        """Return empty sums for frames like these."""
+        raise NotImplementedError
+
+    def add(self, sums: S, block: FrameBlock, place: int) -> S:
+        """Return the sums with a block that begins at this place of the window.
+
+        Its first ``overlap`` frames are in them, or have none before them.
+        """
+        raise NotImplementedError
+
+    def close(self, window: Window[S]) -> F | WindowRefused:
+        """Return what came of a window, or why its dither is not the one asked for."""
+        raise NotImplementedError
+
+    def begun_anew(self, first_seq: int) -> Self:
+        """Return it without the window under way; none begins before this frame."""
+        first_seq = max(self.plan.first_seq, first_seq)
+        return replace(self, plan=replace(self.plan, first_seq=first_seq), window=None)
+
+    def accumulate(self, block: FrameBlock) -> tuple[Self, list[F | WindowRefused]]:
+        """Add a block of frames; return the new state and the windows that ended in it."""
+        ended: list[F | WindowRefused] = []
+        window, done = self.window, 0
+        while done < block.n_frames:
+            window, used, found = self._advanced(window, block.rows(done, block.n_frames))
+            done += used
+            ended += [] if found is None else [found]
+        return replace(self, window=window), ended
+
+    def _advanced(
+        self, window: Window[S] | None, block: FrameBlock
+    ) -> tuple[Window[S] | None, int, F | WindowRefused | None]:
+        """Take rows from the start of a block: into the open window, or up to the next one."""
+        n_frames = self.plan.n_frames
+        if window is None:
+            if block.first_seq < self.plan.first_seq:
+                return None, min(self.plan.first_seq - block.first_seq, block.n_frames), None
+            if block.dither_m is None:
+                return None, block.n_frames, None
+            window = Window(
+                session=block.session,
+                cm_id=block.cm_id,
+                first_seq=block.first_seq,
+                next_seq=block.first_seq,
+                next_t_ns=block.t0_ns_utc,
+                dt_ns=block.dt_ns,
+                sums=self.begin(block),
+            )
+        why = window.why_broken(block, n_frames)
+        if why is not None:
+            kind, reason = why
+            return None, 0, WindowRefused(reason=reason, t_ns_utc=window.next_t_ns, kind=kind)
+        end_seq = window.first_seq + n_frames
+        if block.first_seq >= end_seq:  # the window's last frames never came
+            return None, 0, self.close(self._added(window).without_rest(n_frames))
+        part = block.rows(0, min(block.n_frames, end_seq - block.first_seq, CHUNK_FRAMES))
+        window = self._with_rows(window, part)
+        if window.next_seq < end_seq:
+            return window, part.n_frames, None
+        return None, part.n_frames, self.close(self._added(window))
+
+    def _with_rows(self, window: Window[S], rows: FrameBlock) -> Window[S]:
+        """Return the window after some rows, which wait until there are enough to be added."""
+        if window.waiting and not rows.follows(window.waiting[-1]):
+            window = replace(self._added(window), waiting=())
+        window = replace(
+            window,
+            next_seq=rows.next_seq,
+            next_t_ns=rows.next_t_ns,
+            # frames skipped before these count as missing
+            n_missing=window.n_missing + rows.first_seq - window.next_seq,
+            waiting=(*window.waiting, rows),
+        )
+        enough = sum(block.n_frames for block in window.waiting) >= ENOUGH_FRAMES
+        return self._added(window) if enough else window
+
+    def _added(self, window: Window[S]) -> Window[S]:
+        """Return the window with the frames that wait in its sums."""
+        if sum(block.n_frames for block in window.waiting) <= self.overlap:
+            return window
+        block = joined_frames(window.waiting)
+        sums = self.add(window.sums, block, block.first_seq - window.first_seq)
+        kept = (block.last(self.overlap),) if self.overlap else ()
+        return replace(window, sums=sums, waiting=kept)

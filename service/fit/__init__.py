@@ -1,1 +1,0 @@
-"""Registration of measured interaction matrices. Pure numerics: no clock, log, file or thread."""

@@ -1,0 +1,197 @@
+"""Processes of their own for what takes long: nice'd, and ended at any moment.
+
+Whoever waits for one waits in a thread, on a pipe: a process that is killed, even one that is
+stopped, closes the pipe, and the wait is over. An executor of the standard library waits for its
+process to finish instead, and the service with it.
+
+Nothing here takes long to import: a process can be begun at once, and imports :data:`ITS_WORK`
+while its parent does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import TypeVar, cast
+
+from threadpoolctl import threadpool_limits
+
+from service.errors import PyrcalError, WorkerError
+
+ITS_WORK = "service.runtime.worker"
+"""What every process imports before its first work."""
+
+R = TypeVar("R")
+
+
+class Apart:
+    """A process that does one piece of work after another; nothing runs before the first."""
+
+    def __init__(self, *, nice: int) -> None:
+        self._nice = nice
+        self._busy = threading.Lock()
+        self._process: BaseProcess | None = None
+        self._line: Connection | None = None
+        self._ended = threading.Event()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id; None: nothing has been asked of it yet."""
+        return None if self._process is None else self._process.pid
+
+    def cpu_s(self) -> float:
+        """Return the processor time it has taken, as the kernel counts it; the clock elsewhere.
+
+        Where there is no such file a process cannot be told to stand still: it never seems to.
+        """
+        if self.pid is None:
+            return 0.0
+        try:
+            words = Path(f"/proc/{self.pid}/stat").read_text("ascii").rpartition(")")[2].split()
+        except (OSError, UnicodeDecodeError):
+            return time.monotonic()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+    def do(self, work: Callable[[], R], *, sent: bool = False) -> R:
+        """Have it done and return the result; ``work`` must be picklable, like what it returns.
+
+        What has been ``sent`` is only waited for. Blocks until it is done or the process has
+        ended, so call off the event loop.
+
+        Raises
+        ------
+        PyrcalError
+            What ``work`` has raised of this kind; WorkerError for anything else it raised.
+        EOFError
+            If the process died, or was killed meanwhile.
+        """
+        with self._busy:
+            try:
+                line = self._started()
+                if not sent:
+                    line.send(work)
+                answer = line.recv()
+            except OSError as error:  # no process to be had, or a line that is cut
+                raise EOFError from error
+        if isinstance(answer, PyrcalError):
+            raise answer
+        return cast(R, answer)
+
+    def kill(self) -> None:
+        """End the process at once, whatever it is at; whoever waits for it waits no longer."""
+        self._ended.set()
+        process = self._process
+        if process is not None:
+            process.kill()
+            process.join()
+        with self._busy:
+            if self._line is not None:
+                self._line.close()
+
+    def _started(self) -> Connection:
+        if self._ended.is_set():
+            raise EOFError
+        if self._line is None:
+            context = multiprocessing.get_context("spawn")
+            ours, theirs = context.Pipe()
+            process = context.Process(
+                target=_work, args=(theirs, self._nice, ITS_WORK), daemon=True
+            )
+            with _deaf_to_the_keyboard():
+                process.start()
+            self._process, self._line = process, ours
+            theirs.close()  # else nobody would notice that the other end is gone
+            if self._ended.is_set():  # killed while it was being born
+                process.kill()
+        return self._line
+
+
+class Worker(Apart):
+    """A process that keeps the optical models between jobs."""
+
+    def __init__(self) -> None:
+        super().__init__(nice=0)  # until it knows how nice it is to be
+        self._enter: Callable[[], None] | None = None
+        self._enters = False
+
+    def begin(self) -> Worker:
+        """Begin the process before there is work for it, and return it."""
+        with contextlib.suppress(EOFError, OSError):  # the first job begins it, or says why not
+            self._started()
+        return self
+
+    def told(self, enter: Callable[[], None]) -> Worker:
+        """Tell it what to do before its first job, and return it; one that runs does it now."""
+        self._enter = enter
+        if self._line is not None:
+            with contextlib.suppress(OSError):  # the first job finds out
+                self._line.send(enter)
+                self._enters = True
+        return self
+
+    def run(self, job: Callable[[], R]) -> R:
+        """Do a job on the optical models; see :meth:`Apart.do`."""
+        if self._enter is not None:
+            self.do(self._enter, sent=self._enters)
+            self._enter = None
+        return self.do(job)
+
+
+def _work(line: Connection, nice: int, imports: str) -> None:
+    """Be the process: do what comes and send what came of it, until the line is cut."""
+    _be_polite(nice)
+    import_module(imports)
+    threadpool_limits(1)  # of BLAS, which has been imported now
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            line.send(_answer(line.recv_bytes()))
+
+
+def _answer(work: bytes) -> object:
+    try:
+        return pickle.loads(work)()  # of this very program
+    except PyrcalError as error:
+        return error
+    except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job
+        return WorkerError(f"failed unforeseen: {error!r}")
+
+
+def _be_polite(nice: int) -> None:
+    """Make this process nice, and gone when its parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(nice)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _deaf_to_the_keyboard() -> Iterator[None]:
+    """Start what is started here with SIGINT held back: it cannot ignore it before it has begun.
+
+    Ctrl-C in a terminal reaches every process there, also one that still imports.
+    """
+    resource_tracker.ensure_running()  # else the first process starts it, and it lets SIGINT in
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _follow_parent() -> None:
+    """End with the service, even when it was killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        with contextlib.suppress(OSError):
+            parent.join()
+        os._exit(1)

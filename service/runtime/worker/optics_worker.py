@@ -1,0 +1,470 @@
+"""The optical model at work: fitting windows, computing reconstructors, judging them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.dither import information
+from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
+from service.control.gains import CalibrationGains
+from service.control.gate import GateVerdict, judge
+from service.control.loop import ControlLoop
+from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
+from service.estimation import passive
+from service.estimation.dialect import LIKELY, Dialect, of_answer, of_reconstructor
+from service.estimation.estimate import DitheredEstimate
+from service.estimation.light import far_starts
+from service.estimation.lockin import Spectra, WindowEstimate, fit_window
+from service.estimation.openloop import FarEstimate, FarSearch, find, not_found
+from service.estimation.own_matrix import OwnMatrix, recognise_modes
+from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
+from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.files.prepared import Prepared
+from service.model.instrument import Instrument
+from service.model.interaction import Linearisation, RtcInteractionModel
+from service.model.misregistration import Misregistration
+from service.model.slopes import SlopeRecipe
+from service.model.turbulence import Halo
+from service.runtime.worker.records import (
+    Compute,
+    Conditions,
+    Description,
+    Made,
+    actuators_of,
+    check_controllable,
+    outer_of,
+)
+from service.runtime.worker.sensor import REACH, Sensor, length, near_enough
+
+MAX_APPROACHES = 5
+"""Steps of the coarse model; from the edge of the capture range three are enough."""
+
+CONTRACTION = 0.5
+"""A step longer than this share of the last one is not Newton's any more: the fit has failed."""
+
+FAR_SAMPLING = 1
+"""The same of the model that leads from afar: biased by some per cent of a subaperture."""
+
+AS_DRAWN = 0.15
+"""A mode's response that differs by less, of the drawing's, is the drawing's: noise and the model's
+own error come to as much."""
+
+COARSE_SAMPLING = 2
+"""Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,
+four times as fast."""
+
+FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
+"""An estimate further than this from its start has diverged (numeric units)."""
+
+
+Dithered = TypeVar("Dithered", bound=DitheredEstimate)
+
+
+class OpticsWorker:
+    """The optical model and the last linearisation, kept between jobs.
+
+    Telemetry, and the stability of a loop, are of the sensor as it works; what is published is the
+    inverse of its response to a flat wavefront: the optical gain is never folded in. Every optical
+    gain that comes or goes is relative to that flat response.
+    """
+
+    def __init__(self, instrument: Instrument, compute: Compute) -> None:
+        check_controllable(instrument)
+        self._prepared = Prepared(compute.cache)
+        self._basis = self._prepared.basis(instrument)
+        self._threads = ThreadPoolExecutor(compute.threads)
+        self._compute = compute
+        self._mode_response: NDArray[np.float64] | None = None
+        self._equip(instrument)
+
+    def _equip(self, instrument: Instrument) -> None:
+        """Make the models of an instrument, all but its modes."""
+        basis, compute = self._basis, self._compute
+
+        def model(sampling: int, nodes: int, halo: Halo | None) -> RtcInteractionModel:
+            return RtcInteractionModel(
+                instrument,
+                basis,
+                pupil_sampling=sampling,
+                detector_nodes=nodes,
+                halo=halo,
+                mapper=self._threads.map,
+                mode_response=self._mode_response,
+            )
+
+        sampling, nodes, working_point_modes = compute.sampling
+        self._sensor = Sensor(
+            lambda halo: model(sampling, nodes, halo), instrument, working_point_modes, sampling
+        )
+        self._model = self._sensor.flat
+        self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
+        self._start = instrument.start
+        self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
+
+    def tidy(self) -> None:
+        """Give back the memory of what a job leaves and the next one hardly ever needs."""
+        models = (self._coarse, *itertools.chain.from_iterable(self._far.values()))
+        for model in (*self._sensor.models, *models):
+            model.forget()
+
+    def describe(self) -> Description:
+        """Return what telemetry must look like, and prepare for the first fit."""
+        linearisation = self._first()
+        self._sensor.keep(linearisation)
+        return Description(
+            n_slopes=self._model.n_slopes,
+            n_modes=self._model.basis.n_modes,
+            mode_variance_m2=self._model.basis.variance_m2,
+            actuators=actuators_of(self._model),
+            mode_information=information(linearisation),
+            kind=self._model.instrument.slopes.kind,
+            products=linearisation.matrix.T @ linearisation.matrix,
+            start=self._start,
+        )
+
+    def _first(self) -> Linearisation:
+        """Return the linearisation about the nominal registration, prepared once for all."""
+        sampling, start = self._compute.sampling, self._start
+
+        def computed() -> dict[str, NDArray[np.float32]]:
+            found = self._sensor.linearise(start)
+            return {"matrix": found.matrix, "derivatives": found.derivatives}
+
+        what = ("linearisation", *sampling, start.vector.tolist())
+        kept = self._prepared.arrays(self._model.instrument, what, computed)
+        return Linearisation(alpha=start, **kept)
+
+    def fit(
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration | None
+    ) -> WindowEstimate | WindowRefused:
+        """Estimate α from one window, from ``start`` or, without one, from the nominal rotation.
+
+        Where the linearisation at hand is too far away, the coarse model leads to within reach of
+        one new, fine linearisation. A working point that does not give the optical gains that were
+        measured is followed first. Slopes that cannot be those of the instrument file are refused
+        with what they look like.
+        """
+        begun = start or self._start
+        outcome = self._fitted(spectra, loop, begun)
+        if isinstance(outcome, WindowEstimate):
+            gains = outcome.optical_gain
+            if gains.real.min() > LIKELY[0] and np.abs(gains).max() < LIKELY[1]:
+                return outcome
+            begun = outcome.alpha
+        seen = spectra.commands[:, 0] @ self._sensor.near(begun).matrix.T
+        turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / spectra.plan.frame_rate_hz
+        answer = of_answer(spectra.slopes[:, 0], seen, turns, self._model.instrument)
+        if not answer.wrong:
+            return outcome
+        return WindowRefused(
+            reason=answer.wrong, t_ns_utc=spectra.t_end_ns_utc, kind=RefusalKind.MISTOLD
+        )
+
+    def _fitted(
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
+    ) -> WindowEstimate | WindowRefused:
+        try:
+            estimate = self._settled_fit(spectra, loop, start)
+            if estimate is None:
+                return _unsettled(spectra)
+            found = self._against_flat(estimate)
+            if self._sensor.follow(found.modes, found.optical_gain):
+                estimate = self._settled_fit(spectra, loop, found.alpha)
+        except np.linalg.LinAlgError as error:
+            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
+        return _unsettled(spectra) if estimate is None else self._against_flat(estimate)
+
+    def listen(self, in_use: NDArray[np.float32], near: Misregistration | None) -> Dialect:
+        """Return whether the RTC's own matrix is of the slopes that the instrument file tells.
+
+        Where the file leaves the orientation open, what is found is taken over.
+        """
+        at, instrument = near or self._start, self._model.instrument
+        dialect = of_reconstructor(
+            in_use,
+            instrument,
+            self._basis,
+            near=at,
+            response=self._sensor.at_unit_gain(at).matrix,
+            mapper=self._threads.map,
+        )
+        if instrument.slopes.orientation is not None or dialect.found is None or dialect.wrong:
+            return dialect
+        self.adopt(dialect.found)
+        return replace(dialect, adopted=True)
+
+    def adopt(
+        self, slopes: SlopeRecipe | None, mode_response: NDArray[np.float64] | None = None
+    ) -> None:
+        """List slopes in this order from now on, and expect this response ``(n_modes,)`` of modes.
+
+        None leaves what it stands for as it is.
+        """
+        instrument, now = self._model.instrument, self._model.instrument.slopes
+        if slopes is not None and replace(now, orientation=now.assumed_orientation) != slopes:
+            instrument = replace(instrument, slopes=slopes)
+        elif mode_response is None:
+            return
+        if mode_response is not None:
+            self._mode_response = mode_response
+        self._equip(instrument)
+
+    def recognise(
+        self, own: NDArray[np.float32], near: Misregistration | None, rotation_rad: float | None
+    ) -> tuple[OwnMatrix | None, NDArray[np.float64] | None]:
+        """Return which modes the RTC's own matrix controls, and the response the model expects.
+
+        None: it controls none; the modes answer as drawn.
+
+        ``rotation_rad`` is where a coarser look has found the mirror, None: nobody looked. Where a
+        mode answers otherwise than was drawn, though with its own sign and in its own place, the
+        model takes its response over: matrices made from now on allow for it.
+        """
+        start = near or self._start
+        if near is None and rotation_rad is not None:
+            start = replace(start, rotation_rad=rotation_rad)
+        found = recognise_modes(own, self._coarse.linearise, start)
+        if found is None or found.wrong or not found.known.any():
+            return found, self._mode_response
+        response = found.response[found.known]
+        if np.any(np.abs(response - 1.0) > AS_DRAWN):
+            n_modes = self._basis.n_modes
+            gains = CalibrationGains.of_modes(response, found.columns[found.known], n_modes).values
+            now = 1.0 if self._mode_response is None else self._mode_response
+            self.adopt(None, now * gains)
+        return found, self._mode_response
+
+    def _settled_fit(
+        self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
+    ) -> WindowEstimate | None:
+        """Return the fit about a linearisation that is near enough to it; None: there is none."""
+        estimate = fit_window(spectra, self._sensor.near(start), loop)
+        if length(estimate.step) > REACH:
+            near = self._approach(spectra, loop, estimate, start)
+            if near is None:
+                return None
+            estimate = fit_window(spectra, self._sensor.linearise(near), loop)
+        if not near_enough(estimate.step, estimate.covariance):
+            # near enough; or the coarse model's bias, flat as it is, was more than what settles
+            estimate = fit_window(spectra, self._sensor.linearise(estimate.alpha), loop)
+        return estimate if near_enough(estimate.step, estimate.covariance) else None
+
+    def find(
+        self, spectra: Spectra, start: Misregistration | None, flux: bytes | None
+    ) -> FarEstimate | WindowRefused:
+        """Find α in a window with the loop open; without a start from anywhere in the range.
+
+        ``flux`` is the RTC's: where the pupil images move with the mirror's they are a start.
+        """
+        modes = spectra.plan.modes
+        if modes not in self._far:
+            basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
+            self._far[modes] = tuple(
+                RtcInteractionModel(
+                    self._model.instrument,
+                    basis,
+                    pupil_sampling=sampling,
+                    detector_nodes=sampling,
+                    mapper=self._threads.map,
+                    mode_response=None if every is None else every[list(modes)],
+                )
+                for sampling in (FAR_SAMPLING, COARSE_SAMPLING)
+            )
+        far, near = self._far[modes]
+        starts = (start,) if start is not None else far_starts(self._model.instrument, flux)
+        try:
+            return find(spectra, FarSearch(far=far, near=near, nominal=self._start, starts=starts))
+        except np.linalg.LinAlgError as error:
+            return not_found(str(error), spectra)
+
+    def fit_random(
+        self, window: Correlated, start: Misregistration | None
+    ) -> RandomEstimate | WindowRefused:
+        """Estimate α from one window of random dither, from ``start`` as in :meth:`fit`."""
+        try:
+            estimate = fit_random(window, self._sensor.near(start or self._start))
+            for _ in range(MAX_APPROACHES):
+                if isinstance(estimate, WindowRefused):
+                    return estimate
+                if near_enough(estimate.step, estimate.covariance):
+                    return self._against_flat(estimate)
+                begun = start or self._start
+                if np.any(np.abs(estimate.alpha.vector - begun.vector) > FIT_RANGE):
+                    break
+                estimate = fit_random(window, self._sensor.linearise(estimate.alpha))
+        except np.linalg.LinAlgError as error:
+            return WindowRefused(reason=f"no fit: {error}", t_ns_utc=window.t_end_ns_utc)
+        return _unsettled(window)
+
+    def response(self, alpha: Misregistration | None) -> NDArray[np.float32]:
+        """Return D(α) to a flat wavefront, ``(n_slopes, n_modes)``, slope per metre OPD.
+
+        None: at the nominal registration.
+        """
+        return self._model.interaction_matrix(alpha or self._start)
+
+    def _against_flat(self, estimate: Dithered) -> Dithered:
+        """Return the estimate with its gains relative to the flat response, not that at work."""
+        ratio = self._sensor.ratio()[list(estimate.modes)]
+        sigma = estimate.gain_sigma
+        return replace(
+            estimate,
+            optical_gain=estimate.optical_gain * ratio,
+            gain_sigma=None if sigma is None else sigma * ratio,
+        )
+
+    def _approach(
+        self,
+        spectra: Spectra,
+        loop: ClosedLoop,
+        estimate: WindowEstimate,
+        start: Misregistration,
+    ) -> Misregistration | None:
+        """Return where the coarse model's steps lead; None when they do not shrink."""
+        for _ in range(MAX_APPROACHES):
+            if np.any(np.abs(estimate.alpha.vector - start.vector) > FIT_RANGE):
+                return None
+            before = length(estimate.step)
+            estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)
+            if length(estimate.step) <= REACH:
+                return estimate.alpha
+            if length(estimate.step) > CONTRACTION * before:
+                return None
+        return None
+
+    def make(self, conditions: Conditions, fewer: tuple[int, ...] = ()) -> Made:
+        """Compute the reconstructor for α, as many modes as the loop has gains, and judge it.
+
+        Where the gate refuses it, the most of ``fewer`` modes, largest first, that pass; none
+        passes: the one asked for.
+        """
+        matrix, loop = self._model.interaction_matrix(conditions.alpha), conditions.loop
+
+        def judged(n_modes: int) -> Made:
+            inversion = reconstruct(matrix, self._recipe(n_modes))
+            of_these = replace(conditions, loop=loop.of(slice(n_modes)))
+            verdict = self.judge(inversion.matrix, of_these)
+            return Made(
+                matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
+            )
+
+        return _most(len(loop.gains), fewer, judged)
+
+    def assess(
+        self,
+        in_use: NDArray[np.float32],
+        alpha: Misregistration,
+        loop: ControlLoop,
+        magnitude: float | None,
+    ) -> ExpectedGain | None:
+        """Return what a new reconstructor would win over the one in use; None: nobody can say.
+
+        ``magnitude`` is the star's; None: the noise of the settings.
+        """
+        model, n_modes = self._model, len(in_use)
+        seen = self._sensor.at_unit_gain(alpha).matrix_at(alpha)
+        flat = seen if self._sensor.is_flat else model.interaction_matrix(alpha)
+        fresh = reconstruct(flat, self._recipe(n_modes)).matrix
+        noise, kind = self._compute.slope_noise, model.instrument.slopes.kind
+        if magnitude is not None:
+            noise = noise_of_star(
+                model.instrument,
+                magnitude=magnitude,
+                frame_rate_hz=loop.frame_rate_hz,
+                n_valid=int(model.valid.sum()),
+            )
+        sky = Sky(
+            variance_m2=model.basis.variance_m2,
+            beyond_m2=beyond_m2(model.basis.variance_m2),
+            crossing_hz=self._compute.wind_m_s / model.instrument.diameter_m,
+            slope_noise=noise * kind.noise,
+        )
+        try:
+            return expected_gain(in_use, fresh, seen, loop, sky)
+        except np.linalg.LinAlgError:
+            return None
+
+    def _recipe(self, n_modes: int) -> Recipe:
+        prior = None
+        if self._compute.method is InversionMethod.MAP:
+            noise = self._compute.slope_noise * self._model.instrument.slopes.kind.noise
+            prior = Prior(
+                variance_m2=self._model.basis.variance_m2,
+                slope_noise=np.full(self._model.n_slopes, noise),
+            )
+        return Recipe(
+            n_modes=n_modes,
+            max_condition=self._compute.max_condition,
+            prior=prior,
+        )
+
+    def judge(self, reconstructor: NDArray[np.float32], conditions: Conditions) -> GateVerdict:
+        """Return whether a reconstructor would hold the loop within α ± 3σ."""
+        alpha, noise = conditions.alpha, self._model.instrument.slopes.kind.noise
+        loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
+        at_work = self._sensor.at_unit_gain(alpha)
+        covariance, bound = conditions.covariance, conditions.bound
+        return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
+
+    def margin(
+        self,
+        in_use: NDArray[np.float32],
+        conditions: Conditions,
+        optical_gain: NDArray[np.float64],
+        magnitude: float | None,
+    ) -> tuple[GateVerdict, ExpectedGain | None]:
+        """Return verdict and worth of the matrix in use, ``(n_modes, n_slopes)`` metres per slope.
+
+        ``optical_gain`` ``(n_basis,)`` and the star's ``magnitude`` are the expected gain's.
+        """
+        verdict = self.judge(in_use, conditions)
+        loop = replace(conditions.loop, optical_gain=optical_gain)
+        return verdict, self.assess(in_use, conditions.alpha, loop, magnitude)
+
+    def watch(
+        self, state: passive.Passive, start: Misregistration | None
+    ) -> passive.PassiveEstimate | None:
+        """Estimate α from ordinary telemetry; None when there is too little of it.
+
+        About ``start``, or without one about the nominal rotation.
+        """
+        found = passive.fit(state, self._sensor.near(start or self._start))
+        if found is None:
+            return None
+        return replace(
+            found, optical_gain=found.optical_gain * self._sensor.ratio()[: state.n_modes]
+        )
+
+
+def _most(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:
+    """Return what passes with most modes: fewer are never less stable, so halves are enough."""
+    asked = judged(n_modes)
+    if asked.gate.accepted:
+        return asked
+    found, refused, first, end = None, asked, 0, len(fewer)
+    while first < end:
+        middle = (first + end) // 2
+        tried = judged(fewer[middle])
+        if tried.gate.accepted:
+            found, end = tried, middle
+        else:
+            refused, first = tried, middle + 1
+    if found is None:
+        return asked
+    return replace(found, why_fewer=f"{len(refused.matrix)} modes: {refused.gate.reason}")
+
+
+def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:
+    return WindowRefused(
+        reason="the fit did not settle: the mirror moved inside the window, the registration is "
+        "outside the capture range, or the instrument file is another's",
+        t_ns_utc=spectra.t_end_ns_utc,
+        kind=RefusalKind.OUT_OF_REACH,
+    )

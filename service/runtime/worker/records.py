@@ -1,0 +1,149 @@
+"""What the worker is told, what it asks of an instrument, and what it says of a matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.control.gate import GateVerdict
+from service.control.loop import ControlLoop
+from service.control.reconstructor import MAX_CONDITION, InversionMethod
+from service.errors import ModelError
+from service.estimation.health import Actuators
+from service.model.instrument import Instrument, Mirror
+from service.model.interaction import RtcInteractionModel
+from service.model.kinds import Influence, SignalKind
+from service.model.misregistration import Determination, Misregistration
+from service.model.modes import ModalBasis
+
+
+class Sampling(NamedTuple):
+    """How finely the optics are computed, and of which working point."""
+
+    pupil: int = 3
+    """Points of the pupil along a subaperture."""
+
+    detector: int = 3
+    """Quadrature nodes per detector pixel and axis."""
+
+    working_point_modes: int | None = None
+    """Telemetry is compared with the response of a loop that controls this many modes at the
+    instrument's r0; None: with that of a flat wavefront."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compute:
+    """What the worker may use, and how it computes."""
+
+    threads: int = 2
+    """Threads that share the rows of a product; BLAS itself keeps to one."""
+
+    nice: int = 10
+    sampling: Sampling = field(default_factory=Sampling)
+
+    method: InversionMethod = InversionMethod.SVD
+    """How interaction matrices are inverted."""
+
+    max_condition: float = MAX_CONDITION
+    """Of a truncated SVD."""
+
+    slope_noise: float = 0.05
+    """1 σ of one slope in one frame: of a MAP inversion, and of a star of unknown magnitude. Of a
+    pixel it is half."""
+
+    wind_m_s: float = 15.0
+    """At which the expected loss of a reconstructor is computed."""
+
+    cache: Path | None = None
+    """Folder of what is prepared once; None: it is computed every time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Description:
+    """What the service must know of the model to check telemetry against it."""
+
+    n_slopes: int
+    n_modes: int
+    mode_variance_m2: NDArray[np.float64]
+    """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
+
+    actuators: Actuators | None = None
+    """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
+
+    mode_information: NDArray[np.float64] | None = None
+    """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
+
+    products: NDArray[np.float32] | None = None
+    """``(n_modes, n_modes)`` DᵀD at ``start``, slope² per metre²; None: not worked out."""
+
+    kind: SignalKind = SignalKind.XY
+    """What the signals are."""
+
+    start: Misregistration = field(default_factory=Misregistration)
+    """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Conditions(Determination):
+    """What a reconstructor has to hold in; the covariance includes the model's error."""
+
+    loop: ControlLoop
+    """As the gate is to see it."""
+
+    bound: float
+    """Largest pole radius that is accepted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Made:
+    """A reconstructor and the gate's verdict on it."""
+
+    matrix: NDArray[np.float32]
+    """``(n_modes, n_slopes)`` metres per slope."""
+
+    condition_number: float
+    gate: GateVerdict
+    why_fewer: str = ""
+    """What the gate said of more modes, where it has fewer than were asked for."""
+
+
+def actuators_of(model: RtcInteractionModel) -> Actuators | None:
+    """Return the mirror's actuators; None where the modes are measured surfaces."""
+    basis, mirror = model.basis, model.instrument.mirror
+    if not isinstance(basis, ModalBasis) or not isinstance(mirror, Mirror):
+        return None
+    return Actuators(positions=mirror.positions_m, strokes=basis.mode_to_actuator)
+
+
+def outer_of(model: RtcInteractionModel) -> NDArray[np.float64] | None:
+    """Return the outermost ring as a ``ControlLoop`` has it; None: strokes are no metres."""
+    actuators, mirror = actuators_of(model), model.instrument.mirror
+    if actuators is None or not isinstance(mirror, Mirror):
+        return None
+    if mirror.shape.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
+        return None
+    return actuators.strokes[actuators.outer]
+
+
+def check_controllable(instrument: Instrument) -> None:
+    """Refuse what can be fitted offline, but not controlled with.
+
+    Raises
+    ------
+    ModelError
+        If the stroke is unknown, or the RTC delivers frames.
+    """
+    if not instrument.mirror.stroke_known:
+        raise ModelError(
+            f"{instrument.name}: found mirror.stroke = unknown; expected a known one: a "
+            "reconstructor gives metres (pyrcal fit needs none)"
+        )
+    if instrument.frames is not None:
+        raise ModelError(
+            f"{instrument.name}: found wfs.input = frames; expected slopes, which is what an RTC "
+            "sends (pyrcal fit takes frames)"
+        )

@@ -1,0 +1,408 @@
+"""Who may ask over HTTP, and for what.
+
+A page in an operator's browser can send requests to this service: from another origin, or under a
+name of its own that it has had resolved to this address. Programs send no ``Origin``. Whatever is
+asked needs a key of the scope its route has, once there are keys.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from ipaddress import ip_address, ip_network
+
+import structlog
+from fastapi import Request
+from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from typing_extensions import override
+
+from service.archive import AuditEntry
+from service.errors import ConfigurationError
+from service.runtime.recording import Caller, Whence
+from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
+from service.web.keys import Key, KeyFile, KeyScope, is_loopback
+from service.web.problems import problem
+
+COOKIE = "pyrcal_key"
+"""Under which a browser keeps the key."""
+
+MOST_FAILURES, FAILURES_WITHIN_S = 10, 60.0
+"""Wrong keys that an address may show within so many seconds: the next are answered 429."""
+
+MOST_ADDRESSES = 1000
+"""Whose failures are remembered; the oldest go first."""
+
+MOST_TOLD, TOLD_WITHIN_S = 20, 60.0
+"""Refusals that are told one by one within so many seconds; the others are counted."""
+
+_READS = {"GET", "HEAD", "OPTIONS"}
+
+_HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
+
+_PORTS = {"http": ":80", "https": ":443"}
+"""What need not be written in an origin."""
+
+Security = dict[str, list[dict[str, list[str]]]]
+
+OPEN: Security = {"security": []}
+"""``openapi_extra`` of a route that needs no key."""
+
+
+def needs(scope: KeyScope) -> Security:
+    """Return ``openapi_extra`` of a route that needs a key of this scope."""
+    return {"security": [{scheme: [scope.value]} for scheme in SCHEMES]}
+
+
+SCHEMES: dict[str, dict[str, str]] = {
+    "bearer": {"type": "http", "scheme": "bearer", "description": "An API key"},
+    "cookie": {
+        "type": "apiKey",
+        "in": "cookie",
+        "name": COOKIE,
+        "description": "The same, kept by a browser that logged in; orders need its Origin, too",
+    },
+}
+"""How a key is shown, as the OpenAPI has it. None is needed while there are none, on loopback."""
+
+
+def scope_of(route: RouteContext, method: str) -> KeyScope | None:
+    """Return the scope a route needs; None: no key.
+
+    A route that does not say lets read what only reads, and operators do the rest. What is no
+    route of REST is a file of the package.
+    """
+    if not isinstance(route.original_route, APIRoute):
+        return None
+    said = (route.openapi_extra or {}).get("security")
+    if said is None:
+        return KeyScope.READ if method in _READS else KeyScope.OPERATE
+    return KeyScope(said[0]["bearer"][0]) if said else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hosts:
+    """Names and addresses under which this service is asked for; loopback is always one."""
+
+    bound: str = "127.0.0.1"
+    """Address it listens on. With that of all interfaces any address will do, for a page that was
+    loaded from an address cannot have had it resolved to another."""
+
+    allowed: tuple[str, ...] = ()
+    """Further names, without a port."""
+
+    @property
+    def local(self) -> bool:
+        """Whether nobody can ask but this machine."""
+        return is_loopback(self.bound)
+
+    def know(self, host: str) -> bool:
+        """Return whether the value of a ``Host`` header is one of them."""
+        match = _HOST.fullmatch(host)
+        if match is None:
+            return False
+        name = match[1].strip("[]").rstrip(".").lower()
+        if name in {"localhost", self.bound.lower(), *(n.lower() for n in self.allowed)}:
+            return True
+        try:
+            return ip_address(name).is_loopback or ip_address(self.bound).is_unspecified
+        except ValueError:
+            return False
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a request may not be made."""
+
+    status: HTTPStatus
+    kind: str
+    """Of the problem that it is answered with."""
+
+    detail: str
+    headers: Mapping[str, str] = field(default_factory=dict)
+    who: str = ""
+    """Name of the key that was shown, where there is such a key."""
+
+
+class Failures:
+    """Wrong keys by the address that has shown them.
+
+    A right one is never refused for what others at its address do: what has 256 bits cannot be
+    guessed, and an operator must not be locked out by a forgotten program.
+    """
+
+    def __init__(self) -> None:
+        self._of: OrderedDict[str, tuple[float, int]] = OrderedDict()
+
+    def count(self, address: str) -> int:
+        """Count one more; return after how many seconds the address may try again, 0: at once."""
+        now_s, house = time.monotonic(), _house(address)
+        since_s, n_before = self._of.pop(house, (now_s, 0))
+        if now_s - since_s >= FAILURES_WITHIN_S:
+            since_s, n_before = now_s, 0
+        self._of[house] = (since_s, n_before + 1)
+        if len(self._of) > MOST_ADDRESSES:
+            self._of.popitem(last=False)
+        left_s = since_s + FAILURES_WITHIN_S - now_s
+        return 0 if n_before < MOST_FAILURES else math.ceil(left_s)
+
+
+def _house(address: str) -> str:
+    """Return what one client can have all addresses of."""
+    try:
+        six = ip_address(address).version == 6
+    except ValueError:
+        return address
+    return str(ip_network(f"{address}/64", strict=False)) if six else address
+
+
+class Refusals:
+    """Tells the audit trail of what was refused: one by one, of a flood how many a minute.
+
+    Parameters
+    ----------
+    audit
+        Takes an entry of the trail.
+    """
+
+    def __init__(self, audit: Callable[[AuditEntry], object]) -> None:
+        self._audit = audit
+        self._left = MOST_TOLD
+        self._untold: Counter[str] = Counter()
+        self._next: asyncio.TimerHandle | None = None
+
+    def tell(self, request: Request, refusal: Refusal) -> None:
+        """Take down a refusal."""
+        if self._next is None:
+            self._next = asyncio.get_running_loop().call_later(TOLD_WITHIN_S, self._look_again)
+        if self._left == 0:
+            self._untold[refusal.kind] += 1
+            return
+        self._left -= 1
+        address = address_of(request)
+        self._write(
+            AuditEntry(
+                t_ns_utc=time.time_ns(),
+                who=refusal.who or address or "somebody",
+                name=f"request.{refusal.kind}",
+                text=f"{request.method} {request.url.path:.200}",
+                address=address,
+                whence=whence_of(request),
+                answer=f"{refusal.status}: {refusal.detail}",
+            )
+        )
+
+    def _look_again(self) -> None:
+        """Tell how many were not told; while they keep coming, nothing but that."""
+        self._next = None
+        self._left = 0 if self._untold else MOST_TOLD
+        if self._untold:
+            kinds = ", ".join(f"{n} {kind}" for kind, n in self._untold.most_common())
+            text = f"{self._untold.total()} more within {TOLD_WITHIN_S:g} s: {kinds}"
+            self._untold.clear()
+            self._next = asyncio.get_running_loop().call_later(TOLD_WITHIN_S, self._look_again)
+            self._write(
+                AuditEntry(t_ns_utc=time.time_ns(), who="service", name="request.flood", text=text)
+            )
+
+    def _write(self, entry: AuditEntry) -> None:
+        structlog.get_logger().warning(
+            "api.refused", kind=entry.name, who=entry.who, asked=entry.text, answer=entry.answer
+        )
+        self._audit(entry)
+
+
+def address_of(request: Request) -> str:
+    """Return the address of whoever asks; empty: it is not known."""
+    return "" if request.client is None else request.client.host
+
+
+def caller_of(request: Request) -> Caller:
+    """Return who asks, once they are let through."""
+    key: Key | None = request.user
+    return Caller(
+        address=address_of(request), key="" if key is None else key.name, whence=whence_of(request)
+    )
+
+
+def whence_of(request: Request) -> Whence:
+    """Return what a request came through."""
+    sent = request.headers
+    if "origin" in sent or "sec-fetch-site" in sent:  # only browsers say so
+        return Whence.PAGE
+    return Whence.CLI if sent.get("user-agent", "").startswith("pyrcal") else Whence.REST
+
+
+class Admission(Middleware):
+    """Lets requests through to the application that may be made, each with its whole body.
+
+    ``request.user`` is then the key it was made with; None: there are no keys, or none is needed.
+    As soon as there has been a key, one is needed from everywhere: what comes from loopback may be
+    a proxy's, or anybody's who has an account here; and to revoke the last one opens no door.
+
+    Parameters
+    ----------
+    app
+        The application.
+    hosts
+        Under which it is asked for.
+    keys
+        Those there are; None: nobody needs one.
+    audit
+        Takes an entry of the audit trail.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        hosts: Hosts,
+        keys: KeyFile | None,
+        audit: Callable[[AuditEntry], object],
+    ) -> None:
+        super().__init__(app)
+        self._hosts = hosts
+        self._keys = keys
+        self._failures = Failures()
+        self._refusals = Refusals(audit)
+        self._routes: tuple[RouteContext, ...] = ()
+        self._trouble = ""
+
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await to_its_end(self._admit, scope, receive, send)
+
+    async def _admit(self, scope: Scope, receive: Receive, send: Send) -> None:
+        request, scope["user"] = Request(scope), None
+        refusal = self._stranger(request)
+        if refusal is None and (needed := self._scope_of(request)) is not None:
+            scope["user"], refusal = self._known(request, needed)
+            send = self._while_valid(scope["user"], send)
+        if refusal is not None:
+            self._refusals.tell(request, refusal)
+            told = (refusal.status, refusal.kind, refusal.detail, refusal.headers)
+            return await problem(request, *told)(scope, receive, send)
+        return await bounded(self._app, scope, receive, send)
+
+    def _stranger(self, request: Request) -> Refusal | None:
+        """Return why a request is not for this service, or not of its own page; None: it is."""
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if not self._hosts.know(host):
+            detail = (
+                f"found Host {host!r:.100}, expected localhost or the address this service listens "
+                "on; name others in the settings, api.allowed_hosts"
+            )
+            return Refusal(HTTPStatus.MISDIRECTED_REQUEST, "foreign-host", detail)
+        if origin is not None and not _same(origin.lower(), host.lower()):
+            detail = (
+                f"found Origin {origin!r:.100}, expected none or http://{host}: a page from "
+                "elsewhere cannot use this service"
+            )
+            return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
+        return None
+
+    def _known(self, request: Request, needed: KeyScope) -> tuple[Key | None, Refusal | None]:
+        """Return the key a request is made with, and why it may not be made."""
+        secret, by_cookie = shown_key(request)
+        try:
+            if self._keys is None or self._holds(None):
+                return None, None
+            key = None if secret is None else self._keys.key_of(secret)
+        except ConfigurationError as error:
+            if self._trouble != str(error):  # once, not with each request
+                self._trouble = str(error)
+                structlog.get_logger().error("api.keys", text=self._trouble)
+            detail = "the file of the API keys cannot be read; the service's log says more"
+            later = {"Retry-After": str(RETRY_S)}
+            return None, Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "keys", detail, later)
+        if key is None:
+            return None, self._unknown(request, needed, shown=secret is not None)
+        if not key.scope.covers(needed):
+            detail = f"key {key.name} is of scope {key.scope}, this needs one of scope {needed}"
+            told = _challenge(f', error="insufficient_scope", scope="{needed}"')
+            return key, Refusal(HTTPStatus.FORBIDDEN, "scope", detail, told, key.name)
+        if by_cookie and request.method not in _READS and "origin" not in request.headers:
+            detail = "found a browser's cookie and no Origin, expected both: is it this page's?"
+            return key, Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail, who=key.name)
+        return key, None
+
+    def _unknown(self, request: Request, needed: KeyScope, *, shown: bool) -> Refusal:
+        """Return the refusal of a request without a key, or with one that is none."""
+        expected = f"expected a key of scope {needed}"
+        if not shown:
+            detail = f"found no key, {expected}: Authorization: Bearer KEY, or log in at the page"
+            return Refusal(HTTPStatus.UNAUTHORIZED, "no-key", detail, _challenge())
+        wait_s = self._failures.count(address_of(request))
+        if wait_s:
+            detail = f"found more than {MOST_FAILURES} wrong keys from here, {expected}"
+            later = {"Retry-After": str(wait_s)}
+            return Refusal(HTTPStatus.TOO_MANY_REQUESTS, "too-many", detail, later)
+        detail = f"found a key that is none, or no longer, {expected}"
+        told = _challenge(', error="invalid_token"')
+        return Refusal(HTTPStatus.UNAUTHORIZED, "wrong-key", detail, told)
+
+    def _scope_of(self, request: Request) -> KeyScope | None:
+        """Return the scope a request needs; None: no key."""
+        self._routes = self._routes or tuple(iter_route_contexts(request.app.routes))
+        for route in self._routes:
+            if route.path_regex.match(request.scope["path"]) and (
+                route.methods is None or request.method in route.methods
+            ):
+                return scope_of(route, request.method)
+        return KeyScope.READ if request.method in _READS else KeyScope.OPERATE
+
+    def _while_valid(self, key: Key | None, send: Send) -> Send:
+        """Return what ends an answer that comes bit by bit when its key is good no longer."""
+        ended = False
+
+        async def sent(message: Message) -> None:
+            nonlocal ended
+            if ended:
+                return
+            if message.get("more_body", False):
+                try:
+                    ended = not self._holds(key)
+                except ConfigurationError:
+                    ended = True
+                if ended:
+                    message = {"type": "http.response.body", "body": b"", "more_body": False}
+            await send(message)
+
+        return sent
+
+    def _holds(self, key: Key | None) -> bool:
+        """Return whether a key is good at this moment; None: whether none is needed.
+
+        Raises
+        ------
+        ConfigurationError
+            If nobody can tell.
+        """
+        keys = () if self._keys is None else self._keys.all()
+        if key is None:
+            return self._keys is None or (self._hosts.local and not self._keys.path.exists())
+        return key in keys
+
+
+def shown_key(request: Request) -> tuple[str | None, bool]:
+    """Return the key that a request shows, and whether it is a browser's cookie."""
+    scheme, _, secret = request.headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return secret.strip(), False
+    return request.cookies.get(COOKIE), True
+
+
+def _challenge(more: str = "") -> dict[str, str]:
+    """Return the header that says how to show a key (RFC 6750)."""
+    return {"WWW-Authenticate": f'Bearer realm="pyrcal"{more}'}
+
+
+def _same(origin: str, host: str) -> bool:
+    scheme, _, authority = origin.partition("://")
+    port = _PORTS.get(scheme)
+    return port is not None and authority.removesuffix(port) == host.removesuffix(port)

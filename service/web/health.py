@@ -1,0 +1,313 @@
+"""How the service is doing: for orchestrators and Prometheus."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from enum import StrEnum
+from http import HTTPStatus
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CollectorRegistry, ProcessCollector
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+from pydantic import BaseModel
+
+from service import __version__
+from service.link.statistics import LinkStatistics
+from service.runtime.snapshot import Pace, Snapshot
+from service.tracking.activity import Occupation, Operation
+from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, Attention, Party, Severity
+from service.tracking.dither_request import DitherPhase
+from service.tracking.products import MatrixState
+from service.tracking.registration import Source, Validity
+from service.tracking.state import Mode, TrackerState
+from service.web.admission import OPEN
+from service.web.problems import problem, problem_response
+from service.web.views import ServiceDep
+from service.wire import Pattern
+
+router = APIRouter(tags=["how it is doing"])
+
+FRESH_S = 3.0
+"""Telemetry whose last frame is older has stopped, seconds."""
+
+
+class HealthView(BaseModel):
+    """The process runs and answers."""
+
+    status: str
+    version: str
+    uptime_s: float
+
+
+class ReadyView(BaseModel):
+    """The service does its work: telemetry is fresh, the archive writable, the worker keeps up."""
+
+    ready: bool
+    reason: str
+
+
+@router.get("/healthz", openapi_extra=OPEN)
+async def healthz(service: ServiceDep) -> HealthView:
+    """Answer as long as the process lives."""
+    snapshot = service.snapshot()
+    return HealthView(status="ok", version=__version__, uptime_s=snapshot.uptime_s)
+
+
+@router.get(
+    "/readyz",
+    openapi_extra=OPEN,
+    response_model=ReadyView,
+    responses={503: problem_response("Telemetry, archive or worker: the detail says which, why")},
+)
+async def readyz(request: Request, service: ServiceDep) -> ReadyView | Response:
+    """Say whether telemetry is fresh, the archive writable and the worker keeps up; which is not.
+
+    It asks for more than ``ready`` of the state, which a service without an RTC is, too.
+    """
+    snapshot = service.snapshot()
+    detail = "; ".join(f"{part}: {text}" for part, text in troubles(snapshot).items() if text)
+    if detail:
+        return problem(request, HTTPStatus.SERVICE_UNAVAILABLE, "not-ready", detail)
+    return ReadyView(ready=True, reason=snapshot.ready_reason)
+
+
+def troubles(snapshot: Snapshot) -> dict[str, str]:
+    """Return what is the matter with telemetry, archive and worker; empty: nothing."""
+    alarms = {alarm.name: alarm.text for alarm in snapshot.tracker.alarms}
+    hindering = [wait for wait in snapshot.waiting_for if wait.hinders]
+    age_s = snapshot.link.frame_age_s
+    stopped = []
+    if age_s is None:
+        stopped = ["no frame has come from an RTC yet"]
+    elif age_s > FRESH_S:
+        stopped = [f"the last frame came {age_s:.0f} s ago, expected one within {FRESH_S:g} s"]
+    unusable = [wait.text for wait in hindering if wait.party is not Party.WORKER]
+    lost = [wait.text for wait in hindering if wait.party is Party.WORKER]
+    return {
+        "telemetry": "; ".join([*stopped, *unusable]),
+        "archive": alarms.get(ARCHIVE_FAILED, ""),
+        "worker": "; ".join([*lost, *([alarms[WORKER_BEHIND]] if WORKER_BEHIND in alarms else [])]),
+    }
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "Prometheus text format, or OpenMetrics where Accept asks for it",
+            "content": {"text/plain": {"schema": {"type": "string"}}},
+        }
+    },
+)
+async def metrics(request: Request, service: ServiceDep) -> Response:
+    """Return everything that can be counted or measured, for Prometheus."""
+    encode, content_type = choose_encoder(request.headers.get("accept", ""))
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(SnapshotCollector(service.snapshot))
+    ProcessCollector(registry=registry)
+    return Response(encode(registry), headers={"Content-Type": content_type})
+
+
+# --- the snapshot as Prometheus metrics
+
+_ALPHA = (
+    "shift_x_subapertures",
+    "shift_y_subapertures",
+    "rotation_radians",
+    "magnification_ratio",
+)
+"""The four parameters in base units; the sensor's own for shifts."""
+
+_LINK_COUNTERS = {
+    "batches_received": "Telemetry batches taken in",
+    "frames_received": "Frames that could be used",
+    "frames_recovered": "Frames that came late and still found their place",
+    "frames_duplicate": "Frames that came again",
+    "frames_late": "Frames that came when their place had been passed",
+    "frames_nonfinite": "Frames dropped because a number in them was not finite",
+    "frames_overwritten": "Frames nobody drained in time, or that a new session made void",
+    "statuses_received": "Status messages of the RTC",
+    "acknowledgements_received": "Acknowledgements of reconstructors",
+    "acknowledgements_unknown": "Acknowledgements for an id that was never offered",
+    "events_dropped": "Events of the link that nobody took in time",
+    "callback_errors": "Faults of the service while it took a message in",
+}
+
+
+class SnapshotCollector(Collector):
+    """Reads one snapshot for each scrape.
+
+    Parameters
+    ----------
+    snapshot
+        Returns what is known now.
+    """
+
+    def __init__(self, snapshot: Callable[[], Snapshot]) -> None:
+        self._snapshot = snapshot
+
+    # typing.override comes with Python 3.12
+    def collect(self) -> Iterator[Metric]:  # type: ignore[explicit-override]
+        """Yield every metric."""
+        snapshot = self._snapshot()
+        tracker = snapshot.tracker
+        yield _gauge("build_info", "Version", {__version__: 1}, "version")
+        parts = {part: not text for part, text in troubles(snapshot).items()}
+        yield _gauge("ready", "1 for each part that does its work; all: /readyz", parts, "part")
+        yield _gauge("uptime_seconds", "Since the service started", snapshot.uptime_s)
+        refused = "Attempts to write that the disk has refused"
+        yield _counter("archive_failures", refused, snapshot.archive_failures)
+        waiting = "Lines of the audit trail that are not on the disk yet"
+        yield _gauge("archive_waiting", waiting, snapshot.archive_waiting)
+        yield from _of_pace(snapshot.pace)
+        yield from _of_link(snapshot.link)
+        yield from _of_registration(snapshot)
+        yield from _of_the_dither(tracker)
+        yield from _of_reconstructors(tracker)
+        yield from _of_measurement(snapshot)
+        yield from _of_alarms(snapshot)
+        waits = {wait.name: wait.hinders + 1 for wait in snapshot.waiting_for}
+        expected = "1 for what is waited for, 2 where nothing can be done meanwhile"
+        yield _gauge("waiting_for", expected, waits, "name")
+
+
+def _of_alarms(snapshot: Snapshot) -> Iterator[Metric]:
+    lasting, operating = snapshot.alarms, snapshot.operating
+    yield _gauge("alarms", "Alarms that last", len(lasting))
+    names = {alarm.note.name: 1 for alarm in lasting}
+    yield _gauge("alarm", "1 for each alarm that lasts", names, "name")
+    by_severity = Counter(str(alarm.severity) for alarm in lasting if alarm.note.muted is None)
+    shown = {str(severity): by_severity[severity] for severity in Severity}
+    yield _gauge("alarms_shown", "Alarms that last and are not muted", shown, "severity")
+    active = sum(alarm.note.attention is Attention.ACTIVE for alarm in lasting)
+    yield _gauge("alarms_unacknowledged", "Alarms that last and nobody has acknowledged", active)
+    stale = "Alarms that have gone and nobody has acknowledged"
+    yield _gauge("alarms_stale", stale, len(snapshot.stale_alarms))
+    yield _gauge("alarms_muted", "Alarms that are muted", len(snapshot.muted_alarms))
+    states = _one_of(Operation, operating.operation)
+    yield _gauge("operation", "1 for the state of the service", states, "state")
+    doing = _one_of(Occupation, operating.occupation)
+    yield _gauge("occupation", "1 for what the service does", doing, "occupation")
+
+
+def _of_pace(pace: Pace) -> Iterator[Metric]:
+    text = "Processor time of the worker per second of telemetry, last minute"
+    yield _gauge("worker_load_ratio", text, pace.worker_per_s)
+    yield _gauge("worker_job_load_ratio", f"{text}, by job", pace.by_job, "job")
+    text = "Processor time of the service itself per second, last minute"
+    yield _gauge("service_load_ratio", text, pace.service_per_s)
+    busy = "Share of the last minute in which the worker had a job"
+    yield _gauge("worker_busy_ratio", busy, pace.busy_ratio)
+    yield _gauge("window_seconds", "Mean length of the windows of the last minute", pace.window_s)
+    late = "Windows of the last minute that were joined to one the worker had no hand free for"
+    yield _gauge("windows_late", late, pace.windows_late)
+
+
+def _of_link(link: LinkStatistics) -> Iterator[Metric]:
+    for name, text in _LINK_COUNTERS.items():
+        yield _counter(name, text, getattr(link, name))
+    refused = "Frames not used, by reason"
+    yield _counter("frames_refused", refused, link.frames_refused, "reason")
+    malformed = "Messages that broke the contract"
+    yield _counter("messages_malformed", malformed, link.messages_malformed, "kind")
+    lost = "Frames missing in the sequence; falls again when they are recovered"
+    yield _gauge("frames_lost", lost, link.frames_lost)
+    yield _gauge("rtc_alive", "1 while the RTC's liveliness token is there", link.rtc_alive)
+    yield _gauge("frame_age_seconds", "Since the last frame arrived", link.frame_age_s)
+    yield _gauge("latency_p50_seconds", "Median from put to callback", link.latency_p50_s)
+
+
+def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
+    tracker = snapshot.tracker
+    windows = {
+        "accepted": tracker.windows_accepted,
+        "refused": tracker.windows_refused,
+        "outlying": tracker.windows_outlying,
+    }
+    yield _counter("windows", "Windows of telemetry, by verdict", windows, "verdict")
+    # the last look of each kind
+    misfits = {str(entry.source): entry.misfit for entry in tracker.history}
+    if tracker.watchdog is not None:
+        misfits[str(Source.PASSIVE)] = tracker.watchdog.misfit
+    explained = "Residual power over what noise explains, last of each kind: 1 is all explained"
+    yield _gauge("misfit_ratio", explained, misfits, "source")
+    alpha = snapshot.alpha
+    if alpha is None:
+        return
+    registration = alpha.known
+    for name, text, four in (
+        ("alpha", "Registration", registration.alpha.vector),
+        ("alpha_sigma", "1 sigma, floor included", registration.sigma),
+    ):
+        for parameter, value in zip(_ALPHA, four.tolist(), strict=True):
+            yield _gauge(f"{name}_{parameter}", text, value)
+    yield _gauge("alpha_age_seconds", "Age of the estimate", alpha.age_s)
+    worth = registration.standing.validity
+    text = "1 for what the estimate is worth"
+    yield _gauge("alpha_validity", text, _one_of(Validity, worth), "validity")
+    due = tracker.dither_due_since_ns_utc is not None
+    yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
+    gain = "Mean optical gain of the dithered modes"
+    yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
+
+
+def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
+    dithering = tracker.dithering
+    mean = "Quadratic mean of the dither over ten minutes, OPD"
+    yield _gauge("dither_mean_meters", mean, dithering.mean_cost_m)
+    yield _gauge("dither_budget_meters", "Largest RMS of all modes together", dithering.budget_m)
+    phases = _one_of(DitherPhase, dithering.phase)
+    yield _gauge("dither_phase", "1 for how the service dithers", phases, "phase")
+
+
+def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
+    states = Counter(record.state for record in tracker.reconstructors)
+    by_state = {str(state): states[state] for state in MatrixState}
+    yield _gauge("reconstructors", "Reconstructors remembered", by_state, "state")
+    yield _gauge("mode", "1 for the mode of the service", _one_of(Mode, tracker.mode), "mode")
+    if tracker.margin is None:
+        return
+    worst = tracker.margin.worst_pole_radius
+    yield _gauge("worst_pole_radius", "Of the reconstructor in use, 1 is unstable", worst)
+    yield _gauge("pole_radius_bound", "Largest radius that is accepted", tracker.margin.bound)
+    yield _gauge("stability_margin", "1 minus the worst pole radius", 1.0 - worst)
+
+
+def _of_measurement(snapshot: Snapshot) -> Iterator[Metric]:
+    current = snapshot.tracker.measuring
+    patterns = _one_of(Pattern, None if current is None else current.pattern)
+    text = "1 for the pattern of the interaction matrix being measured"
+    yield _gauge("measuring", text, patterns, "pattern")
+    if current is not None and current.asked_ns_utc is not None:
+        age_s = (snapshot.now_ns - current.asked_ns_utc) / 1e9
+        yield _gauge("measuring_seconds", "Since it was asked for", age_s)
+
+
+def _one_of(kinds: type[StrEnum], current: StrEnum | None) -> dict[str, int]:
+    """Return 1 for the kind that it is, 0 for all others."""
+    return {str(kind): int(kind is current) for kind in kinds}
+
+
+Numbers = float | None | Mapping[str, float]
+"""What is not known is NaN, as Prometheus has it."""
+
+
+def _gauge(name: str, text: str, value: Numbers, label: str = "") -> Metric:
+    return _filled(GaugeMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value)
+
+
+def _counter(name: str, text: str, value: Numbers, label: str = "") -> Metric:
+    return _filled(CounterMetricFamily(f"pyrcal_{name}", text, labels=[label] * bool(label)), value)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, value: Numbers) -> Metric:
+    """Return a metric with its number, or one for each value of its label."""
+    for key, number in value.items() if isinstance(value, Mapping) else [("", value)]:
+        labels = [key] if isinstance(value, Mapping) else []
+        family.add_metric(labels, math.nan if number is None else number)
+    return family

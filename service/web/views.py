@@ -1,0 +1,500 @@
+"""What leaves over REST: which fields of which record, and how they are written.
+
+Records leave as they are: a view names the fields of one, in boundary units. A registration, or its
+1 σ, leaves as its four parameters; a number that is not finite is null. The OpenAPI document takes
+types and descriptions from the records themselves, when it is asked for.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import math
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from functools import cache, lru_cache
+from hashlib import blake2b
+from itertools import pairwise
+from operator import attrgetter, methodcaller
+from types import NoneType, UnionType
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+from fastapi import Depends, Request, Response
+from numpy.typing import NDArray
+
+from service.archive import AuditEntry
+from service.control.expected_gain import ExpectedGain
+from service.control.gains import ModeGain
+from service.control.gate import GateVerdict
+from service.errors import UnknownIdError
+from service.estimation.comparison import ProbationFinding
+from service.link.statistics import LinkStatistics
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.runtime.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
+from service.runtime.supervisor import Supervisor
+from service.tracking.activity import Operating
+from service.tracking.alarms import Alarm, Note, Remark, Waiting
+from service.tracking.commands import GainGroup
+from service.tracking.dither_request import Dither, Dithering, DitherPlan
+from service.tracking.interlocks import Permission
+from service.tracking.loop import LoopCommand
+from service.tracking.mode_limits import ModeLimit, ModeProof
+from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
+from service.tracking.registration import HistoryEntry, Move, Watchdog
+from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState
+from service.wire import Pointing
+
+Record = TypeVar("Record")
+
+Schema = dict[str, Any]
+"""A JSON schema."""
+
+_LATEST_NS = 253_402_300_800 * 1_000_000_000
+"""RFC 3339 has years of four digits."""
+
+
+class FieldShown(NamedTuple):
+    """A field of a picture."""
+
+    path: str
+    """Where to find it, from the record on."""
+
+    taken: Callable[[Any], Any]
+    below: View | None
+    """Of the records in it, where it is not the usual one."""
+
+    clock: str
+    """Name under which it leaves by the clock, too; empty: it is no time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """A picture of a record."""
+
+    name: str
+    """Of its schema."""
+
+    record: type
+    text: str
+    """What it shows."""
+
+    parts: Mapping[str, FieldShown]
+    """By the name each leaves under."""
+
+
+_USUAL: dict[type, View] = {}
+_NAMED: dict[str, View] = {}
+
+
+def view(name: str, record: type, fields_of: str = "", text: str = "", **below: View) -> View:
+    """Make a view known, and return it.
+
+    Parameters
+    ----------
+    name
+        Of its schema.
+    record
+        The record's type; the first view of one is its usual view.
+    fields_of
+        Which fields leave, separated by spaces; ``name=path`` for one that leaves under another
+        name. Empty: all of them.
+    text
+        What it shows; empty: the record's own words.
+    **below
+        Views of the records in its fields, where they are not the usual ones.
+    """
+    parts = {}
+    for word in fields_of.split() or [field.name for field in fields(record)]:
+        own, _, path = word.rpartition("=")
+        own = own or path.rpartition(".")[2]
+        parts[own] = FieldShown(path, attrgetter(path), below.get(own), clock_of(own))
+    text = text or inspect.cleandoc(record.__doc__ or "")
+    made = View(name=name, record=record, text=text, parts=parts)
+    _NAMED[name] = made
+    _USUAL.setdefault(record, made)
+    return made
+
+
+def picture(record: object, of: View | None = None) -> dict[str, Any]:
+    """Return what JSON can hold of a record, as its usual view or another shows it."""
+    of = of or _USUAL[type(record)]
+    shown = {}
+    for name, (_, taken, below, clock) in of.parts.items():
+        value = taken(record)
+        shown[name] = _plain(value, below)
+        if clock:
+            shown[clock] = rfc3339(value)
+    return shown
+
+
+@lru_cache(maxsize=1500)
+def _lasting(record: HistoryEntry | LogEntry | AuditEntry) -> dict[str, Any]:
+    """Return the picture of what is asked for again and again, and never changes."""
+    return picture(record)
+
+
+def clock_of(name: str) -> str:
+    """Return the name under which a time in nanoseconds leaves by the clock; empty: it is none."""
+    is_time = name.endswith("_ns_utc") or name == "now_ns"
+    return f"{name.removesuffix('_utc').removesuffix('_ns')}_utc" if is_time else ""
+
+
+def rfc3339(t_ns: int | None) -> str | None:
+    """Return a time in UTC to the microsecond; None for one that is not known, or too late."""
+    if not t_ns or not 0 < t_ns < _LATEST_NS:
+        return None
+    seconds, rest_ns = divmod(t_ns, 1_000_000_000)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
+
+
+as_json = msgspec.json.Encoder(enc_hook=methodcaller("item")).encode
+"""Returns the JSON of a picture, in which numbers may be NumPy's."""
+
+
+def answer(record: object, of: View | None = None) -> Response:
+    """Return the answer that shows a record."""
+    return Response(as_json(picture(record, of)), media_type="application/json")
+
+
+def tagged(record: object, of: View | None = None) -> Response:
+    """Return the answer that shows a record, with an ETag that changes when it does."""
+    shown = answer(record, of)
+    shown.headers["ETag"] = f'"{blake2b(shown.body, digest_size=12).hexdigest()}"'
+    return shown
+
+
+def known(record: Record | None, what: str) -> Record:
+    """Return the record that was looked up.
+
+    Raises
+    ------
+    UnknownIdError
+        If there is none of ``what`` was asked for.
+    """
+    if record is None:
+        raise UnknownIdError(f"{what}: nobody has heard of it")
+    return record
+
+
+def four(vector: NDArray[np.float64]) -> dict[str, float | None]:
+    """Return a 4-vector in numeric units under its names and in the units of every boundary."""
+    values = (vector * BOUNDARY_SCALE).tolist()
+    return {name: finite(value) for name, value in zip(PARAMETERS, values, strict=True)}
+
+
+def finite(value: float) -> float | None:
+    """Return the number, or None where it is not finite."""
+    return value if math.isfinite(value) else None
+
+
+def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a record
+    if value is None or isinstance(value, (str, int)):
+        return value
+    if isinstance(value, float):
+        return finite(value)
+    if isinstance(value, _LASTING):
+        return _lasting(value)
+    if isinstance(value, Misregistration):
+        return four(value.vector)
+    if isinstance(value, np.ndarray):
+        return four(value)
+    if isinstance(value, tuple | list):
+        return [_plain(entry, of) for entry in value]
+    if isinstance(value, Mapping):
+        return {key: _plain(entry, of) for key, entry in value.items()}
+    return picture(value, of)
+
+
+_LASTING = (HistoryEntry, LogEntry, AuditEntry)
+
+
+# a plain function would be called in a thread, which takes as long as most answers
+async def _service_of(request: Request) -> Supervisor:
+    service: Supervisor = request.app.state.service
+    return service
+
+
+ServiceDep = Annotated[Supervisor, Depends(_service_of)]
+"""The service a route works for."""
+
+
+# --- the OpenAPI document
+
+
+def shows(of: View) -> dict[str, Any]:
+    """Return the OpenAPI description of an answer that shows a record."""
+    schema = {"$ref": f"{SCHEMAS}{of.name}"}
+    content = {"application/json": {"schema": schema}}
+    return {"description": _for_readers(of.text), "content": content}
+
+
+def schemas() -> dict[str, Schema]:
+    """Return the schemas of all views, and of what they hold, by name."""
+    found: dict[str, Schema] = {"FourView": _FOUR}
+    for of in _NAMED.values():
+        properties = {}
+        for name, part in of.parts.items():
+            kind, text = _field(of.record, part.path)
+            properties[name] = _schema(kind, part.below, found)
+            if text:
+                properties[name] = {**properties[name], "description": _for_readers(text)}
+            if part.clock:
+                properties[part.clock] = {**_CLOCK, "description": f"``{name}`` by the clock."}
+        found[of.name] = {
+            "type": "object",
+            "description": _for_readers(of.text),
+            "properties": properties,
+            "required": list(properties),
+        }
+    return found
+
+
+SCHEMAS = "#/components/schemas/"
+_NUMBER: Schema = {"anyOf": [{"type": "number"}, {"type": "null"}]}
+_CLOCK: Schema = {"anyOf": [{"type": "string", "format": "date-time"}, {"type": "null"}]}
+_OF_KIND: dict[object, Schema] = {
+    float: _NUMBER,
+    int: {"type": "integer"},
+    bool: {"type": "boolean"},
+    str: {"type": "string"},
+}
+_FOUR: Schema = {
+    "type": "object",
+    "description": "The four parameters of a registration, or their 1 σ.",
+    "properties": {
+        "shift_x_subap": {**_NUMBER, "description": "Along sensor +x, subapertures."},
+        "shift_y_subap": {**_NUMBER, "description": "Along sensor +y, subapertures."},
+        "rotation_deg": {**_NUMBER, "description": "From sensor +x towards +y, degrees."},
+        "magnification": {**_NUMBER, "description": "Ratio; 1 is nominal."},
+    },
+    "required": list(PARAMETERS),
+}
+
+
+def beside_the_four(schema: Schema) -> None:
+    """Add the four parameters of a registration to the keys they lie beside."""
+    four = _FOUR["properties"].items()
+    titled = {name: {**said, "title": name.replace("_", " ").title()} for name, said in four}
+    schema["properties"] = titled | schema["properties"]
+    schema["required"] = [*PARAMETERS, *schema["required"]]
+
+
+def _schema(kind: Any, of: View | None, found: dict[str, Schema]) -> Schema:  # noqa: ANN401  a type
+    """Return the schema of a type; those of alternatives that it holds are added to ``found``."""
+    origin, inside = get_origin(kind), get_args(kind)
+    if kind in _OF_KIND:
+        return _OF_KIND[kind]
+    if origin in {Union, UnionType}:
+        schema = _schema(next(one for one in inside if one is not NoneType), of, found)
+        return schema if schema == _NUMBER else {"anyOf": [schema, {"type": "null"}]}
+    if kind is Misregistration or origin is np.ndarray:
+        return {"$ref": f"{SCHEMAS}FourView"}
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return {"type": "object", "additionalProperties": _schema(inside[1], of, found)}
+    if origin in {tuple, list}:
+        return {"type": "array", "items": _schema(inside[0], of, found)}
+    if issubclass(kind, StrEnum):
+        found[kind.__name__] = {
+            "type": "string",
+            "enum": [entry.value for entry in kind],
+            "description": inspect.getdoc(kind) or "",
+        }
+        return {"$ref": f"{SCHEMAS}{kind.__name__}"}
+    return {"$ref": f"{SCHEMAS}{(of or _USUAL[kind]).name}"}
+
+
+def _field(record: type, path: str) -> tuple[Any, str]:
+    """Return the type of what a path leads to, and what the record says of it."""
+    first, _, rest = path.partition(".")
+    hints, texts = _facts(record)
+    if not rest:
+        return hints[first], texts.get(first, "")
+    return _field(_without_none(hints[first]), rest)
+
+
+def _without_none(kind: Any) -> Any:  # noqa: ANN401  a type
+    return next((one for one in get_args(kind) if one is not NoneType), kind)
+
+
+@cache
+def _facts(record: type) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return types and descriptions of a record's fields and properties, by name."""
+    if record is object:
+        return {}, {}
+    hints, texts = (dict(facts) for facts in _facts(record.__mro__[1]))
+    hints |= get_type_hints(record) if is_dataclass(record) else {}
+    for statement, after in pairwise([*_statements(record), ast.Pass()]):
+        match statement, after:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(
+                value=ast.Constant(value=str(text))
+            ):
+                texts[name] = inspect.cleandoc(text)
+            case ast.FunctionDef(name=name), _ if isinstance(getattr(record, name), property):
+                module = vars(sys.modules[record.__module__])
+                hints[name] = get_type_hints(getattr(record, name).fget, module)["return"]
+                texts[name] = ast.get_docstring(statement) or ""
+            case _:
+                pass
+    return hints, texts
+
+
+def _statements(record: type) -> Iterator[ast.stmt]:
+    """Yield what the source of a record says, of those it is derived from first."""
+    for base in reversed(record.__mro__[:-1]):
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        yield from tree.body if isinstance(tree, ast.ClassDef) else ()
+
+
+def explained(record: type) -> dict[str, str]:
+    """Return what a record says of its fields, by name."""
+    return {name: _for_readers(text) for name, text in _facts(record)[1].items()}
+
+
+def _for_readers(text: str) -> str:
+    """Return a record's description as it is true of JSON: null, four names, boundary units."""
+    text = re.sub(r"\b(None|NaN)\b", "null", text.partition("\n\n")[0])
+    return re.sub(r"``\(4,\)`` |,? ?numeric units( \([^)]*\))?", "", text)
+
+
+# --- what of each record leaves
+
+
+view("PointingView", Pointing)
+view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=scatter t_ns_utc")
+view("VerdictView", GateVerdict)
+view("ExpectedGainView", ExpectedGain)
+view("AssessmentView", Assessment)
+view("ProbationFindingView", ProbationFinding)
+view("ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback")
+view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
+view("ModeProofView", ModeProof, "n_proven contrary_modes own_response_ratio")
+ALPHA = view(
+    "AlphaView",
+    Alpha,
+    "known.alpha known.sigma known.floor covariance parameters known.t_ns_utc age_s window_age_s "
+    "known.n_windows known.standing.validity validity_reason=known.standing.reason "
+    "valid_until_ns_utc=known.standing.until_ns_utc known.restored_ns_utc known.jumped_ns_utc "
+    "suspected known.optical_gain known.optical_gains passive_bias passive_bias_sigma "
+    "known.pointing",
+)
+view("HistoryEntryView", HistoryEntry)
+HISTORY = view("HistoryView", TrackerState, "entries=history", "The last estimates.")
+view("WatchdogView", Watchdog)
+
+view("GainGroupView", GainGroup)
+view(
+    "RtcView",
+    Rtc,
+    "known.session known.loop known.frame_rate_hz known.delay_frames known.leak gains "
+    "known.n_controlled known.n_modes known.n_slopes known.cm_id known.basis_id known.config_id "
+    "known.magnitude known.max_dither_m known.max_dither_modes t_ns_utc=known.t_ns",
+)
+view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
+view(
+    "DitherView",
+    Dither,
+    "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
+    "request.duration_s start_seq",
+)
+view("DitherPlanView", DitherPlan)
+view(
+    "DitheringView",
+    Dithering,
+    "phase reason budget_m mean_cost_m plan next_ns_utc n_windows_learnt avoided_hz",
+)
+view(
+    "AcquisitionView",
+    Acquisition,
+    "stage text under_way started_ns_utc since_ns_utc held_off commanded n_attempts=attempt alpha "
+    "n_modes",
+)
+view("MoveView", Move, "id state text step total n_moves asked_ns_utc")
+RECONSTRUCTOR = view(
+    "ReconstructorView",
+    ReconstructorRecord,
+    "id state n_modes created_ns_utc alpha sigma parent origin sha256 condition_number gate reason "
+    "published_ns_utc applied_frame_seq",
+)
+RECONSTRUCTORS = view(
+    "ReconstructorsView",
+    TrackerState,
+    "in_use reconstructors",
+    "The reconstructors the service remembers.",
+)
+GAINS = view("GainTableView", GainTableShown)
+
+MEASUREMENT = view(
+    "MeasurementView",
+    MeasurementRecord,
+    "id state reason pattern modes amplitude_m n_average frequency_hz duration_s asked_ns_utc "
+    "start_seq created_ns_utc n_slopes double_pass session basis_id config_id sha256",
+)
+MEASUREMENTS = view(
+    "MeasurementsView", TrackerState, "measurements=by_rtc", "Measured interaction matrices."
+)
+MEASURING = view(
+    "MeasuringView",
+    MeasurementRecord,
+    "id state pattern modes asked_ns_utc opens_loop",
+    "The interaction matrix being measured: ``/v1/measurements/{id}`` says more.",
+)
+GATHERING = view(
+    "GatheringView",
+    MeasurementRecord,
+    "id state total_m duration_s asked_ns_utc",
+    "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
+)
+
+view("RemarkView", Remark)
+view(
+    "AlarmView",
+    AlarmShown,
+    "note.name severity worst_severity=note.worst note.attention note.since_ns_utc note.text cause "
+    "do note.over_ns_utc note.acknowledged note.muted",
+)
+view("RaisedView", Alarm, "name since_ns_utc text")
+view("MutedView", Note, "name muted")
+view("OperatingView", Operating)
+view("ObservatoryValueView", ObservatoryValue)
+view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
+EVENTS = view("EventsView", TrackerState, "alarms log", "What happened, and what is wrong now.")
+view("WaitingView", Waiting)
+view("PermissionView", Permission)
+view("PaceView", Pace)
+view(
+    "LinkView",
+    LinkStatistics,
+    "rtc_alive session frame_age_s latency_p50_s frames_received frames_lost frames_recovered "
+    "frames_duplicate frames_late frames_nonfinite frames_overwritten frames_refused "
+    "messages_malformed",
+)
+STATE = view(
+    "StateView",
+    Snapshot,
+    "tracker.system tracker.mode tracker.stopped_because ready ready_reason now_ns uptime_s "
+    "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit "
+    "tracker.mode_proof tracker.probation rtc tracker.pointing tracker.basis_id "
+    "tracker.config_id tracker.dither tracker.dithering tracker.vibrations_hz tracker.measuring "
+    "tracker.gathering "
+    "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
+    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating permitted "
+    "no_return "
+    "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
+    "tracker.windows_refused tracker.windows_outlying window_refusal pace link",
+    "What the service knows, at one glance.",
+    measuring=MEASURING,
+    gathering=GATHERING,
+)
+ALARMS = view(
+    "AlarmsView",
+    Snapshot,
+    "alarms stale_alarms muted_alarms worst_severity",
+    "The alarms that last, that went unseen, and that are muted.",
+)

@@ -1,0 +1,167 @@
+"""``pyrcal status`` beside the service's own description of its state."""
+
+import http.server
+import json
+import socket
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+
+from pyrcal.__main__ import main
+from pyrcal.client.status import status_lines
+from service.runtime.snapshot import Snapshot
+from service.tracking.state import Level, LogEntry, TrackerState
+from service.web.views import STATE as STATE_VIEW
+from service.web.views import picture
+from tests.unit.test_api import LINK, SECOND, STATE
+from tests.unit.tracking.situations import POLICY
+
+
+def told(tracker=STATE, *, ready=True, **changes):
+    """What the service would answer."""
+    snapshot = Snapshot(
+        policy=POLICY,
+        tracker=replace(tracker, **changes),
+        link=LINK,
+        now_ns=100 * SECOND,
+        started_ns=40 * SECOND,
+        ready=ready,
+        ready_reason="telemetry flows" if ready else "no RTC is there",
+        archive_failures=0,
+        archive_waiting=0,
+    )
+    return picture(snapshot, STATE_VIEW)
+
+
+def test_the_first_line_says_whether_it_is_ready_and_the_next_what_is_wrong():
+    lines = status_lines(told())
+    assert lines[0] == "flao-lbt: Operational, Tracking; mode propose, up 1 min 0 s: ready"
+    assert lines[1] == "ALARM rtc.silent (warning) for 30 s: no status: look at it"
+    assert status_lines(told(ready=False))[0].endswith("NOT READY: no RTC is there")
+
+
+def test_the_registration_the_loop_and_the_matrix_are_on_the_screen():
+    text = "\n".join(status_lines(told()))
+    for part in (
+        "loop closed at 1000 Hz, 400 of 594 modes",
+        "shift x       +0.",
+        "rotation",
+        " deg",
+        "magnification 1.",
+        "rtc-0 in use, worst pole radius 0.",
+        "sparse: ordinary telemetry keeps σ between windows",
+        "windows  4 accepted, 1 refused",
+    ):
+        assert part in text, text
+
+
+def test_it_says_why_the_last_window_was_refused():
+    log = (
+        LogEntry(t_ns_utc=SECOND, level=Level.WARNING, name="window.refused", text="edge slip"),
+        LogEntry(
+            t_ns_utc=70 * SECOND,
+            level=Level.WARNING,
+            name="window.refused",
+            text="38 % of its frames were lost",
+            times=3,
+            last_ns_utc=88 * SECOND,
+        ),
+        LogEntry(t_ns_utc=90 * SECOND, level=Level.INFO, name="mode", text="mode is auto"),
+    )
+    text = "\n".join(status_lines(told(log=log)))
+    assert "refused 12 s ago (3 times within a minute): 38 % of its frames were lost" in text
+    assert "edge slip" not in text
+
+
+def test_a_service_that_knows_nothing_says_so():
+    text = "\n".join(status_lines(told(TrackerState(system="small", mode=STATE.mode))))
+    assert "none has been heard" in text
+    assert "not known yet" in text
+    assert "unknown in use, not judged" in text
+
+
+def test_what_cannot_be_told_is_a_question_mark():
+    state = told()
+    state["margin"]["worst_pole_radius"] = None
+    assert "worst pole radius ? of at most" in "\n".join(status_lines(state))
+
+
+@contextmanager
+def answering(body, status=200):
+    """Serve one answer to whatever is asked; yield the address."""
+
+    class Answer(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(status if self.path == "/v1/state" else 404)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Answer) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@pytest.mark.parametrize(
+    ("state", "status"),
+    [(told(alarms=()), 0), (told(), 1), (told(ready=False, alarms=()), 1)],
+)
+def test_the_exit_status_says_whether_all_is_well(capsys, state, status):
+    with answering(json.dumps(state).encode()) as url:
+        assert main(["status", "--url", url + "/"]) == status
+        assert "flao-lbt" in capsys.readouterr().out
+        assert main(["status", "--url", url, "--json"]) == status
+        assert json.loads(capsys.readouterr().out) == state
+
+
+def test_texts_of_strangers_do_not_move_the_cursor(capsys):
+    state = told()
+    state["alarms"][0]["text"] = "\x1b[2Jgone"
+    with answering(json.dumps(state).encode()) as url:
+        assert main(["status", "--url", url]) == 1
+    assert "\\x1b[2Jgone" in capsys.readouterr().out
+
+
+def refused(capsys, url, status=3):
+    assert main(["status", "--url", url]) == status
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("pyrcal: ")
+    assert url in line
+    return line
+
+
+def test_where_nothing_answers_it_says_so_in_one_line(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    line = refused(capsys, f"http://127.0.0.1:{port}")
+    assert "nothing answers" in line
+    assert "--url" in line
+
+
+@pytest.mark.parametrize(
+    "url", ["127.0.0.1:8080", "ftp://127.0.0.1", "http://[", "http://x y", "http://x:port", "http:"]
+)
+def test_an_address_that_makes_no_sense_is_named(capsys, url):
+    assert "expected an address like http://127.0.0.1:8080" in refused(capsys, url, 2)
+
+
+@pytest.mark.parametrize(
+    ("body", "status"), [(b"<html>", 200), (b"{}", 200), (b"[1]", 200), (b"{}", 404)]
+)
+def test_something_else_that_answers_is_not_taken_for_the_service(capsys, body, status):
+    with answering(body, status) as url:
+        assert "not pyrcal" in refused(capsys, url)
+
+
+def test_another_version_of_the_service_is_told_as_one(capsys):
+    with answering(b'{"ready": true, "alarms": []}') as url:
+        assert "or not this version" in refused(capsys, url)

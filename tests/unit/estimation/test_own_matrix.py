@@ -1,0 +1,159 @@
+"""What an RTC's own matrix tells of the modes that it controls, wherever the mirror is."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from service.config import load_instrument
+from service.estimation.own_matrix import recognise_modes
+from service.model.interaction import RtcInteractionModel
+from service.model.misregistration import Misregistration
+from service.model.modes import modal_basis
+from tests.system.stranger import INSTRUMENT
+
+N_CONTROLLED = 60
+ALPHAS = {
+    "as drawn": (0.0, 0.0, 0.0, 1.0),
+    "as a night leaves it": (0.12, -0.08, 0.2, 1.003),
+    "as badly as it may be": (-1.4, 1.2, 6.0, 0.98),
+}
+
+
+@cache
+def model(sampling):
+    instrument = load_instrument(str(INSTRUMENT))
+    basis = modal_basis(instrument)
+    return RtcInteractionModel(instrument, basis, pupil_sampling=sampling, detector_nodes=sampling)
+
+
+@cache
+def true_response(where):
+    """By another sampling than it is compared with, and with noise: a matrix as one measures it."""
+    x, y, rotation_deg, magnification = ALPHAS[where]
+    alpha = Misregistration(
+        shift_x_subap=x,
+        shift_y_subap=y,
+        rotation_rad=np.deg2rad(rotation_deg),
+        magnification=magnification,
+    )
+    clean = model(4).interaction_matrix(alpha).astype(float)
+    rng = np.random.default_rng(1)
+    return alpha, clean + 0.1 * np.abs(clean).mean(axis=0) * rng.standard_normal(clean.shape)
+
+
+def told_by(twist, where="as a night leaves it", n_controlled=N_CONTROLLED):
+    _, response = true_response(where)
+    own = np.linalg.pinv(twist(response)[:, :n_controlled]).astype(np.float32)
+    return recognise_modes(own, model(2).linearise, Misregistration())
+
+
+def times(factor, *modes):
+    def twist(response):
+        scale = np.ones(response.shape[1])
+        scale[list(modes)] = factor
+        return response * scale
+
+    return twist
+
+
+def exchanged(one, other):
+    def twist(response):
+        order = np.arange(response.shape[1])
+        order[[one, other]] = other, one
+        return response[:, order]
+
+    return twist
+
+
+@pytest.mark.parametrize("where", ALPHAS)
+def test_every_mode_of_a_measured_matrix_is_recognised(where):
+    alpha, _ = true_response(where)
+    found = told_by(lambda response: response, where)
+    assert found.wrong == found.uneven == ""
+    assert found.known.all()
+    np.testing.assert_allclose(found.response, 1.0, atol=0.1)
+    # the coarse model is off by some thousandths of a subaperture
+    assert np.all(np.abs(found.alpha.vector - alpha.vector) < [0.02, 0.02, 0.003, 0.003])
+
+
+@pytest.mark.parametrize("where", ALPHAS)
+def test_a_turned_sign_is_named_and_the_others_stay_known(where):
+    found = told_by(times(-1.0, 10, 45), where)
+    assert found.wrong == "modes 10, 45 have the other sign by the RTC's own matrix"
+    assert found.known.sum() == N_CONTROLLED - 2
+
+
+@pytest.mark.parametrize(("one", "other"), [(10, 11), (3, 40)])
+def test_exchanged_modes_are_named(one, other):
+    found = told_by(exchanged(one, other))
+    assert found.wrong == f"modes {one} and {other} are exchanged by the RTC's own matrix"
+
+
+def test_a_mode_exchanged_with_one_that_is_not_controlled_is_named():
+    found = told_by(exchanged(50, 70))
+    assert "50 is the instrument file's 70" in found.wrong
+
+
+def test_rolled_modes_are_told_from_permuted_ones():
+    rolled = told_by(lambda response: np.roll(response, 1, axis=1))
+    assert "rolled by -1" in rolled.wrong
+    order = np.random.default_rng(2).permutation(90)
+    permuted = told_by(lambda response: response[:, order])
+    assert "other places" in permuted.wrong
+    assert f"0 is the instrument file's {order[0]}" in permuted.wrong
+
+
+def test_slopes_in_another_order_are_no_modes_at_all():
+    rng = np.random.default_rng(3)
+    found = told_by(lambda response: response[rng.permutation(len(response))])
+    assert "its slopes are listed in another order, or its modes are another basis" in found.wrong
+    assert not found.known.any()
+
+
+def test_the_size_of_a_response_is_told_and_is_nothing_wrong():
+    """Tip three times as strong, one mode at a tenth: the RTC's matrix allows for it."""
+    tip, weak = told_by(times(3.0, 0)), told_by(times(0.1, 20))
+    assert tip.wrong == weak.wrong == ""
+    assert "mode 0 " in tip.uneven
+    assert "mode 20 0.1 times" in weak.uneven
+    assert tip.response[0] == pytest.approx(3.0, rel=0.1)
+    half = told_by(lambda response: 0.5 * response)
+    assert half.wrong == half.uneven == ""
+    np.testing.assert_allclose(half.response, 0.5, atol=0.05)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_mode_of_half_or_twice_the_strength_is_named(factor):
+    found = told_by(times(factor, 20))
+    assert found.wrong == ""
+    assert "matrix mode 20 " in found.uneven
+    assert found.uneven.count("mode ") == 1
+
+
+def test_a_turned_sign_of_another_size_is_still_a_turned_sign():
+    assert told_by(times(-0.5, 15)).wrong == "mode 15 has the other sign by the RTC's own matrix"
+
+
+def test_a_regularised_matrix_of_fewer_modes_is_recognised():
+    """A maximum a posteriori inverse answers less in high modes: no other sign, no other place."""
+    _, response = true_response("as a night leaves it")
+    columns = response[:, :45]
+    power = np.mean(np.sum(columns**2, axis=0))
+    own = np.linalg.solve(columns.T @ columns + 0.1 * power * np.eye(45), columns.T)
+    found = recognise_modes(own.astype(np.float32), model(2).linearise, Misregistration())
+    assert found.wrong == ""
+    assert found.known.mean() > 0.9
+
+
+def test_rows_of_zeros_control_nothing():
+    _, response = true_response("as drawn")
+    own = np.linalg.pinv(response[:, :30]).astype(np.float32)
+    own[7] = 0.0
+    found = recognise_modes(own, model(2).linearise, Misregistration())
+    assert 7 not in found.columns
+    assert found.wrong == ""
+    nothing = np.zeros_like(own)
+    assert recognise_modes(nothing, model(2).linearise, Misregistration()) is None
+    nothing[0, 0] = np.nan
+    assert recognise_modes(nothing, model(2).linearise, Misregistration()) is None

@@ -1,0 +1,194 @@
+"""The watchdog: registration from what a loop's own noise does to the mirror."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from service.estimation.frames import FrameBlock
+from service.estimation.passive import (
+    BIAS_FLOOR,
+    MIN_FRAMES_PER_MODE,
+    Passive,
+    PassiveEstimate,
+    accumulate,
+    fit,
+    passive_matrix,
+)
+from service.model.misregistration import Misregistration
+from tests.numerics import (
+    N_CONTROLLED,
+    N_MODES,
+    SOMEWHERE,
+    Sky,
+    block_of,
+    closed_loop,
+    part,
+    small_linearisation,
+    small_loop,
+    small_model,
+)
+
+SKY = Sky(noise=2e-3, turbulence=0.003, memory=0.999)
+"""Weak turbulence, for its steps are white: at the filter's frequencies there is noise alone."""
+
+
+def young(memory_frames: float = 1e9) -> Passive:
+    return Passive(n_modes=N_CONTROLLED, memory_frames=memory_frames)
+
+
+def fed(block: FrameBlock, state: Passive | None = None, n: int = 200) -> Passive:
+    state = state or young()
+    for start in range(0, block.n_frames, n):
+        state = accumulate(state, part(block, start, min(start + n, block.n_frames)))
+    return state
+
+
+def quiet_block(n_frames: int, alpha: Misregistration = SOMEWHERE, gains: float | np.ndarray = 0.6):
+    """A noise-free sensor watching commands that are known."""
+    commands = 1e-8 * np.random.default_rng(3).normal(size=(n_frames, N_MODES))
+    commands[:, N_CONTROLLED:] = 0.0
+    matrix = small_model().interaction_matrix(alpha).astype(float)[:, :N_CONTROLLED]
+    return block_of((commands[:, :N_CONTROLLED] * gains) @ matrix.T, commands, None)
+
+
+@cache
+def night(seed: int = 1, noise: float = SKY.noise) -> FrameBlock:
+    """Twelve seconds of a closed loop."""
+    return closed_loop(small_loop(), replace(SKY, seed=seed, noise=noise), np.zeros((12000, 40)))
+
+
+def settled(state: Passive) -> PassiveEstimate:
+    """The estimate about a linearisation at the estimate before."""
+    near = small_linearisation()
+    for _ in range(3):
+        found = fit(state, near)
+        assert found is not None
+        near = small_model().linearise(found.alpha)
+    return found
+
+
+def test_a_noise_free_sensor_gives_back_its_own_matrix():
+    """1e-4: single precision and a ridge of 1e-6."""
+    found = passive_matrix(fed(quiet_block(2000))).matrix
+    expected = 0.6 * small_model().interaction_matrix(SOMEWHERE)[:, :N_CONTROLLED]
+    assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
+
+
+def test_a_noise_free_sensor_gives_its_registration_and_gains():
+    """1e-5: single precision and a ridge of 1e-6."""
+    found = settled(fed(quiet_block(2000)))
+    np.testing.assert_allclose(found.alpha.vector, SOMEWHERE.vector, atol=1e-5)
+    np.testing.assert_allclose(found.optical_gain, 0.6, rtol=1e-3)
+    np.testing.assert_allclose(found.step, 0.0, atol=1e-4)
+
+
+def test_one_step_is_exact_to_first_order_whatever_the_gains():
+    """1 %: α is a thousandth of a subaperture, so that second order is a thousandth of it.
+
+    A free gain takes what a derivative has in common with its own mode; forgetting that makes
+    the step of the magnification 9 % short.
+    """
+    small = np.array([1e-3, -2e-3, 1e-4, 1e-4])
+    near = small_linearisation()
+    gains = np.linspace(0.3, 1.0, N_CONTROLLED)
+    block = quiet_block(2000)
+    matrix = near.matrix_at(Misregistration.from_vector(near.alpha.vector + small))
+    slopes = (block.commands_m[:, :N_CONTROLLED] * gains) @ matrix[:, :N_CONTROLLED].T
+    found = fit(fed(block_of(slopes, block.commands_m, None)), near)
+    np.testing.assert_allclose(found.step, small, rtol=0.01)
+    np.testing.assert_allclose(found.optical_gain, gains, rtol=1e-3)
+
+
+def test_a_far_linearisation_is_a_little_off_and_says_how_far_it_went():
+    """10 % of α: second order, α being a tenth of a subaperture."""
+    found = fit(fed(quiet_block(2000)), small_linearisation())
+    at_rest = Misregistration().vector
+    np.testing.assert_allclose(found.step, SOMEWHERE.vector - at_rest, rtol=0.1)
+    np.testing.assert_allclose(found.alpha.vector, at_rest + found.step, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_closed_loop_tells_its_registration_within_its_scatter(seed):
+    """4.5 of the σ of its scatter, the floor left out: once in 10 000 for each of twelve."""
+    found = settled(fed(night(seed)))
+    error = found.alpha.vector - SOMEWHERE.vector
+    assert np.all(np.abs(error) < 4.5 * np.sqrt(np.diag(found.covariance)))
+    assert np.all(np.sqrt(np.diag(found.covariance))[:2] < 0.02)
+
+
+def test_the_scatter_of_windows_is_the_one_stated():
+    """24 windows of 1.5 s: mean normalised squared error 4 ± 5 · sqrt(8 / 24)."""
+    near = small_model().linearise(SOMEWHERE)
+    squares = []
+    for seed in (1, 2, 3):
+        for start in range(0, 12000, 1500):
+            found = fit(fed(part(night(seed), start, start + 1500)), near)
+            squares.append(found.step @ np.linalg.solve(found.covariance, found.step))
+    assert 1.1 < np.mean(squares) < 6.9
+
+
+@pytest.mark.parametrize("turbulence", [pytest.param(0.03, marks=pytest.mark.long), 0.1])
+def test_the_scatter_is_the_one_stated_where_fast_turbulence_is_left_in_the_slopes(turbulence):
+    """Turbulence looks like modes, so its slopes are correlated: they are no white noise.
+
+    24 windows as above; slopes taken for white make the mean 13.6 and 18.6.
+    """
+    near = small_model().linearise(SOMEWHERE)
+    squares = []
+    for seed in (1, 2, 3):
+        sky = replace(SKY, seed=seed, turbulence=turbulence)
+        block = closed_loop(small_loop(), sky, np.zeros((12000, 40)))
+        for start in range(0, 12000, 1500):
+            found = fit(fed(part(block, start, start + 1500)), near)
+            squares.append(found.step @ np.linalg.solve(found.covariance, found.step))
+    assert 1.1 < np.mean(squares) < 6.9, np.mean(squares)
+
+
+def test_what_the_model_explains_has_a_misfit_of_one():
+    """20 %: 64 samples of the noise of 240 slopes, and the fit of 30 columns to as many."""
+    assert fit(fed(night()), small_model().linearise(SOMEWHERE)).misfit == pytest.approx(1, abs=0.2)
+
+
+def test_a_sensor_that_is_not_the_modelled_one_shows_in_the_misfit():
+    block = night()
+    turned = block_of(np.roll(block.slopes, 3, axis=1), block.commands_m, None)
+    assert fit(fed(turned), small_model().linearise(SOMEWHERE)).misfit > 2.0
+
+
+def test_sigma_is_never_below_the_bias_that_no_dither_has_taught():
+    """10 % of a subaperture, more where the scatter says that the signal is weak."""
+    found = fit(fed(night()), small_linearisation())
+    assert np.all(found.sigma > BIAS_FLOOR)
+    strong, weak = (replace(found, covariance=np.eye(4) * s**2) for s in (1e-4, 0.014))
+    np.testing.assert_allclose(strong.sigma[:2], 0.10, rtol=1e-3)
+    np.testing.assert_allclose(weak.sigma[:2], np.hypot(0.10, 0.14), rtol=0.01)
+    np.testing.assert_allclose(weak.sigma[3], np.hypot(0.001, 0.014))
+
+
+def test_noise_widens_sigma_beyond_the_floor():
+    block = quiet_block(700)
+    noise = 30.0 * np.random.default_rng(4).normal(size=block.slopes.shape)
+    found = fit(fed(block_of(block.slopes + noise, block.commands_m, None)), small_linearisation())
+    assert np.all(found.sigma > 2 * BIAS_FLOOR)
+
+
+def test_too_few_frames_give_no_estimate_rather_than_a_poor_one():
+    least = MIN_FRAMES_PER_MODE * N_CONTROLLED
+    enough = replace(fed(quiet_block(1000)), n_effective=float(least))
+    assert fit(young(), small_linearisation()) is None
+    assert fit(enough, small_linearisation()) is not None
+    assert fit(replace(enough, n_effective=least - 1.0), small_linearisation()) is None
+
+
+@pytest.mark.parametrize("still", [slice(7, 8), slice(None)], ids=["one mode", "all modes"])
+def test_modes_that_never_move_do_not_break_the_watchdog(still):
+    block = quiet_block(1000)
+    commands = block.commands_m.copy()
+    commands[:, still] = 0.0
+    slopes = commands @ small_model().interaction_matrix(SOMEWHERE).T
+    found = fit(fed(block_of(slopes, commands, None)), small_linearisation())
+    assert found is None or np.all(np.isfinite(found.sigma))

@@ -1,0 +1,156 @@
+"""Is the loop worse with a matrix than with the one before?"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy
+
+from service.estimation.comparison import Verdict
+from service.estimation.frames import FrameBlock
+from service.estimation.probation import WITHIN_S, Comparison, begun_anew, observe
+
+N_MODES, BLOCK, DT_NS = 60, 50, 1_000_000
+BEFORE_S, AFTER_S = 2.0, 3.5
+LINE_HZ = (205.0, 293.0)
+
+
+def residual(rng, seconds, *, ring=None):
+    """What the loop sees: white noise in front of slow turbulence; some modes may ring.
+
+    ``ring`` is pole radius, turns a frame and modes.
+    """
+    n_frames = round(seconds * 1e9 / DT_NS)
+    noise = rng.normal(size=(n_frames, N_MODES)) * np.linspace(1.0, 2.0, N_MODES)
+    slow = scipy.signal.lfilter([1.0], [1.0, -0.98], rng.normal(size=noise.shape), axis=0)
+    seen = noise + slow * np.linspace(1.0, 0.05, N_MODES)
+    if ring is not None:
+        radius, turns, modes = ring
+        denominator = [1.0, -2.0 * radius * np.cos(2.0 * np.pi * turns), radius**2]
+        seen[:, modes] += scipy.signal.lfilter([0.15], denominator, noise[:, modes], axis=0)
+    return 1e-9 * seen
+
+
+def blocks(parts, dither=None):
+    """Blocks of telemetry of matrices one after the other, each with its residual."""
+    commands = -0.5 * np.cumsum(np.concatenate([part for _, part in parts]), axis=0)
+    ids = np.repeat([name for name, _ in parts], [len(part) for _, part in parts])
+    played = np.zeros_like(commands) if dither is None else dither
+    for k in range(0, len(commands), BLOCK):
+        some = slice(k, k + BLOCK)
+        yield FrameBlock(
+            session="s",
+            first_seq=k,
+            t0_ns_utc=k * DT_NS,
+            dt_ns=DT_NS,
+            slopes=np.float32(np.diff(commands, axis=0, prepend=commands[:1])[some, ::4]),
+            commands_m=np.float32(commands + played)[some],
+            dither_m=np.float32(played[some]) if played[some].any() else None,
+            cm_id=str(ids[k]),
+        )
+
+
+def judged(parts, modes=N_MODES, lines=(), dither=None):
+    state = Comparison()
+    for block in blocks(parts, dither):
+        state = observe(state, block, np.arange(modes), lines)
+        if state.found is not None:
+            break
+    return state.found
+
+
+def test_good_matrices_in_changing_seeing_pass():
+    """Seeing doubles the noise and triples the turbulence of some, or the other way round."""
+    rng, verdicts = np.random.default_rng(1), []
+    for k in range(8):
+        seeing = np.linspace(1.0, 1.5, round(AFTER_S * 1000))[:, None]
+        after = residual(rng, AFTER_S) * (seeing if k % 2 else 1.0 / seeing)
+        found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
+        verdicts.append(found.verdict)
+    assert verdicts == [Verdict.AS_GOOD] * 8
+
+
+@pytest.mark.parametrize("turns", [0.05, 0.1, 0.15])
+def test_a_few_modes_at_the_edge_of_stability_are_found(turns):
+    rng = np.random.default_rng(2)
+    after = residual(rng, AFTER_S, ring=(0.99, turns, slice(40, 44)))
+    found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
+    assert found.verdict is Verdict.WORSE
+    assert 40 <= found.mode < 44
+    assert found.after_s < 2.0
+    assert found.common_ratio == pytest.approx(1.0, abs=0.1)
+
+
+def test_all_modes_running_away_together_are_found_at_once():
+    rng = np.random.default_rng(3)
+    grown = np.exp(np.linspace(0.0, 20.0, 1000))[:, None]
+    found = judged([("a", residual(rng, BEFORE_S)), ("b", residual(rng, 1.0) * grown)])
+    assert found.verdict is Verdict.WORSE
+    assert found.after_s <= 0.4
+
+
+def test_a_matrix_after_a_bad_one_is_not_blamed_for_what_has_become_calm():
+    rng = np.random.default_rng(4)
+    bad = residual(rng, BEFORE_S, ring=(0.99, 0.08, slice(10, 50)))
+    assert judged([("a", bad), ("b", residual(rng, AFTER_S))]).verdict is Verdict.AS_GOOD
+
+
+def test_the_verdict_comes_within_three_seconds_and_no_sooner_if_all_is_well():
+    rng = np.random.default_rng(5)
+    found = judged([("a", residual(rng, BEFORE_S)), ("b", residual(rng, AFTER_S))])
+    assert WITHIN_S - 0.15 < found.after_s <= WITHIN_S
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_dither_that_begins_or_ends_with_the_swap_does_not_count(first):
+    """Its lines stand in every mode, above all noise; two modes outside the loop play it."""
+    rng = np.random.default_rng(6)
+    before, after = residual(rng, BEFORE_S), residual(rng, AFTER_S)
+    t = np.arange(len(before) + len(after)) * 1e-9 * DT_NS
+    plays = (t < BEFORE_S) if first else (t >= BEFORE_S)
+    tone = (np.sin(2.0 * np.pi * np.outer(t, LINE_HZ)) * plays[:, None]).sum(axis=1)
+    seen = 6e-9 * tone[:, None] * np.linspace(0.0, 1.0, N_MODES)
+    dither = np.zeros((len(t), N_MODES))
+    dither[:, -2:] = 2e-8 * tone[:, None]
+    parts = [("a", before + seen[: len(before)]), ("b", after + seen[len(before) :])]
+    assert judged(parts, N_MODES - 2, LINE_HZ, dither).verdict is Verdict.AS_GOOD
+    assert judged(parts, N_MODES - 2, (), None).verdict is (
+        Verdict.AS_GOOD if first else Verdict.WORSE
+    ), "the lines do count where nobody tells of them: the test would show it"
+
+
+def test_without_enough_before_nothing_is_said():
+    rng = np.random.default_rng(7)
+    found = judged([("a", residual(rng, 0.5)), ("b", residual(rng, 1.0))])
+    assert found.verdict is Verdict.UNKNOWN
+    assert "only 0.5 s of telemetry with a" in found.text
+
+
+def test_another_loop_ends_a_comparison_without_a_verdict():
+    rng, state = np.random.default_rng(8), Comparison()
+    for block in blocks([("a", residual(rng, BEFORE_S)), ("b", residual(rng, 1.0))]):
+        state = observe(state, block, np.arange(N_MODES))
+    assert state.before is not None
+    state = begun_anew(state, "the gains changed")
+    assert (state.found.verdict, state.found.text) == (Verdict.UNKNOWN, "the gains changed")
+    assert state.before is None
+    assert not state.parts
+
+
+def test_modes_that_only_one_of_them_controls_do_not_count():
+    rng = np.random.default_rng(9)
+    before, after = residual(rng, BEFORE_S), residual(rng, AFTER_S)
+    before[:, 50:] *= 1e-3
+    state = Comparison()
+    for block in blocks([("a", before), ("b", after)]):
+        state = observe(state, block, np.arange(50 if block.cm_id == "a" else N_MODES))
+    assert state.found.verdict is Verdict.AS_GOOD
+    assert state.found.mode < 50
+
+
+def test_a_burst_in_one_mode_right_after_the_swap_is_turbulence():
+    """FLAO, 400 modes: one of them moved 1.65 times as much in the first tenth of a second."""
+    rng = np.random.default_rng(8)
+    after = residual(rng, AFTER_S)
+    after[30:130, 35] *= 3.0
+    assert judged([("a", residual(rng, BEFORE_S)), ("b", after)]).verdict is Verdict.AS_GOOD

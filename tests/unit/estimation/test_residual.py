@@ -1,0 +1,138 @@
+"""A loop that leaves more than before is found whole, whatever its single modes say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy
+
+from service.estimation.comparison import Verdict
+from service.estimation.frames import FrameBlock
+from service.estimation.probation import Comparison, observe
+from service.estimation.residual import LAG, STRIDE, Reader, Residual, ratio
+
+N_MODES, N_SLOPES, BLOCK, DT_NS = 40, 100, 20, 1_000_000
+RNG = np.random.default_rng(1)
+RESPONSE = np.linalg.qr(RNG.normal(size=(N_SLOPES, N_MODES)))[0]
+MATRIX = np.float32(RESPONSE.T)
+GAIN, DELAY = 0.4, 2
+
+
+def turbulence(seconds, rng, strength=1.0):
+    """Slow walks that forget themselves after a third of a second, low modes by far the largest."""
+    n_frames = round(seconds * 1e9 / DT_NS)
+    walk = scipy.signal.lfilter([0.08], [1.0, -0.997], rng.normal(size=(n_frames, N_MODES)), axis=0)
+    return 1e-6 * strength * walk / (1.0 + np.arange(N_MODES))
+
+
+def played(stretches, rng, noise=2e-9):
+    """Blocks of a loop under matrices one after the other: id, seconds, matrix, seeing."""
+    wave = np.concatenate([turbulence(s, rng, seeing) for _, s, _, seeing in stretches])
+    names = [name for name, s, _, _ in stretches for _ in range(round(s * 1e9 / DT_NS))]
+    matrices = {name: matrix for name, _, matrix, _ in stretches}
+    commands = np.zeros((len(wave) + DELAY, N_MODES))
+    slopes = np.zeros((len(wave), N_SLOPES))
+    for k, name in enumerate(names):
+        slopes[k] = RESPONSE @ (wave[k] + commands[k]) + noise * rng.normal(size=N_SLOPES)
+        wanted = commands[k + DELAY - 1] - GAIN * (matrices[name] @ slopes[k])
+        commands[k + DELAY] = np.clip(wanted, -1e-4, 1e-4)
+    for k in range(0, len(wave), BLOCK):
+        some = slice(k, k + BLOCK)
+        yield (
+            matrices[names[k]],
+            FrameBlock(
+                session="s",
+                first_seq=k,
+                t0_ns_utc=k * DT_NS,
+                dt_ns=DT_NS,
+                slopes=np.float32(slopes[some]),
+                commands_m=np.float32(commands[some]),
+                dither_m=None,
+                cm_id=names[k],
+            ),
+        )
+
+
+def judged(stretches, seed=2, whole=True):
+    """All verdicts on these matrices, in order."""
+    state, found = Comparison(), []
+    for matrix, block in played(stretches, np.random.default_rng(seed)):
+        state = observe(state, block, np.arange(N_MODES), matrix=matrix if whole else None)
+        if state.found is not None and (not found or state.found is not found[-1]):
+            found.append(state.found)
+    return found
+
+
+def with_sign(mode):
+    matrix = MATRIX.copy()
+    matrix[mode] *= -1.0
+    return matrix
+
+
+def test_a_loop_at_a_third_of_its_gain_is_worse_though_no_mode_rings():
+    (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, 0.3 * MATRIX, 1.0)])
+    assert found.verdict is Verdict.WORSE
+    assert found.residual_ratio > 1.4
+    assert not found.lost
+    (unread,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, 0.3 * MATRIX, 1.0)], whole=False)
+    assert unread.residual_ratio is None
+
+
+@pytest.mark.parametrize("seeing", [0.6, 0.8, 1.25, 1.6])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_same_matrix_in_other_seeing_is_not(seeing, seed):
+    (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, MATRIX, seeing)], seed)
+    assert found.verdict is Verdict.AS_GOOD, found.text
+    assert found.residual_ratio < found.residual_limit
+
+
+@pytest.mark.parametrize("mode", [0, 10, 39])
+def test_a_mode_of_the_other_sign_is_noticed_within_a_tenth_of_a_second(mode):
+    (found,) = judged([("a", 2.0, MATRIX, 1.0), ("b", 0.2, with_sign(mode), 1.0)])
+    assert found.verdict is Verdict.WORSE
+    assert found.after_s < 0.15
+
+
+def test_back_on_the_matrix_before_the_loop_is_held_against_what_it_was():
+    before, worse = ("a", 2.0, MATRIX, 1.0), ("b", 0.1, with_sign(10), 1.0)
+    worst, again = judged([before, worse, ("c", 3.5, MATRIX, 1.0)])
+    assert (worst.before, worst.after) == ("a", "b")
+    assert (again.before, again.after) == ("a", "c")
+    assert again.verdict is Verdict.AS_GOOD, again.text
+
+
+def test_one_that_is_lost_with_that_too_is_said_to_be():
+    before, worse = ("a", 2.0, MATRIX, 1.0), ("b", 0.1, with_sign(10), 1.0)
+    _, again = judged([before, worse, ("c", 1.5, with_sign(3), 1.0)])
+    assert (again.before, again.after) == ("a", "c")
+    assert again.verdict is Verdict.WORSE
+    assert again.lost
+    assert again.after_s < 1.2
+
+
+def test_samples_are_compared_over_their_lag_alone():
+    reader, n = Reader.of(MATRIX), STRIDE * (LAG + 1)
+    block = FrameBlock(
+        session="s",
+        first_seq=0,
+        t0_ns_utc=0,
+        dt_ns=DT_NS,
+        slopes=np.zeros((n, N_SLOPES), np.float32),
+        commands_m=-1e-9 * np.arange(n, dtype=np.float32)[:, None] * np.ones(N_MODES, np.float32),
+        dither_m=None,
+        cm_id="a",
+    )
+    reader, sums = reader.read(block)
+    assert (sums.n_seen, sums.n_moved) == (LAG + 1, 1)
+    assert sums.moved == pytest.approx(np.full(N_MODES, (1e-9 * LAG * STRIDE) ** 2))
+    assert not sums.seen.any()
+
+
+def test_a_mode_that_runs_away_is_not_taken_for_seeing():
+    ones = np.ones(4)
+    before = Residual(n_seen=1, seen=ones, n_moved=1, moved=ones, commanded=ones)
+    wild = np.array([100.0, 1.0, 1.0, 1.0])
+    after = Residual(n_seen=1, seen=wild, n_moved=1, moved=wild, commanded=ones)
+    assert ratio(before, after, np.arange(4)) == pytest.approx((100.0 / 2.0 + 3.0) / 4.0)
+    calm = Residual(n_seen=1, seen=ones, n_moved=1, moved=0.1 * ones, commanded=ones)
+    assert ratio(before, calm, np.arange(4)) == pytest.approx(1.0)

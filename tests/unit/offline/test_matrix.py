@@ -1,0 +1,182 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pyrcal.offline.matrix import FitOptions
+from pyrcal.offline.uncertainty import FAR_SHARE, STRANGE_RESIDUAL
+from service.errors import ModelError
+from service.model.interaction import InteractionModel
+from service.model.kinds import Method, Stop
+from service.model.misregistration import Misregistration
+from service.model.pupil import Illumination
+from tests.numerics import small_basis
+from tests.unit.estimation.bench import ELSEWHERE, GRID, PLAIN, error, fit, instrument, matrix
+
+
+def from_here(*steps: float) -> FitOptions:
+    """Options with a start that is off by subapertures, subapertures, degrees, ratio."""
+    start = ELSEWHERE.vector + np.array(steps) * [1.0, 1.0, np.pi / 180, 1.0]
+    return FitOptions(start=Misregistration.from_vector(start), orientation=PLAIN)
+
+
+@pytest.mark.parametrize("stop", list(Stop))
+def test_a_noise_free_matrix_of_a_finer_grid_is_recovered(stop):
+    about = replace(instrument(), stop=stop)
+    found = fit(matrix(about=about), about)
+    assert found.accepted
+    assert found.converged
+    assert np.all(np.abs(error(found)) < GRID)
+    np.testing.assert_allclose(found.gains, 1.0, atol=0.02)
+    assert found.residual_fraction < 0.01
+
+
+def test_errors_of_noisy_matrices_are_those_that_sigma_says():
+    chi = []
+    for seed in range(6):
+        found = fit(matrix(noise=0.2, seed=seed), options=from_here(0.1, 0.1, 0.2, 0.0))
+        chi.append(error(found) @ np.linalg.solve(found.covariance, error(found)))
+    # 6 draws of a chi-squared of 4 degrees: mean 4 +- 1.2; the floor makes it smaller
+    assert 0.8 < np.mean(chi) < 7.6
+
+
+def test_far_shifts_are_less_sure_by_a_share_of_themselves_where_the_mirror_may_be_another():
+    """The errors of a model whose mirror is of another kind grow with the shift."""
+    far = replace(ELSEWHERE, shift_x_subap=0.9, shift_y_subap=0.3)
+    near = replace(ELSEWHERE, shift_x_subap=0.0, shift_y_subap=0.0)
+    strange = 1.2 * STRANGE_RESIDUAL
+    sigma = [np.sqrt(fit(matrix(alpha, noise=strange)).covariance[0, 0]) for alpha in (near, far)]
+    assert sigma[1] > FAR_SHARE[0] * np.hypot(0.9, 0.3)
+    assert sigma[0] < sigma[1]
+
+
+def test_a_far_shift_of_a_mirror_that_is_no_other_is_as_sure_as_it_is_right():
+    """A matrix of the very modes of the file, as other codes make them, leaves next to nothing."""
+    far = replace(ELSEWHERE, shift_x_subap=0.9, shift_y_subap=0.3)
+    found = fit(matrix(far))
+    assert found.residual_fraction < STRANGE_RESIDUAL / 5.0
+    sigma = np.sqrt(found.covariance[0, 0])
+    assert abs(error(found, far)[0]) < 2.0 * sigma
+    assert sigma < 0.5 * FAR_SHARE[0] * np.hypot(0.9, 0.3)
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, 1, -1)])
+def test_starts_at_the_corners_of_the_capture_range_lead_to_the_same_place(signs):
+    found = fit(matrix(), options=from_here(*(np.array(signs) * [1.5, 1.5, 6.0, 0.05])))
+    assert found.accepted
+    assert np.all(np.abs(error(found)) < GRID)
+
+
+def test_a_start_from_which_nothing_is_found_is_refused():
+    found = fit(matrix(), options=from_here(0.0, 0.0, 60.0, 0.0))
+    assert not found.accepted
+    assert found.verdict.startswith("refused: the steps did not come to rest")
+
+
+@pytest.mark.parametrize("n_modes", [9, 20])
+def test_few_modes_suffice(n_modes):
+    found = fit(matrix(noise=0.05)[:, :n_modes])
+    assert found.accepted
+    assert list(found.modes) == list(range(n_modes))
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(found)) < 3.0 * sigma)
+
+
+def test_modes_may_be_any_of_those_measured():
+    kept = np.array([30, 2, 17, 5, 9, 12, 21, 33])
+    found = fit(matrix(), options=FitOptions(modes=kept))
+    assert list(found.modes) == list(kept)
+    assert np.all(np.abs(error(found)) < 2.0 * GRID)
+
+
+def test_a_mode_that_was_not_measured_cannot_be_used():
+    with pytest.raises(ModelError, match="35 is asked for and was not measured"):
+        fit(matrix()[:, :30], options=FitOptions(modes=np.array([1, 35])))
+
+
+@pytest.mark.parametrize("method", [Method.PAPER, Method.SENSITIVITY])
+def test_the_other_methods_find_the_same(method):
+    options = replace(from_here(0.1, -0.15, 0.3, 0.004), method=method)
+    found = fit(matrix(), options=options)
+    assert found.accepted
+    # the scans end with steps of 2 % of a subaperture on a coarser grid
+    assert np.all(np.abs(error(found)) < 4.0 * GRID)
+    assert (found.paper_table is not None) == (method is Method.PAPER)
+
+
+def test_an_rtc_that_turns_its_slope_axes_does_not_turn_the_registration():
+    along_x, along_y = np.split(matrix(), 2)
+    angle = np.deg2rad(1.0)
+    turned = np.concatenate(
+        [
+            np.cos(angle) * along_x - np.sin(angle) * along_y,
+            np.sin(angle) * along_x + np.cos(angle) * along_y,
+        ]
+    )
+    found = fit(turned)
+    assert abs(np.rad2deg(error(found)[2])) < 0.005
+
+
+def test_known_light_takes_its_error_away():
+    coordinates = np.linspace(-7.0, 7.0, 57)
+    x, y = np.meshgrid(coordinates, coordinates)
+    light = Illumination(
+        coordinates=coordinates, intensity=1.0 + 0.3 * np.sin(1.07 * x + 0.38 * y + 0.7)
+    )
+    measured = matrix(illumination=light)
+    assumed_even, known = fit(measured), fit(measured, options=FitOptions(illumination=light))
+    assert assumed_even.residual_fraction > 0.15
+    assert known.residual_fraction < 0.01
+    assert np.all(np.abs(error(known)) < GRID)
+
+
+def test_nine_modes_under_thirty_percent_of_static_structure_are_accepted_with_an_honest_sigma():
+    coordinates = np.linspace(-7.0, 7.0, 57)
+    x, y = np.meshgrid(coordinates, coordinates)
+    light = Illumination(
+        coordinates=coordinates, intensity=1.0 + 0.3 * np.sin(1.07 * x + 0.38 * y + 0.7)
+    )
+    found = fit(matrix(illumination=light)[:, :9])
+    assert found.accepted
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(found)) < 2.5 * sigma)
+
+
+def test_a_smooth_gain_over_the_pupil_is_found_when_asked_for():
+    found = fit(matrix())
+    gain = 1.0 + 0.02 * (np.nonzero(found.valid)[1] - 5.5)
+    uneven = matrix() * np.tile(gain, 2)[:, None]
+    mapped = fit(uneven, options=FitOptions(gain_map=True))
+    # the common part of the gain belongs to the modes
+    np.testing.assert_allclose(mapped.gain_map[mapped.valid], gain / gain.mean(), atol=0.02)
+    assert mapped.residual_fraction < fit(uneven).residual_fraction / 3.0
+
+
+def test_a_stretched_image_of_the_mirror_is_found_when_asked_for():
+    stretched = matrix() + 0.004 * derivative_of_stretch()
+    found = fit(stretched, options=FitOptions(anamorphosis=True))
+    np.testing.assert_allclose(found.anamorphosis, [0.004, 0.0], atol=3e-4)
+    assert np.all(np.abs(error(found)) < 2.0 * GRID)
+
+
+def derivative_of_stretch() -> np.ndarray:
+    model = InteractionModel(instrument(), small_basis(), pupil_sampling=4, detector_nodes=4)
+    return model.stretch_derivatives(ELSEWHERE)[0]
+
+
+def test_silent_subapertures_do_not_count():
+    silent = matrix()
+    silent[[7, 7 + len(silent) // 2]] = 0.0
+    found = fit(silent)
+    assert np.all(np.abs(error(found)) < GRID)
+    assert found.left_out[0].startswith("2 of")
+
+
+def test_double_pass_is_divided_out():
+    found = fit(2.0 * matrix(), double_pass=True)
+    assert found.accepted
+    np.testing.assert_allclose(found.gains, 1.0, atol=0.02)
+
+
+def test_the_number_of_evaluations_is_small():
+    assert fit(matrix(), options=from_here(0.2, 0.1, 0.5, 0.01)).n_evaluations < 40

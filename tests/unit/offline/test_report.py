@@ -1,0 +1,171 @@
+import json
+
+import numpy as np
+import pytest
+
+from pyrcal.offline.report import document, table
+from service.model.misregistration import PARAMETERS
+from service.model.slopes import Orientation
+from tests.unit.offline.made import GAINS, SCAN, a_fit, a_report
+
+KEYS = {
+    *PARAMETERS,
+    "sigma",
+    "covariance",
+    "gains",
+    "residual_fraction",
+    "condition_number",
+    "n_modes_used",
+    "orientation",
+    "subset_scatter",
+    "converged",
+    "verdict",
+    "notes",
+    "anamorphosis",
+    "instrument_found",
+    "seconds",
+}
+
+
+def test_the_document_has_exactly_the_keys_it_promises():
+    found = document(a_report())
+    assert set(found) == KEYS
+    assert set(found["sigma"]) == set(found["subset_scatter"]) == set(PARAMETERS)
+
+
+def test_every_number_is_in_the_unit_of_its_name():
+    found = document(a_report())
+    assert found["rotation_deg"] == pytest.approx(65.08)
+    assert found["sigma"]["rotation_deg"] == pytest.approx(0.01)
+    assert found["covariance"][2][2] == pytest.approx(0.01**2)
+    assert found["subset_scatter"]["rotation_deg"] == pytest.approx(0.004)
+    assert found["shift_x_subap"] == -0.92
+    assert found["sigma"]["shift_y_subap"] == pytest.approx(0.02)
+    assert found["gains"] == GAINS.tolist()
+    assert found["n_modes_used"] == 3
+
+
+def test_the_orientation_is_said_as_the_instrument_file_would():
+    found = document(a_report())["orientation"]
+    assert found == {
+        "order": "yx",
+        "swap_xy": False,
+        "flip_x": True,
+        "flip_y": False,
+        "sign": [1, -1],
+    }
+    both = a_fit(orientation=Orientation(sign_x=-1, sign_y=-1))
+    assert document(a_report(both))["orientation"]["sign"] == -1
+
+
+def test_what_should_be_known_beside_the_verdict_is_in_the_document():
+    assert document(a_report(notes=("columns of the wrong sign: 3",)))["notes"] == [
+        "columns of the wrong sign: 3"
+    ]
+
+
+def test_what_was_left_out_is_named_in_the_verdict():
+    fit = a_fit(left_out=("not finite: mode 2", "dead (no response): mode 3"))
+    verdict = document(a_report(fit))["verdict"]
+    assert verdict.startswith("accepted")
+    assert "mode 2" in verdict
+    assert "mode 3" in verdict
+    assert "\n" not in verdict
+
+
+def test_a_number_that_is_none_is_null():
+    fit = a_fit(
+        accepted=False,
+        covariance=np.full((4, 4), np.inf),
+        gains=np.array([1.0, np.nan, 0.9]),
+        residual_fraction=np.nan,
+        subset_scatter=np.full(4, np.nan),
+    )
+    found = json.loads(json.dumps(document(a_report(fit)), allow_nan=False))
+    assert found["gains"] == [1.0, None, 0.9]
+    assert found["residual_fraction"] is None
+    assert found["sigma"] == dict.fromkeys(PARAMETERS)
+
+
+def line(text, name):
+    (found,) = [line for line in text.splitlines() if line.startswith(name)]
+    return found
+
+
+def test_the_verdict_comes_first():
+    fit = a_fit(accepted=False, verdict="refused: sets of modes disagree; check the stop")
+    assert table(a_report(fit)).splitlines()[0] == fit.verdict
+
+
+def test_the_four_parameters_are_there_with_unit_and_uncertainty():
+    text = table(a_report())
+    assert line(text, "shift x").split() == [
+        "shift",
+        "x",
+        "-0.9200",
+        "0.0100",
+        "0.0010",
+        "subapertures",
+    ]
+    assert line(text, "rotation").split() == ["rotation", "65.0800", "0.0100", "0.0040", "deg"]
+    numbers, words = line(text, "magnification").split()[1:4], "the mirror as drawn over the pupil"
+    assert numbers == ["0.98000", "0.00100", "0.00010"]
+    assert f"ratio, of {words} as told" in line(text, "magnification")
+
+
+def test_what_was_left_out_is_named():
+    assert "mode 17" in line(table(a_report(a_fit(left_out=("dead: mode 17",)))), "left out")
+
+
+def test_modes_are_told_as_ranges():
+    assert "3 (0 to 1, 4)" in line(table(a_report()), "modes used")
+
+
+def test_a_gain_far_from_the_others_is_named():
+    fit = a_fit(gains=np.array([1.0, 1.02, 0.5]))
+    assert "mode 4" in line(table(a_report(fit)), "gains")
+    assert "off" not in line(table(a_report()), "gains")
+
+
+def test_the_papers_table_has_a_line_for_every_step():
+    text = table(a_report(a_fit(paper_table=(SCAN, SCAN))))
+    assert line(text, "   2").split() == [
+        "2",
+        "rotation_deg",
+        "64.5000",
+        "65.5000",
+        "0.5000",
+        "65.0000",
+    ]
+
+
+def test_what_was_asked_beside_the_four_is_told():
+    fit = a_fit(anamorphosis=np.array([0.001, -0.002]), gain_map=np.full((3, 3), 0.9))
+    text = table(a_report(fit, notes=("double pass: no, as the measured file says",)))
+    assert "+0.100 %" in line(text, "anamorphosis")
+    assert "0.90 to 0.90" in line(text, "gain over the pupil")
+    assert "double pass: no" in line(text, "note")
+
+
+def test_a_refused_fit_without_a_size_is_still_told():
+    fit = a_fit(
+        accepted=False,
+        gains=np.full(3, np.nan),
+        residual_fraction=np.nan,
+        covariance=np.full((4, 4), np.nan),
+    )
+    assert line(table(a_report(fit)), "shift x").split() == [
+        "shift",
+        "x",
+        "-0.9200",
+        "-",
+        "0.0010",
+        "subapertures",
+    ]
+
+
+def test_what_a_file_says_of_itself_cannot_write_lines_of_the_table():
+    evil = "\x1b[2J\naccepted: by a stranger"
+    text = table(a_report(reference=evil, notes=(evil,)))
+    assert "\x1b" not in text
+    assert "\naccepted: by a stranger" not in text

@@ -48,7 +48,7 @@ clean: ## remove what make made; never var/, which holds calibration products
 	    .import_linter_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(MANUAL): $(STAMP) docs/conf.py docs/manual.css $(wildcard docs/*.md docs/*/*.md docs/*/*.png)
+$(MANUAL): $(STAMP) docs/conf.py docs/manual.css $(wildcard docs/*.md docs/*/*.md docs/*/*.png docs/*/*.svg)
 	@$(PY) -m sphinx -q -d build/manual docs $(@D) && touch $@
 
 # A working environment is brought up to date in place; one made elsewhere or broken is made anew.

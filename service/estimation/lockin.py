@@ -356,8 +356,11 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
     """Return the mode of the model that each line's slopes are most like.
 
     Another than the line's own only where it explains far more, and far more than beside the line.
+    Empty: the matrix has the dithered modes alone, and tells nothing of others.
     """
-    slopes, own = spectra.slopes, np.array(spectra.plan.modes)
+    slopes, own = spectra.slopes, np.argmax(np.abs(spectra.dither), axis=1)
+    if tuple(own.tolist()) != spectra.plan.modes:
+        return ()
     unit = matrix / np.maximum(np.linalg.norm(matrix, axis=0), np.finfo(np.float32).tiny)
     size = np.abs(_apply(unit.T, slopes[:, 0]))
     best = np.argmax(size, axis=1)

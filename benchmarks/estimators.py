@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.estimation import comb, loopcheck, passive
+from service.estimation import demodulation, loopcheck, passive
 from service.estimation.frames import FrameBlock
 from service.estimation.health import (
     Actuators,
@@ -188,7 +188,7 @@ def _edge_watch(mirror: object, strokes: Array, variance: Array) -> EdgeWatch:
 
 def _plain() -> Iterator[Part]:
     """Yield the sums of the estimators as one would first write them: a frame at a time."""
-    bins_hz = (np.array(LINES_HZ)[:, None] + np.append(comb.SIDE_OFFSETS_HZ, 0.0)).ravel()
+    bins_hz = (np.array(LINES_HZ)[:, None] + np.append(demodulation.SIDE_OFFSETS_HZ, 0.0)).ravel()
     sums = np.zeros((len(bins_hz), N_SLOPES + 2 * N_MODES), np.complex64)
 
     def demodulate(_: None, block: FrameBlock) -> None:

@@ -24,10 +24,10 @@ from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.loop import ControlLoop
 from service.control.reconstructor import Recipe, reconstruct
-from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan, Spectra, fit_window
 from service.estimation.windows import ClosedLoop
-from service.files.prepared import usual_folder
+from service.files.disk_cache import usual_folder
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis

@@ -21,7 +21,7 @@ from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
 from pyrcal.terminal import print_lines
-from service.cli.program import leave, log_to_terminal, status_of, told_to_stop
+from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.wire import FrameHeader, Keys, encode
 from service.wire.frames import encode_frames
 from sim_rtc.computer.feed import Background
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the bridge until it is told to stop; return the exit status."""
     options = arguments_parser().parse_args(arguments)
     log_to_terminal()
-    stopped = told_to_stop()
+    stopped = stop_signal()
     return status_of(lambda: _run(options, stopped), "pyrcal cacao")
 
 

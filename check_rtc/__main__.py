@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     # told to end, it first stops its dither and closes the loop again
     heard = (signal.SIGINT, signal.SIGTERM)
-    return imported_and_run(load, own_process=arguments is None, heard=heard)
+    return imported_and_run(load, own_process=arguments is None, received=heard)
 
 
 if __name__ == "__main__":

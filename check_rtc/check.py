@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.articles import ARTICLES, Checked, Outcome
-from check_rtc.ear import Ear, systems_with_rtc
+from check_rtc.client import RtcClient
+from check_rtc.connection import RtcConnection, systems_with_rtc
 from check_rtc.examine import Examination, examine
 from check_rtc.offload import Registered
-from check_rtc.talk import Talk
-from check_rtc.watch import Watch
+from check_rtc.requirements import REQUIREMENTS, Checked, Outcome
+from check_rtc.watch import TelemetryObserver
 from service.config import load_instrument, packaged_instrument
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
-from service.estimation.dialect import Dialect, of_reconstructor
-from service.estimation.lockin import Spectra, WindowEstimate
+from service.estimation.lockin import LockInEstimate, Spectra
+from service.estimation.slope_convention import SlopeConvention, of_reconstructor
 from service.estimation.windows import ClosedLoop, WindowRefused
-from service.files.prepared import Prepared, usual_folder
+from service.files.disk_cache import DiskCache, usual_folder
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
@@ -53,13 +53,13 @@ def check(options: argparse.Namespace) -> int:
     PyrcalError
         If nothing could be checked: no RTC, no link, or options that make no sense.
     """
-    unknown = [name for name in options.only if name not in ARTICLES]
+    unknown = [name for name in options.only if name not in REQUIREMENTS]
     if unknown:
         raise ConfigurationError(
-            f"--only: found {', '.join(unknown)}, expected some of {', '.join(ARTICLES)}"
+            f"--only: found {', '.join(unknown)}, expected some of {', '.join(REQUIREMENTS)}"
         )
     endpoint, instrument = _whom(options)
-    wish = Examination(
+    examination = Examination(
         only=frozenset(options.only),
         passive=options.passive,
         open_loop=options.open_loop,
@@ -69,21 +69,23 @@ def check(options: argparse.Namespace) -> int:
         move_image=options.move_image,
     )
     if instrument is not None:
-        wish = replace(
-            wish,
+        examination = replace(
+            examination,
             basis_id=instrument.basis_id,
             config_id=instrument.config_id,
             dialect=lambda matrix: compared(instrument, matrix),
             registered=registering(instrument),
         )
     checks = []
-    with Ear(endpoint, as_service=not options.passive) as ear:
-        for one in examine(Talk(ear, Watch(endpoint, time.monotonic)), wish):
+    with RtcConnection(endpoint, as_service=not options.passive) as ear:
+        for one in examine(
+            RtcClient(ear, TelemetryObserver(endpoint, time.monotonic)), examination
+        ):
             checks.append(one)
             if not options.json:
                 print(shown(line(one)), flush=True)
     if options.json:
-        print(json.dumps({"checks": [told(one) for one in checks]}, indent=2))
+        print(json.dumps({"checks": [as_document(one) for one in checks]}, indent=2))
     broken = [one.name for one in checks if one.outcome is Outcome.WRONG]
     say(f"{len(checks)} checks, {len(broken)} wrong{': ' if broken else ''}{', '.join(broken)}")
     return BROKEN if broken else KEPT
@@ -129,16 +131,16 @@ def _only_system(endpoint: Endpoint, wait_s: float) -> str:
 
 def line(one: Checked) -> str:
     """Return a check on one line: what was found, what the contract says, where."""
-    article = one.article
+    article = one.requirement
     return (
         f"{one.outcome:8}{one.name:12} {one.found} "
         f"[contract: {article.says}; {PAGE}#{article.anchor}]"
     )
 
 
-def told(one: Checked) -> dict[str, str]:
+def as_document(one: Checked) -> dict[str, str]:
     """Return a check as JSON has it."""
-    article = one.article
+    article = one.requirement
     return {
         "check": one.name,
         "outcome": one.outcome.lower(),
@@ -149,11 +151,11 @@ def told(one: Checked) -> dict[str, str]:
     }
 
 
-def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> Dialect | str:
+def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConvention | str:
     """Return what the matrix in use says of slopes and commands beside the instrument file."""
     folder: Path = usual_folder(os.environ)
     try:
-        basis = Prepared(folder).basis(instrument)
+        basis = DiskCache(folder).basis(instrument)
         model = RtcInteractionModel(instrument, basis, pupil_sampling=3, detector_nodes=3)
         response = model.interaction_matrix(instrument.start)
         if matrix.shape[1] != len(response) or len(matrix) > response.shape[1]:
@@ -180,9 +182,9 @@ def registering(instrument: Instrument) -> Registered:
 
         return OpticsWorker(instrument, Compute(cache=usual_folder(os.environ)))
 
-    def registered(window: Spectra, loop: ClosedLoop) -> WindowEstimate | WindowRefused:
+    def registered(window: Spectra, loop: ClosedLoop) -> LockInEstimate | WindowRefused:
         try:
-            worker().listen(loop.reconstructor, None)
+            worker().read_slope_convention(loop.reconstructor, None)
             return worker().fit(window, loop, None)
         except ModelError as error:
             return WindowRefused(reason=str(error), t_ns_utc=window.t_end_ns_utc)

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.articles import ARTICLES, Checked, Moves, skipped, wrong
-from check_rtc.listening import About, listened
+from check_rtc.client import TOTAL_M, RtcClient, dither, dithered_modes, replies
 from check_rtc.moving import (
     OPEN_S,
     STROKE_M,
@@ -23,9 +22,10 @@ from check_rtc.moving import (
     rejection,
 )
 from check_rtc.offload import STEP, Registered, offload
-from check_rtc.talk import TOTAL_M, Talk, dither, dithered_modes, replies
+from check_rtc.requirements import REQUIREMENTS, Checked, Moves, skipped, wrong
+from check_rtc.telemetry_checks import About, find_all
 from service.errors import LinkError, WireError
-from service.estimation.dialect import Dialect
+from service.estimation.slope_convention import SlopeConvention
 from service.estimation.windows import WindowRefused
 from service.wire import Status
 
@@ -64,7 +64,7 @@ class Examination:
     consent: Callable[[tuple[str, ...]], bool] = lambda _: False
     """Is told what would be moved, and answers whether it may be."""
 
-    dialect: Callable[[NDArray[np.float32]], Dialect | str] = lambda _: NO_INSTRUMENT
+    dialect: Callable[[NDArray[np.float32]], SlopeConvention | str] = lambda _: NO_INSTRUMENT
     """Compares the matrix in use with the instrument file; a text says why it does not."""
 
     registered: Registered = lambda _, __: WindowRefused(reason=NO_INSTRUMENT, t_ns_utc=0)
@@ -72,7 +72,7 @@ class Examination:
 
     def wants(self, name: str) -> bool:
         """Return whether a check is to be made, if it may."""
-        moves = ARTICLES[name].moves
+        moves = REQUIREMENTS[name].moves
         if self.passive and moves is not Moves.NOTHING:
             return False
         if self.only:
@@ -81,7 +81,7 @@ class Examination:
         return agreed.get(moves, True)
 
 
-def examine(talk: Talk, wish: Examination) -> Iterator[Checked]:
+def examine(client: RtcClient, examination: Examination) -> Iterator[Checked]:
     """Yield every check as soon as it is made.
 
     Raises
@@ -89,60 +89,62 @@ def examine(talk: Talk, wish: Examination) -> Iterator[Checked]:
     LinkError
         If no RTC is heard.
     """
-    yield from (one for one in _listening(talk, wish) if wish.wants(one.name))
-    n_refused = len(talk.watch.refused)
-    status = talk.watch.status
-    asking = [name for name, of in ARTICLES.items() if of.moves is not Moves.NOTHING]
-    asking = [name for name in asking if wish.wants(name)]
+    yield from (one for one in _listening(client, examination) if examination.wants(one.name))
+    n_refused = len(client.watch.refused)
+    status = client.watch.status
+    asking = [name for name, of in REQUIREMENTS.items() if of.moves is not Moves.NOTHING]
+    asking = [name for name in asking if examination.wants(name)]
     if status is None or not asking:
         return
-    why = _why_not(talk, wish, status, asking)
+    why = _why_not(client, examination, status, asking)
     if why:
         yield from (skipped(name, why) for name in asking)
         return
-    yield from (one for one in _asking(talk, wish, status) if one.name in asking)
-    later = talk.watch.refused[n_refused:]
-    if later and wish.wants("messages"):
+    yield from (one for one in _asking(client, examination, status) if one.name in asking)
+    later = client.watch.refused[n_refused:]
+    if later and examination.wants("messages"):
         texts = "; ".join(dict.fromkeys(refused.text for refused in later))
         yield wrong("messages", f"meanwhile {len(later)} could not be read: {texts}")
 
 
-def _listening(talk: Talk, wish: Examination) -> Iterator[Checked]:
-    watch = talk.watch
-    if not talk.listen(wish.wait_s, lambda: bool(watch.arrivals or watch.statuses)):
+def _listening(client: RtcClient, examination: Examination) -> Iterator[Checked]:
+    observer = client.watch
+    if not client.listen(examination.wait_s, lambda: bool(observer.arrivals or observer.statuses)):
         raise LinkError(
-            f"nothing of an RTC of system {talk.ear.keys.system} was heard within "
-            f"{wish.wait_s:g} s: start it, or name its system with --system"
+            f"nothing of an RTC of system {client.connection.keys.system} was heard within "
+            f"{examination.wait_s:g} s: start it, or name its system with --system"
         )
-    talk.listen(min(wish.wait_s, 3.0), lambda: bool(watch.arrivals and watch.statuses))
-    about = About(keys=talk.ear.keys, began_s=talk.clock(), ended_s=talk.clock())
+    client.listen(
+        min(examination.wait_s, 3.0), lambda: bool(observer.arrivals and observer.statuses)
+    )
+    about = About(keys=client.connection.keys, began_s=client.clock(), ended_s=client.clock())
     try:
-        manifest, matrix = talk.ear.applied()
+        manifest, matrix = client.connection.applied()
     except (LinkError, WireError) as error:
         offered = not str(error).startswith(NO_ANSWER)
         about = replace(about, not_applied=str(error), offered=offered)
     else:
         about = replace(about, applied=manifest)
-        watch.loop.use(manifest.id, matrix)
-    talk.listen(wish.listen_s)
+        observer.loop.use(manifest.id, matrix)
+    client.listen(examination.listen_s)
     about = replace(
         about,
-        ended_s=talk.clock(),
-        basis_id=wish.basis_id,
-        config_id=wish.config_id,
+        ended_s=client.clock(),
+        basis_id=examination.basis_id,
+        config_id=examination.config_id,
         dialect="the matrix in use is not known",
     )
-    if watch.loop.matrix is not None and wish.wants("orientation"):
-        about = replace(about, dialect=wish.dialect(watch.loop.matrix))
-    yield from listened(watch, about)
+    if observer.loop.matrix is not None and examination.wants("orientation"):
+        about = replace(about, dialect=examination.dialect(observer.loop.matrix))
+    yield from find_all(observer, about)
 
 
-def _why_not(talk: Talk, wish: Examination, status: Status, names: list[str]) -> str:
+def _why_not(client: RtcClient, examination: Examination, status: Status, names: list[str]) -> str:
     """Return why nothing is to be asked of the RTC; empty: it may be."""
-    if talk.ear.other_service:
+    if client.connection.other_service:
         return "a service drives this RTC: end it first, or listen with --passive"
     moved = moved_by(names, status)
-    if moved and not wish.consent(moved):
+    if moved and not examination.consent(moved):
         return "not agreed to: --yes agrees beforehand"
     return ""
 
@@ -150,7 +152,7 @@ def _why_not(talk: Talk, wish: Examination, status: Status, names: list[str]) ->
 def moved_by(names: list[str], status: Status) -> tuple[str, ...]:
     """Return what these checks will move, a line for each kind; empty: nothing."""
     lines = []
-    kinds = {ARTICLES[name].moves for name in names}
+    kinds = {REQUIREMENTS[name].moves for name in names}
     if Moves.MIRROR in kinds:
         modes = ", ".join(map(str, dithered_modes(status)))
         lines.append(
@@ -179,48 +181,48 @@ def moved_by(names: list[str], status: Status) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _asking(talk: Talk, wish: Examination, status: Status) -> Iterator[Checked]:
+def _asking(client: RtcClient, examination: Examination, status: Status) -> Iterator[Checked]:
     """Make the checks that ask, those that move least first."""
-    if wish.wants("replies"):
-        yield replies(talk, status)
-    if wish.wants("dither") or wish.wants("columns"):
-        yield from dither(talk, status, talk.watch.loop.matrix)
-    if any(wish.wants(name) for name in _SWAPS):
-        yield from _swapping(talk, wish)
-    if wish.wants("reconnect"):
-        yield reconnect(talk)
-    if wish.wants("loop"):
-        yield loop(talk, talk.watch.status or status)
-    if wish.wants("measure"):
-        in_use = _in_use(talk)
+    if examination.wants("replies"):
+        yield replies(client, status)
+    if examination.wants("dither") or examination.wants("columns"):
+        yield from dither(client, status, client.watch.loop.matrix)
+    if any(examination.wants(name) for name in _SWAPS):
+        yield from _swapping(client, examination)
+    if examination.wants("reconnect"):
+        yield reconnect(client)
+    if examination.wants("loop"):
+        yield loop(client, client.watch.status or status)
+    if examination.wants("measure"):
+        in_use = _in_use(client)
         found = skipped("measure", _UNKNOWN)
-        yield found if in_use is None else measure(talk, talk.watch.status or status, in_use)
-    if wish.wants("offload"):
-        yield offload(talk, talk.watch.loop.matrix, wish.registered)
+        yield found if in_use is None else measure(client, client.watch.status or status, in_use)
+    if examination.wants("offload"):
+        yield offload(client, client.watch.loop.matrix, examination.registered)
 
 
-def _swapping(talk: Talk, wish: Examination) -> Iterator[Checked]:
+def _swapping(client: RtcClient, examination: Examination) -> Iterator[Checked]:
     """Send the matrix in use again and again; an RTC that does not answer is asked once."""
-    in_use = _in_use(talk)
+    in_use = _in_use(client)
     if in_use is None:
         yield from (skipped(name, _UNKNOWN) for name in _SWAPS)
         return
-    told, applied = commit(talk, in_use)
+    told, applied = commit(client, in_use)
     yield told
     if applied is None:
         yield from (skipped(name, "commit has to succeed first") for name in _SWAPS[1:])
         return
-    if wish.wants("chunks"):
-        told, later = chunks(talk, applied)
+    if examination.wants("chunks"):
+        told, later = chunks(client, applied)
         applied = later or applied
         yield told
-    if wish.wants("rejection"):
-        yield rejection(talk, applied)
+    if examination.wants("rejection"):
+        yield rejection(client, applied)
 
 
-def _in_use(talk: Talk) -> MatrixInUse | None:
+def _in_use(client: RtcClient) -> MatrixInUse | None:
     try:
-        manifest, matrix = talk.ear.applied()
+        manifest, matrix = client.connection.applied()
     except (LinkError, WireError):
         return None
     return MatrixInUse(manifest=manifest, matrix=matrix)

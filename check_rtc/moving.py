@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.articles import Checked, fine, seen, skipped, wrong
-from check_rtc.talk import Talk
+from check_rtc.client import RtcClient
+from check_rtc.requirements import Checked, fine, seen, skipped, wrong
 from service.errors import LinkError, WireError
 from service.link.matrices import MeasuredIntake, MeasuredMatrix
 from service.wire import (
@@ -69,24 +69,24 @@ class MatrixInUse:
         return split(self.matrix, self.manifest.layout.chunk_bytes)
 
 
-def commit(talk: Talk, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
+def commit(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
     """Send the matrix again, commit last; return what came of it, and what is applied, if it is."""
-    new = before.named(talk.ear.new_id("commit"))
+    new = before.named(client.connection.new_id("commit"))
     name = new.manifest.id
-    talk.ear.offer(new.manifest, new.matrix)
+    client.connection.offer(new.manifest, new.matrix)
     for index, part in enumerate(new.parts):
-        talk.ear.put_chunk(name, index, part)
-    began_s = talk.clock()
-    talk.ear.put_commit(name, encode(new.manifest))
-    said = _answers(talk, name, PATIENCE_S)
+        client.connection.put_chunk(name, index, part)
+    began_s = client.clock()
+    client.connection.put_commit(name, encode(new.manifest))
+    said = _answers(client, name, PATIENCE_S)
     last = said[-1][1] if said else None
     if last is None or last.state is not AckState.APPLIED:
-        return wrong("commit", _without(talk, name, said)), None
+        return wrong("commit", _without(client, name, said)), None
     took_s = said[-1][0] - began_s
-    talk.watch.loop.use(name, new.matrix)
+    client.watch.loop.use(name, new.matrix)
     found = f"applied {took_s:.2f} s after its commit, from frame {last.frame_seq}"
-    talk.listen(TOLD_S, lambda: _status_names(talk, name))
-    problems = _problems(talk, new, last)
+    client.listen(TOLD_S, lambda: _status_names(client, name))
+    problems = _problems(client, new, last)
     if took_s > APPLIED_S:
         problems.insert(0, f"more than {APPLIED_S:g} s")
     if problems:
@@ -94,24 +94,24 @@ def commit(talk: Talk, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None
     return fine("commit", f"{found} on, as frames and status say"), new
 
 
-def chunks(talk: Talk, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
+def chunks(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
     """Send the commit first and leave one part out: the RTC has to ask for it."""
-    new = before.named(talk.ear.new_id("chunks"))
+    new = before.named(client.connection.new_id("chunks"))
     name = new.manifest.id
-    talk.ear.offer(new.manifest, new.matrix)
-    began_s = talk.clock()
-    talk.ear.put_commit(name, encode(new.manifest))
+    client.connection.offer(new.manifest, new.matrix)
+    began_s = client.clock()
+    client.connection.put_commit(name, encode(new.manifest))
     for index, part in enumerate(new.parts):
         if index != _LEFT_OUT:
-            talk.ear.put_chunk(name, index, part)
-    wanted = f"{talk.ear.keys.matrix(name)}?chunk={_LEFT_OUT}"
-    said = _answers(talk, name, PATIENCE_S)
-    asked = [at_s - began_s for at_s, key in talk.watch.asked if key == wanted]
+            client.connection.put_chunk(name, index, part)
+    wanted = f"{client.connection.keys.matrix(name)}?chunk={_LEFT_OUT}"
+    said = _answers(client, name, PATIENCE_S)
+    asked = [at_s - began_s for at_s, key in client.watch.asked if key == wanted]
     if not said or said[-1][1].state is not AckState.APPLIED:
-        tail = _without(talk, name, said)
+        tail = _without(client, name, said)
         when = f"it asked for it after {asked[0]:.1f} s" if asked else "it did not ask for it"
         return wrong("chunks", f"chunk {_LEFT_OUT} was left out: {when}; {tail}"), None
-    talk.watch.loop.use(name, new.matrix)
+    client.watch.loop.use(name, new.matrix)
     if not asked:
         return wrong("chunks", f"applied though chunk {_LEFT_OUT} never came"), new
     found = f"chunk {_LEFT_OUT}, left out, was asked for after {asked[0]:.1f} s"
@@ -119,29 +119,29 @@ def chunks(talk: Talk, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None
     return (wrong if late else fine)("chunks", f"{found}; then it was applied"), new
 
 
-def rejection(talk: Talk, in_use: MatrixInUse) -> Checked:
+def rejection(client: RtcClient, in_use: MatrixInUse) -> Checked:
     """Send what must be rejected; whatever is applied all the same has the numbers in use."""
     problems, reasons = [], []
-    for what, manifest in _bad_manifests(talk, in_use):
+    for what, manifest in _bad_manifests(client, in_use):
         name = manifest.id
-        known = len(talk.watch.acknowledgements)
+        known = len(client.watch.acknowledgements)
         for index, part in enumerate(in_use.named(name).parts):
-            talk.ear.put_chunk(name, index, part)
-        talk.ear.put_commit(name, encode(manifest))
-        said = _answers(talk, name, PATIENCE_S, known)
+            client.connection.put_chunk(name, index, part)
+        client.connection.put_commit(name, encode(manifest))
+        said = _answers(client, name, PATIENCE_S, known)
         if not said or said[-1][1].state is not AckState.REJECTED:
-            problems.append(f"{what}: {_without(talk, name, said)}")
+            problems.append(f"{what}: {_without(client, name, said)}")
         else:
             reasons.append(f"{what} ({said[-1][1].reason:.40})")
-    problems += _repeated(talk, in_use)
-    problems += _unreadable(talk)
+    problems += _repeated(client, in_use)
+    problems += _unreadable(client)
     if problems:
         return wrong("rejection", "; ".join(problems))
     return fine("rejection", f"rejected: {'; '.join(reasons)}; a repeat was answered again")
 
 
-def _bad_manifests(talk: Talk, in_use: MatrixInUse) -> list[tuple[str, Manifest]]:
-    new = talk.ear.new_id
+def _bad_manifests(client: RtcClient, in_use: MatrixInUse) -> list[tuple[str, Manifest]]:
+    new = client.connection.new_id
     other_sum = hashlib.sha256(b"other numbers").hexdigest()
     of_sum = in_use.named(new("sum")).manifest
     of_basis = in_use.named(new("basis")).manifest
@@ -153,73 +153,80 @@ def _bad_manifests(talk: Talk, in_use: MatrixInUse) -> list[tuple[str, Manifest]
     ]
 
 
-def _repeated(talk: Talk, in_use: MatrixInUse) -> list[str]:
+def _repeated(client: RtcClient, in_use: MatrixInUse) -> list[str]:
     """Send the commit of the matrix in use again: its acknowledgement must come again."""
-    name, known = in_use.manifest.id, len(talk.watch.acknowledgements)
-    talk.ear.put_commit(name, encode(in_use.manifest))
-    said = _answers(talk, name, APPLIED_S, known)
+    name, known = in_use.manifest.id, len(client.watch.acknowledgements)
+    client.connection.put_commit(name, encode(in_use.manifest))
+    said = _answers(client, name, APPLIED_S, known)
     if said and said[-1][1].state is AckState.APPLIED:
         return []
-    return [f"the same commit again: {_without(talk, name, said)}"]
+    return [f"the same commit again: {_without(client, name, said)}"]
 
 
-def _unreadable(talk: Talk) -> list[str]:
+def _unreadable(client: RtcClient) -> list[str]:
     """Send a commit that is none: it must be rejected without id and sum."""
-    known = len(talk.watch.acknowledgements)
-    talk.ear.put_commit(talk.ear.new_id("unreadable"), b"\xc1 no manifest")
+    known = len(client.watch.acknowledgements)
+    client.connection.put_commit(client.connection.new_id("unreadable"), b"\xc1 no manifest")
 
     def answered() -> bool:
-        return any(said.id is None for _, said in talk.watch.acknowledgements[known:])
+        return any(
+            acknowledgement.id is None
+            for _, acknowledgement in client.watch.acknowledgements[known:]
+        )
 
-    if talk.listen(APPLIED_S, answered):
+    if client.listen(APPLIED_S, answered):
         return []
     return ["a commit that cannot be read: no acknowledgement with id nil"]
 
 
 def _answers(
-    talk: Talk, name: str, patience_s: float, known: int = 0
+    client: RtcClient, name: str, patience_s: float, n_known: int = 0
 ) -> list[tuple[float, Acknowledgement]]:
     """Return what is said of a matrix, once that is final or the time is over."""
 
     def said() -> list[tuple[float, Acknowledgement]]:
-        every = talk.watch.acknowledgements[known:]
+        every = client.watch.acknowledgements[n_known:]
         return [(at_s, one) for at_s, one in every if one.id == name]
 
-    talk.listen(patience_s, lambda: any(one.state is not AckState.STAGED for _, one in said()))
+    client.listen(patience_s, lambda: any(one.state is not AckState.STAGED for _, one in said()))
     return said()
 
 
-def _without(talk: Talk, name: str, said: list[tuple[float, Acknowledgement]]) -> str:
+def _without(
+    client: RtcClient, name: str, acknowledgements: list[tuple[float, Acknowledgement]]
+) -> str:
     """Return in words how a matrix fared that was not applied, or nobody said so."""
-    if said and said[-1][1].state is AckState.REJECTED:
-        return f"rejected: {said[-1][1].reason}"
-    if said and said[-1][1].state is AckState.APPLIED:
+    if acknowledgements and acknowledgements[-1][1].state is AckState.REJECTED:
+        return f"rejected: {acknowledgements[-1][1].reason}"
+    if acknowledgements and acknowledgements[-1][1].state is AckState.APPLIED:
         return "applied"
-    words = "staged, and not applied" if said else "no acknowledgement"
-    frames = [a.header.seq0 for a in talk.watch.arrivals if a.header.cm_id == name]
+    words = "staged, and not applied" if acknowledgements else "no acknowledgement"
+    frames = [a.header.seq0 for a in client.watch.arrivals if a.header.cm_id == name]
     named = f", though frames name it from {frames[0]} on" if frames else ""
     return f"{words} within {PATIENCE_S:g} s{named}"
 
 
-def _status_names(talk: Talk, name: str) -> bool:
-    status = talk.watch.status
+def _status_names(client: RtcClient, name: str) -> bool:
+    status = client.watch.status
     return status is not None and status.cm_id == name
 
 
-def _problems(talk: Talk, new: MatrixInUse, said: Acknowledgement) -> list[str]:
+def _problems(client: RtcClient, new: MatrixInUse, acknowledgement: Acknowledgement) -> list[str]:
     """Return what contradicts the acknowledgement of a matrix that is in use."""
     name, problems = new.manifest.id, []
-    frames = [a.header.seq0 for a in talk.watch.arrivals if a.header.cm_id == name]
+    frames = [a.header.seq0 for a in client.watch.arrivals if a.header.cm_id == name]
     if not frames:
         problems.append("no frame names it")
-    elif min(frames) != said.frame_seq:
+    elif min(frames) != acknowledgement.frame_seq:
         problems.append(f"frames name it from {min(frames)} on")
-    if not _status_names(talk, name):
+    if not _status_names(client, name):
         problems.append(f"the status does not within {TOLD_S:g} s")
-    status = talk.watch.status
-    if status is not None and said.session != status.session:
-        problems.append(f"it is of session {said.session}, the status of {status.session}")
-    if said.sha256 != new.manifest.layout.sha256:
+    status = client.watch.status
+    if status is not None and acknowledgement.session != status.session:
+        problems.append(
+            f"it is of session {acknowledgement.session}, the status of {status.session}"
+        )
+    if acknowledgement.sha256 != new.manifest.layout.sha256:
         problems.append("its sum is another one")
     return problems
 
@@ -248,50 +255,52 @@ LIKELY: Final = (0.2, 3.0)
 """What a mode measures of itself by the matrix in use: optical gain, double pass."""
 
 
-def reconnect(talk: Talk) -> Checked:
+def reconnect(client: RtcClient) -> Checked:
     """Take the router away for a moment."""
-    if not talk.ear.own_router:
+    if not client.connection.own_router:
         return skipped("reconnect", "the router is not this program's")
-    before = talk.watch.session
-    n_asked = len(talk.watch.asked)
-    talk.ear.close()
-    talk.listen(AWAY_S)
-    opened_s = talk.clock()
-    talk.ear.open()
-    n_known = len(talk.watch.arrivals)
-    if not talk.listen(BACK_S, lambda: len(talk.watch.arrivals) > n_known + 2):
+    before = client.watch.session
+    n_asked = len(client.watch.asked)
+    client.connection.close()
+    client.listen(AWAY_S)
+    opened_s = client.clock()
+    client.connection.open()
+    n_known = len(client.watch.arrivals)
+    if not client.listen(BACK_S, lambda: len(client.watch.arrivals) > n_known + 2):
         return wrong("reconnect", f"no frame came within {BACK_S:g} s after the router was back")
-    talk.listen(1.0)
-    back_s = talk.watch.arrivals[n_known].at_s - opened_s
+    client.listen(1.0)
+    back_s = client.watch.arrivals[n_known].at_s - opened_s
     found = f"frames again {back_s:.1f} s after the router was back"
-    sessions = {arrival.header.session for arrival in talk.watch.arrivals[n_known:]}
+    sessions = {arrival.header.session for arrival in client.watch.arrivals[n_known:]}
     if sessions != {before}:
         return wrong("reconnect", f"{found}, in session {', '.join(sessions)} instead of {before}")
-    current = talk.ear.keys.current
-    again = any(key == current for _, key in talk.watch.asked[n_asked:])
-    before_that = any(key == current for _, key in talk.watch.asked[:n_asked])
+    current = client.connection.keys.current
+    again = any(key == current for _, key in client.watch.asked[n_asked:])
+    before_that = any(key == current for _, key in client.watch.asked[:n_asked])
     if again and before_that:
         return seen("reconnect", f"{found}; it asked cm/current again: once a session is enough")
     return fine("reconnect", f"{found}, in the same session")
 
 
-def loop(talk: Talk, status: Status) -> Checked:
+def loop(client: RtcClient, status: Status) -> Checked:
     """Open the loop, and close it again."""
     if status.loop == Loop.OPEN:
         return skipped("loop", "the loop is open")
-    refused = _told(talk, LoopRequest(id=talk.ear.new_id("open"), loop=Loop.OPEN))
+    refused = _refusal_of(client, LoopRequest(id=client.connection.new_id("open"), loop=Loop.OPEN))
     if refused:
         return wrong("loop", f"it would not open: {refused}")
     try:
-        opened = talk.listen(CHANGED_S, lambda: _loop_is(talk, Loop.OPEN))
-        during = talk.watch.status
-        talk.listen(OPEN_S)
+        opened = client.listen(CHANGED_S, lambda: _loop_is(client, Loop.OPEN))
+        during = client.watch.status
+        client.listen(OPEN_S)
     finally:  # whoever breaks it off wants the loop as it was all the more
-        refused = _told(talk, LoopRequest(id=talk.ear.new_id("close"), loop=Loop.CLOSED))
-    problems = _after_opening(talk, status) if opened else ["no status says that it is open"]
-    closed = talk.listen(CHANGED_S, lambda: not _loop_is(talk, Loop.OPEN))
-    talk.listen(OPEN_S)
-    after = talk.watch.status
+        refused = _refusal_of(
+            client, LoopRequest(id=client.connection.new_id("close"), loop=Loop.CLOSED)
+        )
+    problems = _after_opening(client, status) if opened else ["no status says that it is open"]
+    closed = client.listen(CHANGED_S, lambda: not _loop_is(client, Loop.OPEN))
+    client.listen(OPEN_S)
+    after = client.watch.status
     if refused or not closed or after is None or during is None:
         problems.append(f"it is not closed again: {refused or 'the status says so'}")
     else:
@@ -304,10 +313,10 @@ def loop(talk: Talk, status: Status) -> Checked:
     return fine("loop", f"opened in session {during.session if during else ''}, closed in it again")
 
 
-def _after_opening(talk: Talk, before: Status) -> list[str]:
+def _after_opening(client: RtcClient, before: Status) -> list[str]:
     problems = []
-    now = talk.watch.status
-    later = [a for a in talk.watch.arrivals if a.header.session != before.session]
+    now = client.watch.status
+    later = [a for a in client.watch.arrivals if a.header.session != before.session]
     if now is not None and now.session == before.session:
         problems.append("opening began no new session")
     elif not later:
@@ -319,11 +328,11 @@ def _after_opening(talk: Talk, before: Status) -> list[str]:
     return problems
 
 
-def measure(talk: Talk, status: Status, in_use: MatrixInUse) -> Checked:
+def measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> Checked:
     """Have two modes measured, and compare what comes with the matrix in use."""
     n_rows = len(in_use.matrix)
     modes = tuple(sorted({0, n_rows // 3}))
-    name = talk.ear.new_id("measure")
+    name = client.connection.new_id("measure")
     request = MeasureRequest(
         id=name,
         pattern=Pattern.PUSH_PULL_MODAL,
@@ -331,29 +340,29 @@ def measure(talk: Talk, status: Status, in_use: MatrixInUse) -> Checked:
         amplitude_m=(STROKE_M,) * len(modes),
         n_average=4,
     )
-    n_known = len(talk.watch.measured)
-    refused = _told(talk, request)
+    n_known = len(client.watch.measured)
+    refused = _refusal_of(client, request)
     if refused.startswith(("unsupported", "busy", "no answer")):
         return skipped("measure", f"it will not: {refused}")
     if refused:
         return wrong("measure", refused)
-    found = _awaited(talk, n_known)
+    found = _awaited(client, n_known)
     was_open = status.loop == Loop.OPEN
-    back = talk.listen(CHANGED_S, lambda: _loop_is(talk, Loop.OPEN) is was_open)
-    talk.listen(OPEN_S)
+    back = client.listen(CHANGED_S, lambda: _loop_is(client, Loop.OPEN) is was_open)
+    client.listen(OPEN_S)
     if not back:
         return wrong("measure", "the loop is not as it was before")
     return wrong("measure", found) if isinstance(found, str) else _measured(found, request, in_use)
 
 
-def _awaited(talk: Talk, n_known: int) -> MeasuredMatrix | str:
+def _awaited(client: RtcClient, n_known: int) -> MeasuredMatrix | str:
     """Return the matrix that comes, or why there is none."""
-    collector, found = MeasuredIntake(talk.ear.keys), list[MeasuredMatrix | str]()
+    collector, found = MeasuredIntake(client.connection.keys), list[MeasuredMatrix | str]()
     looked_at = n_known
 
     def come() -> bool:
         nonlocal looked_at
-        for item in talk.watch.measured[looked_at:]:
+        for item in client.watch.measured[looked_at:]:
             looked_at += 1
             try:
                 matrix = collector.take(item.key, item.data)
@@ -363,7 +372,7 @@ def _awaited(talk: Talk, n_known: int) -> MeasuredMatrix | str:
                 found.extend([] if matrix is None else [matrix])
         return bool(found)
 
-    talk.listen(MEASURED_S, come)
+    client.listen(MEASURED_S, come)
     return found[0] if found else f"no matrix within {MEASURED_S:g} s"
 
 
@@ -389,15 +398,15 @@ def _measured(found: MeasuredMatrix, request: MeasureRequest, in_use: MatrixInUs
     return fine("measure", text)
 
 
-def _told(talk: Talk, command: Command) -> str:
+def _refusal_of(client: RtcClient, command: Command) -> str:
     """Send a command; return why it was not accepted, empty: it was."""
     try:
-        reply = talk.ear.command(command)
+        reply = client.connection.command(command)
     except LinkError as error:
         return str(error)
     return "" if reply.accepted else reply.reason or "refused without a reason"
 
 
-def _loop_is(talk: Talk, wanted: Loop) -> bool:
-    status = talk.watch.status
+def _loop_is(client: RtcClient, wanted: Loop) -> bool:
+    status = client.watch.status
     return status is not None and status.loop == wanted

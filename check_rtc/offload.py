@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.articles import Checked, fine, seen, skipped, wrong
-from check_rtc.ear import ANSWER_S
-from check_rtc.talk import REPLY_S, TOTAL_M, Talk, stopped
+from check_rtc.client import REPLY_S, TOTAL_M, RtcClient, stopped
+from check_rtc.connection import ANSWER_S
+from check_rtc.requirements import Checked, fine, seen, skipped, wrong
 from service.errors import LinkError, WireError
 from service.estimation.estimate import Estimate
 from service.estimation.frames import FrameBlock
@@ -57,43 +57,45 @@ _BESIDE_UNITS: Final = np.array([1.0, 1.0, 5.0, 0.2])
 _ALLOWED: Final = ("busy", "range", "unsupported")
 
 
-def offload(talk: Talk, matrix: NDArray[np.float32] | None, registered: Registered) -> Checked:
+def offload(
+    client: RtcClient, matrix: NDArray[np.float32] | None, registered: Registered
+) -> Checked:
     """Have the image moved a little and back, while a dither tells where it is."""
-    status = talk.watch.status
+    status = client.watch.status
     if status is None or matrix is None or status.cm_id is None:
         return skipped("offload", "the matrix in use is not to be had on rtc/cm/applied")
-    request = _dither(talk, status)
+    request = _dither(client, status)
     try:
-        reply = talk.ear.command(request)
+        reply = client.connection.command(request)
         if not reply.accepted or reply.start_seq is None:
             return skipped("offload", f"there was no dither: {reply.reason}")
         loop = closed_loop(status, status.cm_id, matrix)
-        return _moved(talk, request, reply.start_seq, lambda spectra: registered(spectra, loop))
+        return _moved(client, request, reply.start_seq, lambda spectra: registered(spectra, loop))
     except (LinkError, WireError) as error:
         return wrong("offload", str(error))
     finally:
-        stopped(talk)
+        stopped(client)
 
 
 def _moved(
-    talk: Talk,
+    client: RtcClient,
     request: DitherRequest,
     from_seq: int,
     alpha: Callable[[Spectra], Estimate | WindowRefused],
 ) -> Checked:
-    before = _measured(talk, request, from_seq, alpha)
+    before = _measured(client, request, from_seq, alpha)
     if isinstance(before, str):
         return skipped("offload", f"α cannot be measured: {before}")
     demand = OffloadRequest(
-        id=talk.ear.new_id("offload"),
+        id=client.connection.new_id("offload"),
         shift_x_subap=STEP if before.alpha.shift_x_subap < 0.0 else -STEP,
         shift_y_subap=0.0,
         rotation_deg=0.0,
         magnification=0.0,
     )
-    talk.listen(_DRAINED_S)  # much has come while α was computed
-    sent_seq = _next_seq(talk)
-    answer, took_s = talk.ear.ask(CommandKind.OFFLOAD, encode(demand))
+    client.listen(_DRAINED_S)  # much has come while α was computed
+    sent_seq = _next_seq(client)
+    answer, took_s = client.connection.ask(CommandKind.OFFLOAD, encode(demand))
     if answer is None and took_s < ANSWER_S / 2:
         return skipped("offload", "nobody answers on cmd/rtc/offload")
     if answer is None or took_s > REPLY_S:
@@ -104,14 +106,16 @@ def _moved(
         allowed = reply.reason.partition(":")[0] in _ALLOWED
         return (skipped if allowed else wrong)("offload", f"it will not: {reply.reason}")
     try:
-        return _compared(talk, demand, reply, sent_seq, before, request, alpha)
+        return _compared(client, demand, reply, sent_seq, before, request, alpha)
     finally:  # whoever breaks it off wants the image where it was
-        back = replace(demand, id=talk.ear.new_id("back"), shift_x_subap=-demand.shift_x_subap)
-        talk.ear.command(back)
+        back = replace(
+            demand, id=client.connection.new_id("back"), shift_x_subap=-demand.shift_x_subap
+        )
+        client.connection.command(back)
 
 
 def _compared(
-    talk: Talk,
+    client: RtcClient,
     demand: OffloadRequest,
     reply: Reply,
     sent_seq: int,
@@ -121,9 +125,9 @@ def _compared(
 ) -> Checked:
     """Ask again by the same id, wait until the image stands still, and measure."""
     problems = []
-    if talk.ear.command(demand) != reply:
+    if client.connection.command(demand) != reply:
         problems.append("the same id was answered otherwise when asked again")
-    rate_hz = talk.watch.status.frame_rate_hz if talk.watch.status else 1.0
+    rate_hz = client.watch.status.frame_rate_hz if client.watch.status else 1.0
     there_seq = sent_seq + round(SETTLE_S * rate_hz)
     if reply.start_seq is not None:
         there_seq = reply.start_seq
@@ -131,7 +135,7 @@ def _compared(
         if not 0.0 <= lasts_s <= LONGEST_S:
             span = f"expected 0 to {LONGEST_S:g} s ahead"
             return wrong("offload", f"start_seq is {lasts_s:.1f} s ahead of the frames, {span}")
-    after = _measured(talk, request, there_seq, alpha)
+    after = _measured(client, request, there_seq, alpha)
     if isinstance(after, str):
         return skipped("offload", f"α cannot be measured afterwards: {after}")
     way = (after.alpha.vector - before.alpha.vector) * BOUNDARY_SCALE
@@ -144,7 +148,7 @@ def _compared(
     if problems:
         return wrong("offload", "; ".join([found, *problems]))
     if beside > MOST_BESIDE:
-        return seen("offload", f"{found}, and elsewhere: {_told(way)}")
+        return seen("offload", f"{found}, and elsewhere: {_as_text(way)}")
     told = "nil" if reply.start_seq is None else f"{(there_seq - sent_seq) / rate_hz:.1f} s ahead"
     return fine("offload", f"{found}; start_seq {told}; asked again it did not move again")
 
@@ -158,12 +162,12 @@ def _why(share: float) -> str:
     return f"{expected}: another unit or axis, or it moves later than start_seq says"
 
 
-def _told(way: NDArray[np.float64]) -> str:
+def _as_text(way: NDArray[np.float64]) -> str:
     x, y, turned, size = way
     return f"{x:+.3f}, {y:+.3f} subap, {turned:+.3f} deg, {size:+.4f}"
 
 
-def _dither(talk: Talk, status: Status) -> DitherRequest:
+def _dither(client: RtcClient, status: Status) -> DitherRequest:
     """Return sines on four modes outside the loop, or the highest ones of it."""
     n_outside = status.n_modes - status.n_controlled
     if n_outside >= len(LINES):
@@ -174,7 +178,7 @@ def _dither(talk: Talk, status: Status) -> DitherRequest:
     each_m = min(TOTAL_M / np.sqrt(len(modes)), status.max_dither_m)
     lines = [round(line * status.frame_rate_hz * WINDOW_S) / WINDOW_S for line in LINES]
     return DitherRequest(
-        id=talk.ear.new_id("dither"),
+        id=client.connection.new_id("dither"),
         kind=DitherKind.SINE,
         modes=tuple(modes.tolist()),
         amplitude_m=(float(each_m),) * len(modes),
@@ -184,13 +188,13 @@ def _dither(talk: Talk, status: Status) -> DitherRequest:
 
 
 def _measured(
-    talk: Talk,
+    client: RtcClient,
     request: DitherRequest,
     from_seq: int,
     alpha: Callable[[Spectra], Estimate | WindowRefused],
 ) -> Estimate | str:
     """Return α of the first window from a frame on, or why there is none."""
-    status = talk.watch.status
+    status = client.watch.status
     rate_hz = status.frame_rate_hz if status else 1.0
     cutter = LockIn(
         plan=LockInPlan(
@@ -210,17 +214,17 @@ def _measured(
             cutter, found = cutter.accumulate(block)
             ended.extend(found)
 
-    talk.watch.block_takers.append(take)
-    wait_s = (from_seq - _next_seq(talk)) / rate_hz + 3.0 * WINDOW_S
+    client.watch.block_takers.append(take)
+    wait_s = (from_seq - _next_seq(client)) / rate_hz + 3.0 * WINDOW_S
     try:
-        talk.listen(max(wait_s, 3.0 * WINDOW_S), lambda: bool(ended))
+        client.listen(max(wait_s, 3.0 * WINDOW_S), lambda: bool(ended))
     finally:
-        talk.watch.block_takers.remove(take)
+        client.watch.block_takers.remove(take)
     if not ended:
         return "no window of dither has come"
     found = ended[0] if isinstance(ended[0], WindowRefused) else alpha(ended[0])
     return found.reason if isinstance(found, WindowRefused) else found
 
 
-def _next_seq(talk: Talk) -> int:
-    return max((one.stop_seq for one in talk.watch.arrivals[-1:]), default=0)
+def _next_seq(client: RtcClient) -> int:
+    return max((one.stop_seq for one in client.watch.arrivals[-1:]), default=0)

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.ear import Heard, Topic
+from check_rtc.connection import ReceivedMessage, Topic
 from service.errors import WireError
-from service.estimation import loopcheck, looplaw
+from service.estimation import control_law, loopcheck
+from service.estimation.control_law import ControlLawCheck, IdentifiedLaw
 from service.estimation.frames import FrameBlock
-from service.estimation.loopcheck import LoopCheck, Obedience
-from service.estimation.looplaw import FoundLaw, LoopLaw
+from service.estimation.loopcheck import CommandResidual, LoopCheck
 from service.estimation.windows import ClosedLoop
 from service.link.intake import Intake
 from service.link.session import Endpoint
@@ -60,7 +60,7 @@ class Refused:
     text: str
 
 
-class Watch:
+class TelemetryObserver:
     """Feed it what is heard with ``take``; the checks look at what it has gathered."""
 
     def __init__(self, endpoint: Endpoint, clock: Callable[[], float]) -> None:
@@ -68,7 +68,7 @@ class Watch:
         self.arrivals: list[Arrival] = []
         self.statuses: list[tuple[float, Status]] = []
         self.acknowledgements: list[tuple[float, Acknowledgement]] = []
-        self.measured: list[Heard] = []
+        self.measured: list[ReceivedMessage] = []
         self.refused: list[Refused] = []
         self.asked: list[tuple[float, str]] = []
         """Queries of the RTC for matrices: when, and key with part."""
@@ -85,7 +85,7 @@ class Watch:
         self._still = 0
         self._last_slopes: NDArray[np.float32] | None = None
 
-    def take(self, heard: list[Heard]) -> None:
+    def take(self, heard: list[ReceivedMessage]) -> None:
         """Look at what has come."""
         for item in heard:
             try:
@@ -111,7 +111,7 @@ class Watch:
         """Return the batches of each session, the first one first."""
         return Counter(arrival.header.session for arrival in self.arrivals)
 
-    def _take(self, item: Heard) -> None:
+    def _take(self, item: ReceivedMessage) -> None:
         match item.topic:
             case Topic.FRAMES:
                 self._frames(item, decode_frames(item.data, item.attachment))
@@ -119,7 +119,7 @@ class Watch:
                 status = decode(Status, item.data)
                 self.statuses.append((item.at_s, status))
                 self.intake.status(item.data)
-                self.loop.told(status)
+                self.loop.follow_status(status)
             case Topic.ACK:
                 self.acknowledgements.append((item.at_s, decode(Acknowledgement, item.data)))
             case Topic.MEASURED:
@@ -130,7 +130,7 @@ class Watch:
             case Topic.ASKED:
                 self.asked.append((item.at_s, item.key))
 
-    def _frames(self, item: Heard, batch: FrameBatch) -> None:
+    def _frames(self, item: ReceivedMessage, batch: FrameBatch) -> None:
         self.arrivals.append(
             Arrival(
                 at_s=item.at_s,
@@ -164,26 +164,26 @@ class LoopWatch:
     def __init__(self) -> None:
         self.matrix: NDArray[np.float32] | None = None
         self.cm_id: str | None = None
-        self.laws: list[FoundLaw] = []
+        self.laws: list[IdentifiedLaw] = []
         """Verdicts on leak, gain and delay, oldest first."""
 
-        self.obediences: list[Obedience] = []
+        self.obediences: list[CommandResidual] = []
         """Verdicts on every mode, oldest first."""
 
         self._status: Status | None = None
         self._check = LoopCheck()
-        self._law = LoopLaw()
+        self._law = ControlLawCheck()
 
     def use(self, cm_id: str, matrix: NDArray[np.float32]) -> None:
         """Know the numbers of the matrix in use."""
         self.cm_id, self.matrix = cm_id, matrix
 
-    def told(self, status: Status) -> None:
+    def follow_status(self, status: Status) -> None:
         """Take a status; another loop than before begins anew."""
         before, self._status = self._status, status
         if before is None or not same_loop(before, status) or before.cm_id != status.cm_id:
             self._check = LoopCheck(from_seq=last_seq(status) + 1)
-            self._law = LoopLaw(from_seq=last_seq(status) + 1)
+            self._law = ControlLawCheck(from_seq=last_seq(status) + 1)
             return
         terms = self._terms(status.cm_id)
         if terms is not None:
@@ -197,7 +197,7 @@ class LoopWatch:
         if block.slopes.shape[1] != terms.reconstructor.shape[1]:
             return
         self._check = loopcheck.observe(self._check, block, terms)
-        self._law = looplaw.follow(self._law, block, terms)
+        self._law = control_law.follow(self._law, block, terms)
 
     def _terms(self, cm_id: str | None) -> ClosedLoop | None:
         status, matrix = self._status, self.matrix
@@ -210,12 +210,12 @@ class LoopWatch:
     def _judge(self, terms: ClosedLoop, seq: int) -> None:
         span = loopcheck.last_samples(self._check, seq)
         if span is not None:
-            self._check, obeyed = loopcheck.obedience(self._check, terms, *span)
+            self._check, obeyed = loopcheck.command_residual(self._check, terms, *span)
             if obeyed is not None:
                 self.obediences.append(obeyed)
         if self._law.cm_id != terms.cm_id:
             return
-        self._law, found = looplaw.judged(self._law, terms, seq)
+        self._law, found = control_law.judged(self._law, terms, seq)
         if found is not None:
             self.laws.append(found)
 

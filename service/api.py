@@ -37,8 +37,8 @@ from service.web import (
     trends,
     views,
 )
-from service.web.admission import OPEN, SCHEMES, Admission, Hosts, needs, scope_of
-from service.web.connections import Once, Traced, server_config
+from service.web.authentication import OPEN, SCHEMES, Authentication, Hosts, needs, scope_of
+from service.web.connections import Idempotency, RequestId, server_config
 from service.web.keys import KeyFile
 from service.web.unchanged import NOT_MODIFIED, Unchanged
 
@@ -120,14 +120,14 @@ def create_app(
         routes=_routes(with_fits=desk is not None),
     )
     app.add_middleware(Unchanged)
-    app.add_middleware(Once)
+    app.add_middleware(Idempotency)
     app.add_middleware(
-        Admission, hosts=hosts or Hosts(), keys=keys, audit=lambda entry: service.audit(entry)
+        Authentication, hosts=hosts or Hosts(), keys=keys, audit=lambda entry: service.audit(entry)
     )
-    app.add_middleware(Traced)
+    app.add_middleware(RequestId)
     app.state.service = service
     app.state.keys = keys
-    app.state.slopes = numbers.SlopesShown()
+    app.state.slopes = numbers.SlopesCache()
     app.state.stream = stream.Stream(service, over or asyncio.Event())
     problems.install(app)
     page.install(app)

@@ -25,8 +25,8 @@ from service.files.recorder import RecordingWriter
 from service.files.recording import RecordedKind
 from service.link import session as link
 from service.link.intake import Intake
+from service.link.leader_election import Standby
 from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
-from service.link.rivals import Standby
 from service.link.session import Endpoint
 from service.link.statistics import LinkStatistics
 

@@ -11,10 +11,9 @@ from typing import Any, Final
 
 from service.tracking import (
     acquisition,
+    alarm_records,
     alarms,
-    attention,
     dither,
-    evidence,
     interlocks,
     measuring,
     mode_proof,
@@ -26,6 +25,7 @@ from service.tracking import (
     resume,
     rtc,
     validity,
+    window_processing,
 )
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -34,9 +34,9 @@ from service.tracking.events import Effect, Event
 from service.tracking.loop import CommandState
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
+from service.tracking.update_policy import note_declined
 from service.tracking.updates import decide, fetch_in_use
-from service.tracking.worth import note_declined
 from service.wire import (
     Acknowledgement,
     DitherRequest,
@@ -65,136 +65,138 @@ def step(
     """
     if isinstance(event, Command):
         interlocks.require(state, event, policy, now_ns)
-    turn = Turn(state, event, policy, now_ns)
-    attention.judge_rules(turn)
-    measuring.watch_measurement(turn)
-    REACTIONS[type(event)](turn, event)
-    probation.follow(turn)
-    attention.judge_rules(turn)
-    note_declined(turn)
-    _go_on(turn)
-    attention.follow(turn)
-    return turn.state, tuple(turn.effects)
+    context = StepContext(state, event, policy, now_ns)
+    alarm_records.judge_rules(context)
+    measuring.watch_measurement(context)
+    REACTIONS[type(event)](context, event)
+    probation.follow(context)
+    alarm_records.judge_rules(context)
+    note_declined(context)
+    _go_on(context)
+    alarm_records.follow(context)
+    return context.state, tuple(context.effects)
 
 
-def _go_on(turn: Turn) -> None:
+def _go_on(context: StepContext) -> None:
     """Let what runs go on, and decide what else is wanted: what has the mirror comes first."""
-    if turn.state.measuring is not None:
+    if context.state.measuring is not None:
         return
-    fetch_in_use(turn)
-    if turn.state.stopped_because:
-        resume.keep_stopped(turn)
+    fetch_in_use(context)
+    if context.state.stopped_because:
+        resume.keep_stopped(context)
         return
-    acquisition.acquire(turn)
-    if turn.acquisition.under_way:
+    acquisition.acquire(context)
+    if context.acquisition.under_way:
         return
-    measuring.follow_noisy(turn)
-    if not measuring.awaits_its_dither(turn.state):
-        decide(turn)
-        offload.demand(turn)
+    measuring.follow_noisy(context)
+    if not measuring.awaits_its_dither(context.state):
+        decide(context)
+        offload.demand(context)
 
 
-def _on_tick(turn: Turn, _: ev.Tick) -> None:
-    rtc.on_tick(turn)
-    validity.age(turn)
-    refusals.follow(turn)
-    operator.close_again(turn)
+def _on_tick(context: StepContext, _: ev.Tick) -> None:
+    rtc.on_tick(context)
+    validity.age(context)
+    refusals.follow(context)
+    operator.close_again(context)
 
 
-def _on_trouble(turn: Turn, trouble: ev.Trouble) -> None:
-    if trouble.over:
-        validity.end_alarm(turn, trouble.name, trouble.t_ns_utc)
-    elif trouble.name == alarms.MIRROR_SILENT:
-        dither.stop_unanswered(turn, trouble.text)
+def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
+    if event.over:
+        validity.end_alarm(context, event.name, event.t_ns_utc)
+    elif event.name == alarms.MIRROR_SILENT:
+        dither.stop_unanswered(context, event.text)
     else:
-        turn.alarm(trouble.name, trouble.text)
+        context.raise_alarm(event.name, event.text)
 
 
-def _on_window(turn: Turn, event: ev.WindowFitted) -> None:
-    if turn.state.measuring is not None:
-        evidence.refuse_window(turn, measuring.MEASURING)
+def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
+    if context.state.measuring is not None:
+        window_processing.reject_window(context, measuring.MEASURING)
         return
-    mode_proof.learn(turn, event.estimate)
-    evidence.on_window(turn, event)
-    dither.learn(turn, event.estimate)
+    mode_proof.learn(context, event.estimate)
+    window_processing.on_window(context, event)
+    dither.learn(context, event.estimate)
 
 
-def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
-    if turn.acquisition.under_way:
-        reconstructors.propose(turn, made.record)
-    elif probation.is_way_back(turn.state, made):
-        probation.go_back(turn, made)
+def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
+    if context.acquisition.under_way:
+        reconstructors.propose(context, made.record)
+    elif probation.is_way_back(context.state, made):
+        probation.go_back(context, made)
     else:
-        reconstructors.on_matrix(turn, made)
+        reconstructors.on_matrix(context, made)
 
 
-def _on_dither_measured(turn: Turn, heard: ev.DitherMeasured) -> None:
-    loud = dither.why_too_strong(turn, heard)
+def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+    loud = dither.why_too_strong(context, event)
     if loud is not None:
-        measuring.cut_off(turn, f"its dither was too strong: {heard.text}")
-        dither.stop_too_strong(turn, heard.id, loud)
+        measuring.cut_off(context, f"its dither was too strong: {event.text}")
+        dither.stop_too_strong(context, event.id, loud)
 
 
-def _on_answer(turn: Turn, answered: ev.Answered) -> None:
+def _on_answer(context: StepContext, answered: ev.Answered) -> None:
     reply = answered.reply
     match answered.request:
         case DitherRequest() as request:
-            dither.on_answer(turn, request, reply)
+            dither.on_answer(context, request, reply)
         case DitherStop():
-            dither.on_stop_answer(turn, reply)
+            dither.on_stop_answer(context, reply)
         case MeasureRequest() as request:
-            measuring.on_answer(turn, request, reply)
+            measuring.on_answer(context, request, reply)
         case OffloadRequest() as request:
-            offload.on_answer(turn, request, reply)
+            offload.on_answer(context, request, reply)
         case LoopRequest() | RampRequest() as request:
             outcome = CommandState.ACCEPTED if reply.accepted else CommandState.REFUSED
-            operator.on_loop_answer(turn, request.id, outcome, reply.reason)
+            operator.on_loop_answer(context, request.id, outcome, reply.reason)
 
 
-def _on_failure(turn: Turn, failed: ev.JobFailed) -> None:
+def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
-            measuring.fail(turn, turn.state.measurement(name), failed.text)
+            measuring.fail(context, context.state.measurement(name), failed.text)
         case ev.Ask(request=OffloadRequest(id=name)):
-            offload.on_failure(turn, name, failed.text)
+            offload.on_failure(context, name, failed.text)
         case ev.FinishNoisy(record=noisy):
-            measuring.fail(turn, noisy, failed.text)
+            measuring.fail(context, noisy, failed.text)
         case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
-            operator.on_loop_answer(turn, name, CommandState.FAILED, failed.text)
+            operator.on_loop_answer(context, name, CommandState.FAILED, failed.text)
         case effect:
-            rtc.on_failure(turn, effect, failed.text)
+            rtc.on_failure(context, effect, failed.text)
 
 
-REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
+REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.Tick: _on_tick,
     Status: rtc.on_status,
     ev.SessionStarted: rtc.on_new_session,
     ev.RtcVanished: rtc.on_vanished,
     ev.ServicesMet: rtc.on_services,
-    ev.Trouble: _on_trouble,
-    ev.Noted: lambda turn, noted: turn.log(noted.name, noted.text, noted.level),
-    ev.FarFitted: lambda _turn, _event: None,  # an acquisition's
+    ev.ConditionChanged: _on_condition,
+    ev.LogEvent: lambda context, event: context.log(event.name, event.text, event.level),
+    ev.WideCaptureFitted: lambda _context, _event: None,  # an acquisition's
     ev.WindowFitted: _on_window,
-    ev.WindowLost: evidence.on_lost,
-    ev.Watched: evidence.on_watchdog,
-    ev.Unwatched: lambda turn, unwatched: evidence.cannot_watch(turn, unwatched.text),
+    ev.WindowLost: window_processing.on_lost,
+    ev.PassiveFitted: window_processing.process_passive,
+    ev.PassiveUnavailable: lambda context, event: window_processing.note_passive_unavailable(
+        context, event.text
+    ),
     ev.MatrixMade: _on_made,
     ev.MatrixFetched: reconstructors.on_fetched,
     ev.ModesRecognised: mode_proof.recognise,
     ev.MarginJudged: reconstructors.on_margin,
     ev.ProposalJudged: reconstructors.on_proposal_judged,
     Acknowledgement: reconstructors.on_acknowledgement,
-    ev.MatrixMeasured: lambda turn, measured: measuring.on_measured(turn, measured.record),
+    ev.MatrixMeasured: lambda context, measured: measuring.on_measured(context, measured.record),
     ev.Answered: _on_answer,
     ev.DitherSilent: dither.on_silence,
     ev.DitherMeasured: _on_dither_measured,
     ev.Compared: probation.on_compared,
-    ev.LoopHeld: rtc.hear_loop,
-    ev.Vibrations: rtc.hear_vibrations,
+    ev.LoopHeld: rtc.on_loop_held,
+    ev.Vibrations: rtc.on_vibrations,
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
-    cmd.SetPointing: lambda turn, command: validity.point(turn, command.pointing),
-    cmd.SetValue: attention.tell_value,
+    cmd.SetPointing: lambda context, command: validity.point(context, command.pointing),
+    cmd.SetValue: alarm_records.set_value,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
     cmd.StopEverything: resume.stop,
@@ -204,11 +206,11 @@ REACTIONS: Final[dict[type, Callable[[Turn, Any], object]]] = {
     cmd.StartDither: operator.start_dither,
     cmd.StopDither: dither.stop_by_operator,
     cmd.Measure: measuring.measure,
-    cmd.GiveUp: lambda turn, command: measuring.give_up(turn, command.id),
+    cmd.GiveUp: lambda context, command: measuring.give_up(context, command.id),
     cmd.MeasureNoisy: measuring.measure_noisy,
-    cmd.AcknowledgeAlarm: attention.acknowledge,
-    cmd.MuteAlarm: attention.mute,
-    cmd.UnmuteAlarm: attention.unmute,
+    cmd.AcknowledgeAlarm: alarm_records.acknowledge,
+    cmd.MuteAlarm: alarm_records.mute,
+    cmd.UnmuteAlarm: alarm_records.unmute,
     cmd.Refit: operator.refit,
     cmd.Approve: operator.approve,
     cmd.Reject: operator.reject,

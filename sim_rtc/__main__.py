@@ -11,7 +11,7 @@ from pathlib import Path
 import structlog
 from threadpoolctl import threadpool_limits
 
-from service.cli.program import leave, log_to_terminal, status_of, told_to_stop
+from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.recorder import RecordingWriter
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the simulated RTC until its time is up or it is told to stop; return the exit status."""
     options = parse_options(arguments)
     log_to_terminal(quiet=options.quiet)
-    stopped = told_to_stop()
+    stopped = stop_signal()
     return status_of(lambda: _build_and_run(options, stopped), "sim_rtc")
 
 

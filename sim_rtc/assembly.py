@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
-from service.files.prepared import Prepared, usual_folder
+from service.files.disk_cache import DiskCache, usual_folder
 from service.model.described import KarhunenLoeve
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import Normalisation
@@ -86,7 +86,7 @@ class Telescope:
 
 def _modes(instrument: Instrument) -> ModalBasis:
     """Return the modes of an analytic mirror, from the folder that the service keeps its own in."""
-    kept = Prepared(usual_folder(os.environ)).basis(instrument)
+    kept = DiskCache(usual_folder(os.environ)).basis(instrument)
     return kept if isinstance(kept, ModalBasis) else analytic_basis(instrument)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.config import load_instrument
 from service.config.policy import policy_of
 from service.config.settings import Settings
-from service.control.dither import SPAN, information, most_telling
+from service.control.dither import SPAN, information, most_informative
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import PARAMETERS
 from service.model.modes import modal_basis
@@ -42,7 +42,7 @@ def main() -> None:
     ]
     for first in FIRST:
         above = np.arange(first, min(first + SPAN, len(known)))
-        own = most_telling(known, range(first, int(above[-1]) + 1), N_LINES, wanted)
+        own = most_informative(known, range(first, int(above[-1]) + 1), N_LINES, wanted)
         spread = above[np.linspace(0, len(above) - 1, 2 * N_LINES + 1)[1::2].astype(int)]
         sets = [rng.choice(above, N_LINES, replace=False) for _ in range(N_SETS)]
         chosen = _sigma(known, np.array(own))

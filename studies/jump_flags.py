@@ -20,13 +20,13 @@ from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.tracking.events import Tick
-from service.tracking.evidence import enter
-from service.tracking.filtering import Measured
+from service.tracking.filtering import WindowEstimate
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
-from service.tracking.validity import taken
+from service.tracking.step_context import StepContext
+from service.tracking.validity import telemetry_span
+from service.tracking.window_processing import process_window
 from studies.campaign.rows import floats
 
 WINDOW_S = 2.0
@@ -124,20 +124,22 @@ def _flags(night: Night, rng: np.random.Generator, policy: Policy) -> list[tuple
     for k in range(1, night.n_windows + 1):
         end_s = k * WINDOW_S
         now_ns = START_NS + round((end_s + FIT_S) * SECOND_NS)
-        turn = Turn(state, Tick(), policy, now_ns)
-        enter(turn, _measured(night, end_s, rng, policy))
-        state = turn.state
+        context = StepContext(state, Tick(), policy, now_ns)
+        process_window(context, _measured(night, end_s, rng, policy))
+        state = context.state
         new = [e for e in state.log if e.t_ns_utc == now_ns]
         if k > SETTLED:
             found += [(end_s + FIT_S, entry.name) for entry in new if entry.name in FLAGS]
     return found
 
 
-def _measured(night: Night, end_s: float, rng: np.random.Generator, policy: Policy) -> Measured:
+def _measured(
+    night: Night, end_s: float, rng: np.random.Generator, policy: Policy
+) -> WindowEstimate:
     read = night.mean(end_s) + night.sigma * rng.normal(size=4)
     said = night.sigma * np.sqrt(rng.chisquare(DEGREES) / DEGREES) / BOUNDARY_SCALE
-    when = taken(*(START_NS + round(s * SECOND_NS) for s in (end_s - WINDOW_S, end_s)))
-    return Measured(
+    when = telemetry_span(*(START_NS + round(s * SECOND_NS) for s in (end_s - WINDOW_S, end_s)))
+    return WindowEstimate(
         alpha=Misregistration.from_vector(Misregistration().vector + read / BOUNDARY_SCALE),
         covariance=np.diag(said**2),
         floor=policy.floor,

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 from service.api import create_app
-from service.tracking.activity import OCCUPIES, Occupation, Operation
-from service.tracking.alarms import Act, Attention, Severity
+from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS
 from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
+from service.tracking.running_operations import OPERATION_OF, CurrentOperation, ServiceState
 from service.tracking.state import AcquisitionStage, Mode
 from studies import reference
 from studies.contract_tables import described, table, with_tables
@@ -25,8 +25,8 @@ from studies.contract_tables import described, table, with_tables
 ROOT = Path(__file__).parents[1]
 
 _STATES: dict[str, type[StrEnum]] = {
-    "What the service is in": Operation,
-    "What it does": Occupation,
+    "What the service is in": ServiceState,
+    "What it does": CurrentOperation,
     "Modes": Mode,
     "What α is worth": Validity,
     "An acquisition's way": AcquisitionStage,
@@ -34,7 +34,7 @@ _STATES: dict[str, type[StrEnum]] = {
     "The probation of a matrix": ProbationState,
     "A measured matrix's way": MeasureState,
     "How much an alarm matters": Severity,
-    "What operators have done about an alarm": Attention,
+    "What operators have done about an alarm": AlarmState,
 }
 
 
@@ -110,7 +110,7 @@ def rest() -> str:
 
 def runbook() -> str:
     """Return docs/operate/runbook.md."""
-    acts = {act: _lower(text) for act, text in _described(Act).items()}
+    acts = {act: _lower(text) for act, text in _described(Interlock).items()}
     return reference.runbook(acts)
 
 
@@ -133,7 +133,7 @@ def _refusals() -> list[tuple[str, ...]]:
         (
             activity.value,
             ", ".join(f"`{each.__name__}`" for each in every if each not in allowed),
-            OCCUPIES.get(activity, ""),
+            OPERATION_OF.get(activity, ""),
         )
         for activity, allowed in ALLOWS.items()
     ]

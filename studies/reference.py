@@ -229,9 +229,9 @@ def runbook(acts: Mapping[str, str]) -> str:
         table(("word", "what it forbids while the alarm lasts"), list(acts.items())),
     ]
     for name, kind in ALARMS.items():
-        forbids = ", ".join(f"`{act}`" for act in acts if act in kind.forbids)
+        forbids = ", ".join(f"`{act}`" for act in acts if act in kind.blocks)
         head = [f"*{kind.severity.value}*", forbids and f"forbids {forbids}"]
-        head.append(f"the {kind.party} can end it" if kind.party else "")
+        head.append(f"the {kind.responsible} can end it" if kind.responsible else "")
         means = kind.means[:1].upper() + kind.means[1:]
         do = f"**Do**: {kind.do}."
         parts += [f"## {name}", "; ".join(part for part in head if part), f"{means}.", do]

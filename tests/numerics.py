@@ -17,7 +17,7 @@ from service.control.reconstructor import invert
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockInPlan
 from service.estimation.windows import ClosedLoop
-from service.files.prepared import Prepared, usual_folder
+from service.files.disk_cache import DiskCache, usual_folder
 from service.model.described import InfluenceShape, KarhunenLoeve
 from service.model.instrument import Instrument, Mirror, Pyramid
 from service.model.interaction import InteractionModel, Linearisation
@@ -100,7 +100,7 @@ def small_linearisation() -> Linearisation:
 @cache
 def flao_basis() -> ModalBasis:
     """Seconds of work, kept on disk for whatever process asks next."""
-    basis = Prepared(usual_folder(os.environ)).basis(load_instrument("flao-lbt"))
+    basis = DiskCache(usual_folder(os.environ)).basis(load_instrument("flao-lbt"))
     assert isinstance(basis, ModalBasis)
     return basis
 

@@ -37,7 +37,7 @@ SENT_WITHIN_S = 60.0
 """A service reads a matrix from its disk before the first byte of it comes."""
 
 
-def carry_out(service: Service, _request: Request, options: argparse.Namespace) -> int:
+def run_command(service: Service, _request: Request, options: argparse.Namespace) -> int:
     """Write the file; return the exit status.
 
     Raises

@@ -39,7 +39,7 @@ class Step(NamedTuple):
     """How long it takes, seconds; None: nobody knows."""
 
 
-def carry_out(service: Service, request: Request, options: argparse.Namespace) -> int:
+def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:
     """Show what is decided on, give the order, say what came of it; return the exit status.
 
     Raises
@@ -123,7 +123,7 @@ def _reconstructors(service: Service) -> dict[str, Document]:
         return {one["id"]: one for one in document["reconstructors"]}
 
 
-def _looked_at(service: Service, request: Request, options: argparse.Namespace) -> Document:
+def _progress(service: Service, request: Request, options: argparse.Namespace) -> Document:
     """Return how far the work is; a reconstructor that goes out again does so as a copy."""
     if request.follows != RECONSTRUCTORS:
         return service.get(path_of(request.follows, options)).document
@@ -163,7 +163,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
         with Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task("", total=None)
             while True:
-                document, n_looks = _looked_at(service, request, options), n_looks + 1
+                document, n_looks = _progress(service, request, options), n_looks + 1
                 lasted_s = time.monotonic() - began_s
                 with understood(service):
                     step = _step(document, lasted_s)

@@ -14,7 +14,7 @@ from pyrcal.options import named
 from pyrcal.terminal import clock, print_document, print_lines, span, table
 
 
-def carry_out(service: Service, request: Request, options: argparse.Namespace) -> int:
+def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:
     """Ask, print, and return the exit status.
 
     Raises
@@ -104,7 +104,7 @@ def _alarms(state: Document) -> Iterator[str]:
 def _audit(document: Document) -> Iterator[str]:
     for one in document["entries"]:
         why = f" (because: {one['why']})" if one["why"] else ""
-        whence = f", {one['whence']}" if one["whence"] else ""
+        whence = f", {one['channel']}" if one["channel"] else ""
         yield (
             f"{clock(one['t_utc'])}  {one['who']}{whence}: {one['name']}: "
             f"{one['answer'] or one['text']}{why}"

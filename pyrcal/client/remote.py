@@ -35,7 +35,7 @@ class Request(NamedTuple):
     name: str
     purpose: str
     module: str
-    """Of this package; its ``carry_out`` does the work."""
+    """Of this package; its ``run_command`` does the work."""
 
     call: str
     """Method and path of REST; words in braces are options."""
@@ -346,7 +346,7 @@ def main(options: argparse.Namespace) -> int:
     request: Request = options.request
     service = Service(options.url or os.environ.get(URL) or USUAL_URL, _key(options.key_file))
     try:
-        status: int = import_module(f"{__package__}.{request.module}").carry_out(
+        status: int = import_module(f"{__package__}.{request.module}").run_command(
             service, request, options
         )
     except RefusedError as error:

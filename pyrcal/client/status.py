@@ -20,14 +20,14 @@ def status_lines(state: Document) -> list[str]:
     """Return the screen: first whether all is well and what is not, then what there is."""
     ready = "ready" if state["ready"] else f"NOT READY: {state['ready_reason']}"
     does, up = state["operating"], span(state["uptime_s"])
-    doing = f"{does['operation']}, {does['occupation']}"
+    doing = f"{does['service_state']}, {does['current_operation']}"
     lines = [f"{state['system']}: {doing}; mode {state['mode']}, up {up}: {ready}"]
     lines += [f"ALARM {alarm_line(alarm, state)}" for alarm in worst_first(state)]
     gone = ", ".join(alarm["name"] for alarm in state["stale_alarms"])
     lines += [f"gone, and nobody has acknowledged: {gone}; pyrcal alarms has them"] if gone else []
     alarms = {alarm["name"] for alarm in state["alarms"]}
     lines += [
-        f"waits for the {wait['party']}: {wait['text']}"
+        f"waits for the {wait['responsible']}: {wait['text']}"
         for wait in state["waiting_for"]
         if wait["name"] not in alarms
     ]
@@ -38,7 +38,7 @@ def worst_first(state: Document) -> list[Document]:
     """Return the alarms that last and are not muted: the worst first, the unseen before others."""
     shown = [alarm for alarm in state["alarms"] if alarm["muted"] is None]
     return sorted(
-        shown, key=lambda one: (-_SEVERITIES.index(one["severity"]), one["attention"] != "active")
+        shown, key=lambda one: (-_SEVERITIES.index(one["severity"]), one["alarm_state"] != "active")
     )
 
 
@@ -111,14 +111,14 @@ def verdict(margin: Document | None) -> str:
 
 
 def _doing(state: Document) -> list[str]:
-    dithering, acquisition = state["dithering"], state["acquisition"]
-    lines = [f"dither   {dithering['phase']}: {dithering['reason']}"]
+    dither_policy, acquisition = state["dither_policy"], state["acquisition"]
+    lines = [f"dither   {dither_policy['phase']}: {dither_policy['reason']}"]
     if acquisition["under_way"]:
         lines.append(f"doing    acquisition, {acquisition['stage']}: {acquisition['text']}")
     if state["measuring"] is not None:
         lines.append(f"doing    {state['measuring']['id']} is being measured")
-    if state["gathering"] is not None:
-        lines.append(f"doing    {state['gathering']['id']}, a noisy matrix, is under way")
+    if state["noisy_measurement"] is not None:
+        lines.append(f"doing    {state['noisy_measurement']['id']}, a noisy matrix, is under way")
     return [*lines, *_refused(state)]
 
 

@@ -56,7 +56,7 @@ class Latest:
     """Why nothing comes; empty: the stream is open."""
 
 
-def carry_out(service: Service, request: Request, options: argparse.Namespace) -> int:
+def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:
     """Show what comes until Ctrl-C; return the exit status.
 
     Raises
@@ -64,8 +64,8 @@ def carry_out(service: Service, request: Request, options: argparse.Namespace) -
     RefusedError, UnreachableError
         If there is no stream at the first attempt; later ones go on for ever.
     """
-    heard = Latest()
-    coming = events(service, request.path, heard)
+    latest = Latest()
+    coming = events(service, request.path, latest)
     coming = chain([next(coming)], coming)
     try:
         if options.json:
@@ -73,40 +73,40 @@ def carry_out(service: Service, request: Request, options: argparse.Namespace) -
         elif not sys.stdout.isatty():
             _print_log(coming)
         else:
-            _draw(coming, heard)
+            _draw(coming, latest)
     except KeyboardInterrupt:
         return DONE
     return DONE
 
 
-def events(service: Service, path: str, heard: Latest) -> Iterator[Event]:
+def events(service: Service, path: str, latest: Latest) -> Iterator[Event]:
     """Yield the name and the data of each event; ``lost`` with the reason where the stream ends."""
     ever = False
     while True:
-        headers = {"Last-Event-ID": heard.last} if heard.last else {}
+        headers = {"Last-Event-ID": latest.last} if latest.last else {}
         try:
             with service.answered("GET", path, headers=headers, silent_s=SILENT_S) as response:
-                for name, data in _read(service, response, heard):
+                for name, data in _read(service, response, latest):
                     ever = True
                     if name == "reset":
                         data = service.get("/v1/events", limit=_LOG_LENGTH).document
                         with understood(service):
-                            heard.log = tuple(map(dict, data["log"]))
+                            latest.log = tuple(map(dict, data["log"]))
                     elif name == "log":
-                        heard.log = (*heard.log, data)[-_LOG_LENGTH:]
+                        latest.log = (*latest.log, data)[-_LOG_LENGTH:]
                     else:
-                        heard.state, heard.at_s, heard.lost = data, time.monotonic(), ""
+                        latest.state, latest.at_s, latest.lost = data, time.monotonic(), ""
                     yield name, data
-            heard.lost = "the service has ended the stream"
+            latest.lost = "the service has ended the stream"
         except (RefusedError, UnreachableError) as error:
             if not ever:
                 raise
-            heard.lost = str(error)
-        yield "lost", {"text": heard.lost}
+            latest.lost = str(error)
+        yield "lost", {"text": latest.lost}
         time.sleep(AGAIN_S)
 
 
-def _read(service: Service, response: HTTPResponse, heard: Latest) -> Iterator[Event]:
+def _read(service: Service, response: HTTPResponse, latest: Latest) -> Iterator[Event]:
     """Yield the events of a stream; remember the ids of the log's lines.
 
     Raises
@@ -125,7 +125,7 @@ def _read(service: Service, response: HTTPResponse, heard: Latest) -> Iterator[E
         if "data" in fields:
             with understood(service):
                 data = dict(json.loads(fields["data"]))
-            heard.last = fields.get("id", heard.last)
+            latest.last = fields.get("id", latest.last)
             yield fields.get("event", ""), data
         fields = {}
 
@@ -149,7 +149,7 @@ def _of_log(line: Document) -> str:
     return f"{clock(line['t_utc'])}  {line['level']:7}  {line['text']}{times}"
 
 
-def _draw(coming: Iterator[Event], heard: Latest) -> None:
+def _draw(coming: Iterator[Event], latest: Latest) -> None:
     """Draw what is known, and how old it is, while it comes in a thread of its own."""
     from rich.console import Console
     from rich.live import Live
@@ -158,23 +158,25 @@ def _draw(coming: Iterator[Event], heard: Latest) -> None:
     listener.start()
     with Live(console=Console(), screen=True, auto_refresh=False) as live:
         while listener.is_alive():
-            live.update(screen(heard, time.monotonic()), refresh=True)
+            live.update(screen(latest, time.monotonic()), refresh=True)
             time.sleep(DRAWN_S)
 
 
-def screen(heard: Latest, now_s: float) -> Group:
+def screen(latest: Latest, now_s: float) -> Group:
     """Return what there is to see at a time, the newest lines of the log first."""
     from rich.console import Group
     from rich.text import Text
 
-    age_s, lost = now_s - heard.at_s, heard.lost
+    age_s, lost = now_s - latest.at_s, latest.lost
     head = Text(f"connected, the state came {span(age_s)} ago; Ctrl-C ends this", style="green")
     if lost:
-        old = f"; what is below is {span(age_s)} old" if heard.state else ""
+        old = f"; what is below is {span(age_s)} old" if latest.state else ""
         head = Text(shown(f"DISCONNECTED: {lost}; trying again{old}"), style="bold white on red")
     try:
-        told = [] if heard.state is None else status_lines(_aged(heard.state, age_s))
-        log = [(_of_log(line)[11:], _LEVELS.get(line["level"], "")) for line in reversed(heard.log)]
+        told = [] if latest.state is None else status_lines(_aged(latest.state, age_s))
+        log = [
+            (_of_log(line)[11:], _LEVELS.get(line["level"], "")) for line in reversed(latest.log)
+        ]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         told, log = [f"NOT this version of pyrcal: {error!r}"], []
     return Group(

@@ -14,7 +14,7 @@ from typing import Any
 
 from pyrcal.terminal import show_progress
 from service.archive import Archive
-from service.archive.nights import FOREVER_NS, HOUR_NS, MOST_THINNED
+from service.archive.nights import FOREVER_NS, HOUR_NS, MAX_DOWNSAMPLED
 from service.archive.records import to_json
 from service.archive.retention import Item, due, items, remove, verify
 from service.config import Settings, load_settings
@@ -41,7 +41,7 @@ def main(options: argparse.Namespace) -> int:
         return _aot(options, settings)
     if options.action == "prune":
         return _prune(settings, dry_run=options.dry_run, as_json=options.json)
-    with _looked_at(settings) as archive:
+    with _open_archive(settings) as archive:
         every = items(archive, _saved(archive))
         if options.action == "list":
             return _list(every, as_json=options.json)
@@ -51,7 +51,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _looked_at(settings: Settings) -> Iterator[Archive]:
+def _open_archive(settings: Settings) -> Iterator[Archive]:
     """Open the archive to read, whether a service runs or not."""
     with Archive(settings.service.data_dir) as archive:
         archive.look()
@@ -129,13 +129,13 @@ def _verify(archive: Archive, every: tuple[Item, ...], *, as_json: bool) -> int:
 
 def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
     """Remove what the settings let go; a running service does so by itself, and has the lock."""
-    keeping, archive = keeping_of(settings), Archive(settings.service.data_dir)
+    retention, archive = keeping_of(settings), Archive(settings.service.data_dir)
     with archive:
         archive.look()  # a folder that is none is refused before one is made
         if not dry_run:
             archive.close()
             archive.open()
-        going = tuple(due(items(archive, _saved(archive)), keeping, time.time_ns()))
+        going = tuple(due(items(archive, _saved(archive)), retention, time.time_ns()))
         gone = []
         for item, why in going:
             entry = None if dry_run else remove(archive, item, why)
@@ -164,14 +164,14 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
     if options.recording is not None:
         taken = excerpt(options.recording, options.skip, options.seconds)
         span = (taken.first_ns_utc - BESIDE_NS, taken.last_ns_utc + BESIDE_NS)
-    with _looked_at(settings) as archive:
+    with _open_archive(settings) as archive:
         if options.night is not None:
             nights = archive.nights.between(*span)
             night = next((night for night in nights if night.date == options.night), None)
             if night is None:
                 raise UnknownIdError(f"{options.night}: nothing was measured in this night")
             span = (night.since_ns_utc, night.until_ns_utc)
-        estimates = archive.nights.estimates(*span, MOST_THINNED)
+        estimates = archive.nights.estimates(*span, MAX_DOWNSAMPLED)
     write_aot(options.output, instrument, estimates, taken)
     n_frames = 0 if taken is None else sum(batch.header.n for batch in taken.batches)
     n_damaged = 0 if taken is None else taken.n_damaged

@@ -33,7 +33,7 @@ _REFERENCE = re.compile(r"(.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::.*)?|(.+):/.+", re
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Parcel:
+class Upload:
     """What was uploaded, on disk."""
 
     reference: Path
@@ -43,7 +43,7 @@ class Parcel:
     """The instrument file; None: it came alone."""
 
 
-def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes: int) -> Parcel:
+def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: int) -> Upload:
     """Return what an upload consists of; a zip archive is unpacked into the empty ``folder``.
 
     Parameters
@@ -68,10 +68,10 @@ def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes:
         packed = file.read(4) == _ZIP_BEGINS
     if not packed:
         check_sealed(upload)
-        return Parcel(reference=upload, instrument=None)
+        return Upload(reference=upload, instrument=None)
     try:
         with zipfile.ZipFile(upload) as archive:
-            names = _unpack(archive, folder, most_bytes)
+            names = _unpack(archive, folder, max_bytes)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
         raise MatrixError(f"upload: damaged zip archive: {error}") from error
     for name in names:
@@ -84,7 +84,7 @@ def opened_parcel(upload: Path, folder: Path, reference: str | None, most_bytes:
             f"{', '.join(names)}"
         )
     left = [name for name in names if name not in referred and name != instrument.name]
-    return Parcel(reference=folder / _measured(left, names, reference), instrument=instrument)
+    return Upload(reference=folder / _measured(left, names, reference), instrument=instrument)
 
 
 def _only_toml(names: list[str]) -> str:
@@ -105,14 +105,14 @@ def _measured(left: list[str], names: list[str], reference: str | None) -> str:
     return chosen
 
 
-def _unpack(archive: zipfile.ZipFile, folder: Path, most_bytes: int) -> list[str]:
+def _unpack(archive: zipfile.ZipFile, folder: Path, max_bytes: int) -> list[str]:
     """Write the files of an archive and return their names."""
     entries = [entry for entry in archive.infolist() if not entry.is_dir()]
     size = sum(entry.file_size for entry in entries)
-    if len(entries) > MOST_FILES or size > most_bytes:
+    if len(entries) > MOST_FILES or size > max_bytes:
         raise MatrixError(
             f"upload: found {len(entries)} files of {size / 1e6:.0f} MB in the archive, expected "
-            f"at most {MOST_FILES} of {most_bytes / 1e6:.0f} MB"
+            f"at most {MOST_FILES} of {max_bytes / 1e6:.0f} MB"
         )
     names = []
     for entry in entries:
@@ -166,11 +166,11 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
     tell(STAGES[0])
     asked = request.asked
     try:
-        parcel = opened_parcel(folder / UPLOAD, unpacked, asked["reference"], request.most_bytes)
-        instrument, remarks = _instrument_of(parcel, request)
+        upload = open_upload(folder / UPLOAD, unpacked, asked["reference"], request.max_bytes)
+        instrument, remarks = _instrument_of(upload, request)
         report = fit_file(
             instrument,
-            parcel.reference,
+            upload.reference,
             _options(asked),
             dataset=asked["dataset"],
             threads=request.threads,
@@ -181,17 +181,17 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
         raise MatrixError(said) from error
     tell(STAGES[-1])
     report = replace(report, notes=(*report.notes, *remarks))
-    own = asked["instrument"] is None and parcel.instrument is None and not remarks
+    own = asked["instrument"] is None and upload.instrument is None and not remarks
     _write(folder / FIGURES, {"own_instrument": own, **numbers(report.fit)})
     _write(folder / DOCUMENT, document(report))
 
 
-def _instrument_of(parcel: Parcel, request: FitRequest) -> tuple[Instrument, tuple[str, ...]]:
+def _instrument_of(upload: Upload, request: FitRequest) -> tuple[Instrument, tuple[str, ...]]:
     """Return the instrument that is meant, and what whoever reads the fit should know of it."""
     if request.asked["instrument"] is not None:
         return packaged_instrument(request.asked["instrument"]), ()
-    if parcel.instrument is not None:
-        return load_instrument(parcel.instrument), ()
+    if upload.instrument is not None:
+        return load_instrument(upload.instrument), ()
     own = load_instrument(request.own_instrument)
     if instrument_sha256(own) == request.own_sha256:
         return own, ()

@@ -67,7 +67,7 @@ class FoundOptic:
     found: float | None
     """Coupling, or radius in λ/D; None: a width of influence functions without a coupling."""
 
-    told: float | None
+    reported: float | None
     """The same in the instrument file; None as above, or said to be unknown."""
 
     @property
@@ -96,14 +96,14 @@ class FoundOptic:
     @property
     def told_words(self) -> str:
         """What the file says."""
-        if self.told is None:
+        if self.reported is None:
             return "than the instrument file's" if self.found is None else "the file does not say"
-        return f"the instrument file says {self.told:.3g}"
+        return f"the instrument file says {self.reported:.3g}"
 
     @property
     def notable(self) -> bool:
         """Whether the file is wrong, as far as the matrix tells."""
-        unknown = self.found is not None and self.told is None
+        unknown = self.found is not None and self.reported is None
         return not unknown and abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
 
 
@@ -178,7 +178,7 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
                 change=change,
                 sigma=float(sure.nuisance_sigma[k]),
                 found=value if known else None,
-                told=told if known and optic not in nuisances.unknown else None,
+                reported=told if known and optic not in nuisances.unknown else None,
             )
         )
     return tuple(found)

@@ -21,7 +21,7 @@ from service.model.pupil import Illumination
 Array = NDArray[np.float64]
 
 _STEP_DEG = 0.5
-_LEAST_CORRELATION = 0.3
+_MIN_CORRELATION = 0.3
 """Below it the two maps show no common structure. Diffraction leaves narrow arms 0.4; a pupil
 without any reaches 0.2."""
 
@@ -148,10 +148,10 @@ def find_rotation(
 def _refusal(angles: Array, correlation: Array, best: int) -> str:
     """Return why the best rotation is not to be believed; empty: it is."""
     highest = float(correlation[best])
-    if highest < _LEAST_CORRELATION:
+    if highest < _MIN_CORRELATION:
         return (
             f"the light does not resemble its reference at any rotation: correlation "
-            f"{highest:.2f}, expected at least {_LEAST_CORRELATION:g}"
+            f"{highest:.2f}, expected at least {_MIN_CORRELATION:g}"
         )
     apart = np.abs((angles - angles[best] + 180.0) % 360.0 - 180.0)
     peak = np.r_[False, np.diff(np.sign(np.diff(correlation))) < 0, False]

@@ -35,10 +35,10 @@ from pyrcal.offline.uncertainty import (
     pupil_regions,
     uncertainty,
 )
-from pyrcal.offline.verdict import Evidence, judged
+from pyrcal.offline.verdict import FitFindings, judged
 from service.errors import ModelError
 from service.estimation.models import FitModels
-from service.estimation.orientation import DOUBTFUL, LEAST_CORRELATION, find_orientation, overruled
+from service.estimation.orientation import DOUBTFUL, MIN_CORRELATION, find_orientation, overruled
 from service.estimation.reference import Reference, Target, checked, target_of
 from service.estimation.solver import nuisances_of
 from service.model.instrument import Instrument
@@ -220,7 +220,7 @@ def _fitted(
     used = basis.subset(usable.columns)
     tell("orientation")
     instrument = _masked(instrument)
-    told = replace(
+    reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
     )
     slopes, rotation_rad, untold = _axes(instrument, usable, used, options, mapper)
@@ -237,7 +237,7 @@ def _fitted(
         start[2] = rotation_rad if rotation_rad is not None else start[2]
     found = _found(models, target, start, options)
     tell("verdict")
-    return _answer(models, found, usable, untold, told)
+    return _answer(models, found, usable, untold, reported)
 
 
 def _stroke_known(instrument: Instrument) -> bool:
@@ -290,7 +290,7 @@ def _axes(
         return slopes, None, ""
     search = find_orientation(replace(instrument, slopes=slopes), usable, basis, mapper=mapper)
     best = search.best
-    sure = best.correlation >= LEAST_CORRELATION
+    sure = best.correlation >= MIN_CORRELATION
     rotation_rad = best.rotation_rad if sure else None
     if stated is None:
         return best.slopes, rotation_rad, search.refusal
@@ -332,7 +332,7 @@ def _found(models: FitModels, target: Target, start: Array, options: FitOptions)
 
 
 def _answer(
-    as_in_file: FitModels, found: _Found, usable: Reference, untold: str, told: SlopeRecipe
+    as_in_file: FitModels, found: _Found, usable: Reference, untold: str, reported: SlopeRecipe
 ) -> Fit:
     settled = found.settled
     solution, target, models = settled.solution, settled.target, settled.models
@@ -360,7 +360,7 @@ def _answer(
         doubt=np.array([doubt_of_width(settled), *(rival.moved for rival in others)]),
     )
     optics = found_optics(as_in_file, settled, sure)
-    evidence = Evidence(
+    findings = FitFindings(
         solution=solution,
         residual_fraction=residual_fraction,
         structure=structured,
@@ -374,7 +374,7 @@ def _answer(
         passes=usable.passes,
         stroke_known=_stroke_known(models.instrument),
     )
-    accepted, verdict = judged(evidence)
+    accepted, verdict = judged(findings)
     return Fit(
         alpha=Misregistration.from_vector(solution.vector),
         covariance=sure.covariance,
@@ -391,9 +391,9 @@ def _answer(
         converged=solution.converged,
         verdict=verdict,
         remarks=remarks(
-            evidence,
+            findings,
             target,
-            told=told,
+            reported=reported,
             found=slopes,
             about=models.instrument,
         ),

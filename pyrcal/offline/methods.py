@@ -59,7 +59,7 @@ SAME = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
 NEARLY_AS_GOOD = 1.3
 """A minimum with less than this times the least misfit is a rival."""
 
-MOST_REPEATS = 6
+MAX_REPEATS = 6
 LINEAR = 0.01
 """A logarithm of the instrument's that differs by less is as good as linear."""
 
@@ -79,13 +79,13 @@ ROUNDS = (
 HALF_WIDTH = 2
 """Samples on either side of where a scan begins."""
 
-MOST_EXTENSIONS = 2
+MAX_EXTENSIONS = 2
 """Times that a scan moves on when its lowest sample is its last."""
 
 N_LEFT_OUT = 10
 """First modes that have no part in χ², where there are enough others."""
 
-MOST_MODES = 60
+MAX_MODES = 60
 """Modes, spread over those fitted, that are compared where a few will do."""
 
 MODULATIONS = np.arange(-4, 5) * 0.3
@@ -191,7 +191,7 @@ def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances
     solution = refine(models, seen, start, nuisances)
     settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
     models, nuisances = _with_nearest_modulation(settled)
-    for _ in range(MOST_REPEATS):
+    for _ in range(MAX_REPEATS):
         if models is settled.models:
             models, nuisances = _adjusted(settled)
         there = _known(models, target, settled.solution.vector)
@@ -243,7 +243,7 @@ def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
 
 def spread(n_modes: int) -> NDArray[np.intp]:
     """Return the columns that are compared where a few will do, spread over all."""
-    return np.unique(np.linspace(0, n_modes - 1, min(MOST_MODES, n_modes)).astype(np.intp))
+    return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
 
 
 def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
@@ -262,7 +262,7 @@ def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
 def settle_at(models: FitModels, target: Target, vector: Array, nuisances: Nuisances) -> Settled:
     """Return the model as it stands at a registration that another method has found."""
     seen = _known(models, target, vector)
-    there = refine(models, seen, vector, nuisances, most_steps=0)
+    there = refine(models, seen, vector, nuisances, max_steps=0)
     solution = replace(there, converged=within_limits(vector))
     return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
 
@@ -271,7 +271,7 @@ def project_on_sensitivities(
     models: FitModels, target: Target, start: Array, nuisances: Nuisances
 ) -> Settled:
     """Return where the sensitivities lead from a start, without any search for a better one."""
-    for _ in range(MOST_REPEATS):
+    for _ in range(MAX_REPEATS):
         settled = settle(models, target, start, nuisances)
         vector = settled.solution.vector
         if not settled.solution.converged or np.all(np.abs(vector - start) < REACH * SETTLED):
@@ -297,7 +297,7 @@ def scan(models: FitModels, target: Target, start: Array) -> tuple[Array, tuple[
 
     for steps in ROUNDS:
         for index in ORDER:
-            for _ in range(1 + MOST_EXTENSIONS):
+            for _ in range(1 + MAX_EXTENSIONS):
                 step = _scanned(chi, values, index, float(steps[index]))
                 table.append(step)
                 values[index] = step.minimum

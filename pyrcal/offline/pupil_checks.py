@@ -34,7 +34,7 @@ class PupilNumber:
     key: str
     """In the file."""
 
-    told: float
+    reported: float
     """What the file says."""
 
     power: int
@@ -58,7 +58,7 @@ class PupilNumber:
 
     def found(self, few: Few) -> tuple[float, Array]:
         """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
-        light, matrix = self.told**self.power, few.matrix(few.models)
+        light, matrix = self.reported**self.power, few.matrix(few.models)
         low, high = (limit**self.power for limit in self.range)
         for _ in range(_STEPS):
             there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
@@ -73,7 +73,7 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
     return (
         PupilNumber(
             key="obscuration_ratio",
-            told=hole,
+            reported=hole,
             power=2,
             step=0.01,
             range=(0.0, max(0.6, hole)),
@@ -81,7 +81,7 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
         ),
         PupilNumber(
             key="pupil_diameter_subap",
-            told=size,
+            reported=size,
             power=1,
             step=0.01 * size,
             range=(0.94 * size, 1.06 * size),
@@ -136,7 +136,7 @@ def other_pupils(few: Few) -> Iterator[tuple[Other, float, Array]]:
         value, matrix = number.found(few)
         share = few.left(matrix) / few.left(own)
         explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
-        notable = abs(value - number.told) >= number.notable and explained >= LEAST_EXPLAINED
+        notable = abs(value - number.reported) >= number.notable and explained >= LEAST_EXPLAINED
         if notable and share < BETTER:
             other = Other(words=f"{number.key} = {value:.3g}", believed=FAR_BETTER)
             yield other, share, few.step(matrix)[:4] - few.step(own)[:4]

@@ -55,25 +55,25 @@ def main(options: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--max-condition: found {options.max_condition:g}, expected at least 1"
         )
-    known = _known(options)
+    fit = _fit_of(options)
     described = load_instrument(options.instrument)
     found = instrument_sha256(described)
-    if known.instrument_sha256 not in {None, found}:
-        say(f"note: {options.instrument} has changed since {known.origin} was fitted with it")
-    instrument = _modulated(_oriented(described, known), known)
+    if fit.instrument_sha256 not in {None, found}:
+        say(f"note: {options.instrument} has changed since {fit.origin} was fitted with it")
+    instrument = _modulated(_oriented(described, fit), fit)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(
             instrument,
-            _basis(instrument, known),
+            _basis(instrument, fit),
             pupil_sampling=SAMPLING,
             detector_nodes=SAMPLING,
             illumination=None if light is None else light.illumination,
             mapper=pool.map,
         )
         show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
-        matrix = model.interaction_matrix(known.alpha)
-    provenance, inverted = _inverted(options, known, model, matrix)
+        matrix = model.interaction_matrix(fit.alpha)
+    provenance, inverted = _inverted(options, fit, model, matrix)
     inversion, slopes = provenance.inversion, instrument.slopes
     fill = partial(
         fill_reconstructor,
@@ -82,8 +82,8 @@ def main(options: argparse.Namespace) -> int:
         circumstances={
             "instrument": instrument.name,
             "instrument_sha256": found,
-            "alpha_from": known.origin,
-            **{f"found_{key}": value for key, value in known.instrument_found.items()},
+            "alpha_from": fit.origin,
+            **{f"found_{key}": value for key, value in fit.instrument_found.items()},
             "model_pupil_sampling": SAMPLING,
             "model_detector_nodes": SAMPLING,
             "slopes": json.dumps(orientation_words(slopes.assumed_orientation, slopes.order)),
@@ -98,7 +98,7 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def _known(options: argparse.Namespace) -> KnownFit:
+def _fit_of(options: argparse.Namespace) -> KnownFit:
     """Return the registration, from the words or from the file.
 
     Raises
@@ -108,35 +108,35 @@ def _known(options: argparse.Namespace) -> KnownFit:
     """
     path = Path(options.alpha)
     if path.is_file():
-        known = read_fit(path)
-        if not known.accepted:
+        fit = read_fit(path)
+        if not fit.accepted:
             raise MatrixError(
                 f"{path}: found a fit that was refused, expected an accepted one; whoever knows "
                 "better gives the registration itself: X,Y,ROT,MAG"
             )
     else:
-        known = KnownFit(alpha=parse_alpha(options.alpha))
+        fit = KnownFit(alpha=parse_alpha(options.alpha))
     if options.reference is not None:
         found = file_sha256(options.reference)
-        if known.reference_sha256 not in {None, found}:
+        if fit.reference_sha256 not in {None, found}:
             raise MatrixError(
-                f"{options.reference}: found checksum {found}, expected {known.reference_sha256} "
+                f"{options.reference}: found checksum {found}, expected {fit.reference_sha256} "
                 f"of the reference that {path} was fitted to"
             )
-        known = replace(known, reference_sha256=found)
-    return known
+        fit = replace(fit, reference_sha256=found)
+    return fit
 
 
-def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
+def _oriented(instrument: Instrument, fit: KnownFit) -> Instrument:
     """Return the instrument with the slopes as the fit found them."""
     recipe = instrument.slopes
-    if known.orientation is not None and known.order is not None:
-        if known.order.kind is not recipe.kind:
+    if fit.orientation is not None and fit.order is not None:
+        if fit.order.kind is not recipe.kind:
             raise MatrixError(
-                f'{known.origin}: found a fit of slopes.kind = "{known.order.kind}"; expected '
+                f'{fit.origin}: found a fit of slopes.kind = "{fit.order.kind}"; expected '
                 f'"{recipe.kind}", as the instrument file says'
             )
-        recipe = replace(recipe, orientation=known.orientation, order=known.order)
+        recipe = replace(recipe, orientation=fit.orientation, order=fit.order)
     elif recipe.orientation is None:
         say(
             'note: slopes.orientation is "auto" and no fit has found it: the reconstructor is for '
@@ -145,19 +145,19 @@ def _oriented(instrument: Instrument, known: KnownFit) -> Instrument:
     return replace(instrument, slopes=recipe)
 
 
-def _modulated(instrument: Instrument, known: KnownFit) -> Instrument:
+def _modulated(instrument: Instrument, fit: KnownFit) -> Instrument:
     """Return the instrument with the modulation that the fit found; say what is as it found it."""
-    for key, value in known.instrument_found.items():
-        say(f"note: made with {key} = {value:.3g}, as {known.origin} found; correct the instrument")
-    radius = known.instrument_found.get(MODULATION_KEY)
+    for key, value in fit.instrument_found.items():
+        say(f"note: made with {key} = {value:.3g}, as {fit.origin} found; correct the instrument")
+    radius = fit.instrument_found.get(MODULATION_KEY)
     if radius is None:
         return instrument
     return replace(instrument, wfs=replace(instrument.wfs, modulation_lambda_over_d=radius))
 
 
-def _basis(instrument: Instrument, known: KnownFit) -> Basis:
+def _basis(instrument: Instrument, fit: KnownFit) -> Basis:
     """Return the modes of the instrument, its actuators coupled as the fit found."""
-    basis, coupling = modal_basis(instrument), known.instrument_found.get(COUPLING_KEY)
+    basis, coupling = modal_basis(instrument), fit.instrument_found.get(COUPLING_KEY)
     if coupling is None or not isinstance(basis, ModalBasis):
         return basis
     if not isinstance(basis.surface, Gaussian):
@@ -166,18 +166,18 @@ def _basis(instrument: Instrument, known: KnownFit) -> Basis:
 
 
 def _inverted(
-    options: argparse.Namespace, known: KnownFit, model: RtcInteractionModel, matrix: NDArray[Any]
+    options: argparse.Namespace, fit: KnownFit, model: RtcInteractionModel, matrix: NDArray[Any]
 ) -> tuple[Provenance, NDArray[Any]]:
     """Return the reconstructor with how it was made, and the matrix that it inverts."""
     gains = None
-    if known.gains is not None and known.modes is not None and not options.no_gains:
-        gains = CalibrationGains.of_modes(known.gains, known.modes, model.basis.n_modes)
+    if fit.gains is not None and fit.modes is not None and not options.no_gains:
+        gains = CalibrationGains.of_modes(fit.gains, fit.modes, model.basis.n_modes)
         matrix = gains.tuned(matrix)
     recipe = _recipe(options, model)
     provenance = Provenance(
         recipe=recipe,
         inversion=reconstruct(matrix, recipe),
-        fit=known,
+        fit=fit,
         gains=gains,
         measured_illumination=options.flux_map is not None,
     )

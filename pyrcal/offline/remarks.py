@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.verdict import MOST_STRUCTURE, Evidence, factor_of_passes
+from pyrcal.offline.verdict import MOST_STRUCTURE, FitFindings, factor_of_passes
 from service.estimation.reference import Target
 from service.estimation.solver import Solution
 from service.model.instrument import Instrument
@@ -42,10 +42,10 @@ EXPLAINED = 0.1
 
 
 def remarks(
-    evidence: Evidence,
+    findings: FitFindings,
     target: Target,
     *,
-    told: SlopeRecipe,
+    reported: SlopeRecipe,
     found: SlopeRecipe,
     about: Instrument,
 ) -> tuple[str, ...]:
@@ -61,30 +61,31 @@ def remarks(
         The instrument of the file.
     """
     return (
-        *_order(told.order, found.order),
-        *_mirrored(told, found),
-        *_optics(evidence),
-        *_light(evidence),
-        *_size(evidence),
-        *_passes(evidence),
-        *_scale(evidence, about),
-        *_columns(evidence.solution, target),
+        *_order(reported.order, found.order),
+        *_mirrored(reported, found),
+        *_optics(findings),
+        *_light(findings),
+        *_size(findings),
+        *_passes(findings),
+        *_scale(findings, about),
+        *_columns(findings.solution, target),
     )
 
 
-def _order(told: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
-    if told is not found:
+def _order(reported: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
+    if reported is not found:
         yield (
-            f'the instrument file says order = "{told}", the matrix lists its slopes "{found}": '
+            f'the instrument file says order = "{reported}", the matrix lists its slopes '
+            f'"{found}": '
             f'taken as found; write order = "{found}" into [slopes]'
         )
 
 
-def _mirrored(told: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
+def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
     """Yield that the sensor sees the mirror's drawing as in a looking-glass."""
     axes = found.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
-    if told.orientation is None and len(flags) % 2:
+    if reported.orientation is None and len(flags) % 2:
         yield (
             f"the slopes' grid is mirrored against the actuators' drawing ({', '.join(flags)}): "
             "the detector is read from another corner, or the coordinates of the actuators are "
@@ -93,39 +94,39 @@ def _mirrored(told: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
         )
 
 
-def _optics(evidence: Evidence) -> Iterator[str]:
+def _optics(findings: FitFindings) -> Iterator[str]:
     """Yield what of the instrument is another than told, or was found because it was unknown."""
-    for optic in evidence.optics:
-        if optic.found is not None and optic.told is None:
+    for optic in findings.optics:
+        if optic.found is not None and optic.reported is None:
             yield (
                 f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}: write it "
                 "into the instrument file"
             )
-    wrong = [optic for optic in evidence.optics if optic.notable]
-    if not wrong or evidence.as_told is None:
+    wrong = [optic for optic in findings.optics if optic.notable]
+    if not wrong or findings.as_told is None:
         return
     found = " and ".join(f"{optic.found_words} ({optic.told_words})" for optic in wrong)
-    moved = evidence.as_told.moved * BOUNDARY_SCALE
+    moved = findings.as_told.moved * BOUNDARY_SCALE
     yield (
-        f"with {found} the misfit is {evidence.as_told.share:.0%} of what it would be: the "
+        f"with {found} the misfit is {findings.as_told.share:.0%} of what it would be: the "
         f"registration allows for it, which moved it by {moved[0]:.2g}, {moved[1]:.2g} "
         f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; correct the instrument file"
     )
 
 
-def _light(evidence: Evidence) -> Iterator[str]:
+def _light(findings: FitFindings) -> Iterator[str]:
     """Yield that uneven light explains what is left over."""
-    if evidence.structure > MOST_STRUCTURE >= evidence.after_light:
+    if findings.structure > MOST_STRUCTURE >= findings.after_light:
         yield (
-            f"{evidence.structure:.0%} of the signal is left over and no noise; a smooth gain over "
+            f"{findings.structure:.0%} of the signal is left over and no noise; a smooth gain over "
             "the pupil explains it: uneven light, which sigma allows for; give the light "
             "(--flux-map), or have the gain fitted (--gain-map)"
         )
 
 
-def _size(evidence: Evidence) -> Iterator[str]:
+def _size(findings: FitFindings) -> Iterator[str]:
     """Yield that the mirror is drawn in another size than the pupil."""
-    magnification = float(evidence.solution.vector[3])
+    magnification = float(findings.solution.vector[3])
     if abs(magnification - 1.0) > STRAIGHT:
         yield (
             f"magnification {magnification:.3f}: a matrix tells only how large the mirror is on "
@@ -134,9 +135,9 @@ def _size(evidence: Evidence) -> Iterator[str]:
         )
 
 
-def _scale(evidence: Evidence, about: Instrument) -> Iterator[str]:
+def _scale(findings: FitFindings, about: Instrument) -> Iterator[str]:
     """Yield that all gains are off together: the wavelength, or the unit."""
-    gains = evidence.solution.projection.gains
+    gains = findings.solution.projection.gains
     middle = float(np.median(gains))
     wavelength_m = about.wfs.wavelength_m / middle
     if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
@@ -145,8 +146,8 @@ def _scale(evidence: Evidence, about: Instrument) -> Iterator[str]:
             f"flat wavefront: gains of the modes scatter by {float(np.std(gains)) / middle:.1%}"
         )
     together = float(np.std(gains)) < UNIFORM * abs(middle) and abs(middle - 1.0) > OFF_TOGETHER
-    explained = evidence.residual_fraction < EXPLAINED
-    if evidence.stroke_known and explained and together and factor_of_passes(evidence) is None:
+    explained = findings.residual_fraction < EXPLAINED
+    if findings.stroke_known and explained and together and factor_of_passes(findings) is None:
         yield (
             f"the gain of every mode is {middle:.3g}: a wavelength of {wavelength_m:.3g} "
             "m instead of the file's would do that, or another unit of strokes; the registration "
@@ -154,17 +155,17 @@ def _scale(evidence: Evidence, about: Instrument) -> Iterator[str]:
         )
 
 
-def _passes(evidence: Evidence) -> Iterator[str]:
-    factor = factor_of_passes(evidence)
+def _passes(findings: FitFindings) -> Iterator[str]:
+    factor = factor_of_passes(findings)
     if factor is None:
         return
-    passes = f"double_pass = {str(evidence.passes == 2).lower()}"
+    passes = f"double_pass = {str(findings.passes == 2).lower()}"
     cause = {
         (1, 2.0): "double_pass = true if the light meets the mirror twice",
         (2, 2.0): 'per metre of surface? Then divide it by two, or write modes_kind = "surface"',
         (2, 0.5): "double_pass = false if the light meets the mirror once",
-    }[evidence.passes, factor]
-    middle = float(np.median(evidence.solution.projection.gains))
+    }[findings.passes, factor]
+    middle = float(np.median(findings.solution.projection.gains))
     yield (
         f"the gains' median is {middle:.2f} with {passes}: "
         f"{'twice' if factor > 1.0 else 'half'} what was expected; {cause}"

@@ -68,14 +68,14 @@ def document(report: FitReport) -> dict[str, Any]:
     fit = report.fit
     return {
         **fit.alpha.to_boundary(),
-        "sigma": _four(fit.sigma),
+        "sigma": _parameters(fit.sigma),
         "covariance": _plain(fit.covariance * COVARIANCE_SCALE),
         "gains": _plain(fit.gains),
         "residual_fraction": _plain(fit.residual_fraction),
         "condition_number": _plain(fit.condition_number),
         "n_modes_used": len(fit.modes),
         "orientation": orientation_words(fit.orientation, fit.order),
-        "subset_scatter": _four(fit.subset_scatter),
+        "subset_scatter": _parameters(fit.subset_scatter),
         "converged": bool(fit.converged),
         "verdict": verdict_line(fit),
         "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
@@ -83,7 +83,7 @@ def document(report: FitReport) -> dict[str, Any]:
             one.key if one.found is not None else "influence_width": {
                 "found": _plain(one.found if one.found is not None else np.exp(one.change)),
                 "sigma": _plain(one.found_sigma),
-                "told": one.told,
+                "told": one.reported,
             }
             for one in fit.optics
         },
@@ -106,7 +106,7 @@ def orientation_words(orientation: Orientation, order: SlopeOrder) -> dict[str, 
     return {"order": str(order), **flips, "sign": both[0] if both[0] == both[1] else both}
 
 
-def _four(values: NDArray[np.float64]) -> dict[str, float | None]:
+def _parameters(values: NDArray[np.float64]) -> dict[str, float | None]:
     return dict(zip(PARAMETERS, _plain(values * BOUNDARY_SCALE), strict=True))
 
 
@@ -181,7 +181,7 @@ def _basis(report: FitReport) -> Iterator[str]:
 def _extras(fit: Fit) -> Iterator[str]:
     for one in fit.optics:
         if one.found is not None:
-            told = "unknown" if one.told is None else f"{one.told:g}"
+            told = "unknown" if one.reported is None else f"{one.reported:g}"
             words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
             yield f"{one.key[:19]:20s}{words} (the instrument file says {told})"
     if fit.anamorphosis is not None:
@@ -414,9 +414,9 @@ def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
 
 
 def _of_product(file: h5py.File, path: Path) -> KnownFit:
-    known = _of_document(json.loads(file.attrs["document"]), path)
+    fit = _of_document(json.loads(file.attrs["document"]), path)
     return replace(
-        known,
+        fit,
         modes=np.asarray(file["modes"][()], dtype=np.intp),
         gains=np.asarray(file["gains"][()], dtype=np.float64),
         double_pass=bool(file.attrs["double_pass"]),

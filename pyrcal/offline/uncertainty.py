@@ -55,8 +55,8 @@ OTHER_SHARE = 0.5
 """How likely an instrument is that explains a matrix as well as the file's."""
 
 N_SECTORS, N_RINGS = 12, 3
-MOST_SETS = 8
-LEAST_PER_SET = 3
+MAX_SETS = 8
+MIN_PER_SET = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,7 +126,7 @@ def uncertainty(
         RMS of what is left over RMS of the measurement: so far the mirror may be another.
     """
     n_modes = len(projection.gains)
-    n_sets = min(MOST_SETS, n_modes // LEAST_PER_SET)
+    n_sets = min(MAX_SETS, n_modes // MIN_PER_SET)
     normals = projection.normals
     noise = projection.chi / max(projection.residual.size - len(prior) - n_modes, 1)
     held = np.diag(prior * noise)

@@ -22,7 +22,7 @@ from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 
 Array = NDArray[np.float64]
 
-MOST_RESIDUAL = 0.55
+MAX_RESIDUAL = 0.55
 """RMS share of the signal left over, by which even strongly uneven light is exceeded."""
 
 MOST_STRUCTURE = 0.09
@@ -30,10 +30,10 @@ MOST_STRUCTURE = 0.09
 file is right it was at most 0.02 on matrices of other codes, 0.05 under noise of 30 % and on the
 diffractive telescopes; told an obscuration of 0.14 instead of 0.25 it was 0.13 to 0.16."""
 
-MOST_TENSION = 5.0
+MAX_TENSION = 5.0
 """Distance of a set of modes from the others, in its own σ."""
 
-MOST_SCATTER = 0.35
+MAX_SCATTER = 0.35
 """Robust relative scatter of the gains; modes of another basis scatter by more than this."""
 
 LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
@@ -47,7 +47,7 @@ _PASSES = 0.12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Evidence:
+class FitFindings:
     """All that a verdict rests on."""
 
     solution: Solution
@@ -80,36 +80,36 @@ class Evidence:
     stroke_known: bool
 
 
-def judged(evidence: Evidence) -> tuple[bool, str]:
+def judged(findings: FitFindings) -> tuple[bool, str]:
     """Return whether the registration is accepted, and the verdict in one line."""
     for refusal in (
-        evidence.axes,
-        _unsettled(evidence),
-        _undetermined(evidence),
-        _unexplained(evidence),
-        _another_minimum(evidence),
-        _another_instrument(evidence),
-        _another_basis(evidence),
-        _another_unit(evidence),
-        _divided(evidence),
-        _without_a_cause(evidence),
+        findings.axes,
+        _unsettled(findings),
+        _undetermined(findings),
+        _unexplained(findings),
+        _another_minimum(findings),
+        _another_instrument(findings),
+        _another_basis(findings),
+        _another_unit(findings),
+        _divided(findings),
+        _without_a_cause(findings),
     ):
         if refusal:
             return False, f"refused: {refusal}"
-    return True, f"accepted: {_quality(evidence)}"
+    return True, f"accepted: {_quality(findings)}"
 
 
-def _quality(evidence: Evidence) -> str:
-    shares = f"residual {evidence.residual_fraction:.1%} of the signal"
-    if len(evidence.uncertainty.subset_steps) < 2:
+def _quality(findings: FitFindings) -> str:
+    shares = f"residual {findings.residual_fraction:.1%} of the signal"
+    if len(findings.uncertainty.subset_steps) < 2:
         return f"{shares}; too few modes to split into sets that check each other"
-    tension = evidence.uncertainty.subset_tension
-    n_sets = len(evidence.uncertainty.subset_steps)
+    tension = findings.uncertainty.subset_tension
+    n_sets = len(findings.uncertainty.subset_steps)
     return f"{n_sets} sets of modes agree within {tension:.1f} sigma, {shares}"
 
 
-def _unsettled(evidence: Evidence) -> str:
-    if evidence.solution.converged:
+def _unsettled(findings: FitFindings) -> str:
+    if findings.solution.converged:
         return ""
     return (
         "the steps did not come to rest: the start is outside the capture range, or the instrument "
@@ -117,8 +117,8 @@ def _unsettled(evidence: Evidence) -> str:
     )
 
 
-def _undetermined(evidence: Evidence) -> str:
-    sigma = np.sqrt(np.diag(evidence.uncertainty.covariance))
+def _undetermined(findings: FitFindings) -> str:
+    sigma = np.sqrt(np.diag(findings.uncertainty.covariance))
     if np.all(sigma < LARGEST_SIGMA):
         return ""
     shown = sigma * BOUNDARY_SCALE
@@ -128,20 +128,20 @@ def _undetermined(evidence: Evidence) -> str:
     )
 
 
-def _unexplained(evidence: Evidence) -> str:
-    if evidence.residual_fraction <= MOST_RESIDUAL:
+def _unexplained(findings: FitFindings) -> str:
+    if findings.residual_fraction <= MAX_RESIDUAL:
         return ""
     return (
-        f"the model leaves {evidence.residual_fraction:.0%} of the signal unexplained, expected at "
-        f"most {MOST_RESIDUAL:.0%}: too much noise, a false minimum (start closer), or another "
+        f"the model leaves {findings.residual_fraction:.0%} of the signal unexplained, expected at "
+        f"most {MAX_RESIDUAL:.0%}: too much noise, a false minimum (start closer), or another "
         "basis or instrument than the file's"
     )
 
 
-def _another_minimum(evidence: Evidence) -> str:
-    if evidence.landing is None or not evidence.landing.rivals:
+def _another_minimum(findings: FitFindings) -> str:
+    if findings.landing is None or not findings.landing.rivals:
         return ""
-    rival = Misregistration.from_vector(evidence.landing.rivals[0].vector).to_boundary()
+    rival = Misregistration.from_vector(findings.landing.rivals[0].vector).to_boundary()
     return (
         f"another minimum is nearly as good: shift {rival['shift_x_subap']:.2f}, "
         f"{rival['shift_y_subap']:.2f} subaperture, {rival['rotation_deg']:.1f} deg, "
@@ -149,15 +149,15 @@ def _another_minimum(evidence: Evidence) -> str:
     )
 
 
-def _another_instrument(evidence: Evidence) -> str:
-    for rival in evidence.rivals:
+def _another_instrument(findings: FitFindings) -> str:
+    for rival in findings.rivals:
         if rival.believed:
             return (
                 f"another instrument explains the matrix better: with {rival.change.words} the "
                 f"misfit is {rival.share:.0%} of what it is now; correct the instrument file"
             )
-    for optic in evidence.optics:
-        usual = OPTIC_SIGMA[optic.optic] if optic.told is not None else UNKNOWN_SIGMA
+    for optic in findings.optics:
+        usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
         if abs(optic.change) > STRANGEST * usual:
             return (
                 f"only {optic.found_words} would explain the matrix, {optic.told_words}: the "
@@ -166,12 +166,12 @@ def _another_instrument(evidence: Evidence) -> str:
     return ""
 
 
-def _another_basis(evidence: Evidence) -> str:
-    gains = evidence.solution.projection.gains
+def _another_basis(findings: FitFindings) -> str:
+    gains = findings.solution.projection.gains
     middle = float(np.median(gains))
     scatter = float(np.median(np.abs(gains - middle)) / abs(middle)) * 1.4826
     negative = int(np.sum(gains <= 0.0))
-    if negative == 0 and (scatter <= MOST_SCATTER or not evidence.stroke_known):
+    if negative == 0 and (scatter <= MAX_SCATTER or not findings.stroke_known):
         return ""
     if negative:
         return (
@@ -184,61 +184,61 @@ def _another_basis(evidence: Evidence) -> str:
     )
 
 
-def _another_unit(evidence: Evidence) -> str:
-    if not evidence.stroke_known:
+def _another_unit(findings: FitFindings) -> str:
+    if not findings.stroke_known:
         return ""
-    gains = evidence.solution.projection.gains
+    gains = findings.solution.projection.gains
     middle = float(np.median(gains))
     if not 1e-3 < middle < 1e3:
         return (
             f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"
         )
-    factor = factor_of_passes(evidence)
+    factor = factor_of_passes(findings)
     if factor is None or float(np.std(gains) / middle) >= _PASSES:
         return ""
     words = "twice" if factor > 1.0 else "half"
     cause = (
         "the matrix is per metre of the mirror's surface, which is half the OPD: divide it by two, "
         'or write modes_kind = "surface" where the modes were measured'
-        if (evidence.passes, factor) == (2, 2.0)
+        if (findings.passes, factor) == (2, 2.0)
         else f"the light met the mirror {'twice' if factor > 1.0 else 'once'}; set double_pass = "
         f"{'true' if factor > 1.0 else 'false'}, or correct the unit (surface for OPD)"
     )
     return f"the measured slopes are {words} the model's in every mode ({middle:.2f}): {cause}"
 
 
-def factor_of_passes(evidence: Evidence) -> float | None:
+def factor_of_passes(findings: FitFindings) -> float | None:
     """Return 2 or 0.5 where gains, uniform or not, look like a forgotten factor; else None.
 
     Half the slopes after one pass are what the sky leaves of them.
     """
-    middle = float(np.median(evidence.solution.projection.gains))
-    if not evidence.stroke_known:
+    middle = float(np.median(findings.solution.projection.gains))
+    if not findings.stroke_known:
         return None
-    for factor in (2.0,) if evidence.passes == 1 else (2.0, 0.5):
+    for factor in (2.0,) if findings.passes == 1 else (2.0, 0.5):
         if abs(middle / factor - 1.0) < _PASSES:
             return factor
     return None
 
 
-def _without_a_cause(evidence: Evidence) -> str:
-    if min(evidence.structure, evidence.after_light) <= MOST_STRUCTURE:
+def _without_a_cause(findings: FitFindings) -> str:
+    if min(findings.structure, findings.after_light) <= MOST_STRUCTURE:
         return ""
-    nearest = f"with {evidence.rivals[0].change.words} {evidence.rivals[0].share:.0%} of the misfit"
+    nearest = f"with {findings.rivals[0].change.words} {findings.rivals[0].share:.0%} of the misfit"
     return (
-        f"the model leaves {evidence.structure:.0%} of the signal that is no noise, expected at "
+        f"the model leaves {findings.structure:.0%} of the signal that is no noise, expected at "
         f"most {MOST_STRUCTURE:.0%}, and nothing tried explains it ({nearest} is left): check the "
         "mask of valid subapertures, what shades the pupil, the light on it (--flux-map, "
         "--gain-map), and that columns and modes are the same"
     )
 
 
-def _divided(evidence: Evidence) -> str:
-    tension = evidence.uncertainty.subset_tension
-    if tension <= MOST_TENSION:
+def _divided(findings: FitFindings) -> str:
+    tension = findings.uncertainty.subset_tension
+    if tension <= MAX_TENSION:
         return ""
-    scatter = evidence.uncertainty.subset_scatter * BOUNDARY_SCALE
+    scatter = findings.uncertainty.subset_scatter * BOUNDARY_SCALE
     return (
         f"sets of modes disagree by {tension:.1f} sigma (scatter {scatter[0]:.2g} and "
         f"{scatter[1]:.2g} subaperture, {scatter[2]:.2g} deg, {scatter[3]:.2g}): the stop, the "

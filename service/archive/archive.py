@@ -177,7 +177,7 @@ class Archive:
             If the disk refuses.
         """
         for record in records:
-            self.reconstructors.write_fate(record)
+            self.reconstructors.write_state(record)
         self.index.record(records, entries, estimates, samples)
 
     def measurements(self) -> tuple[MeasurementRecord, ...]:

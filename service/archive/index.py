@@ -85,7 +85,7 @@ class AuditEntry:
     address: str = ""
     """Of the client that gave the order."""
 
-    whence: str = ""
+    channel: str = ""
     """"page", "rest" or "cli"; empty: no order."""
 
     why: str = ""
@@ -342,7 +342,10 @@ def begun_ns_utc(record: Product) -> int:
 
 
 _N_COLUMNS = len(fields(AuditEntry)) - 1
-_COLUMNS = ", ".join(field.name for field in fields(AuditEntry)[:_N_COLUMNS])
+_COLUMNS = ", ".join(
+    {"channel": "whence"}.get(field.name, field.name) for field in fields(AuditEntry)[:_N_COLUMNS]
+)
+"""Of the file; it is older than some of our words."""
 
 
 def _widened(connection: sqlite3.Connection) -> str:

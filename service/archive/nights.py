@@ -44,7 +44,7 @@ DAY_NS = 24 * HOUR_NS
 FOREVER_NS = (1 << 63) - 1
 """After all that can be recorded: SQLite's largest integer."""
 
-MOST_THINNED = 300_000
+MAX_DOWNSAMPLED = 300_000
 """Estimates that are looked through at once: a week of telemetry."""
 
 
@@ -151,7 +151,7 @@ class Nights:
         )
         return int(n_there)
 
-    def thinned(self, first_ns: int, last_ns: int, n_points: int) -> tuple[HistoryEntry, ...]:
+    def downsampled(self, first_ns: int, last_ns: int, n_points: int) -> tuple[HistoryEntry, ...]:
         """Return at most so many estimates of a time, oldest first.
 
         They are the lowest and the highest of each parameter in equal parts of the time.
@@ -159,16 +159,16 @@ class Nights:
         Raises
         ------
         TooLargeError
-            If there are more than ``MOST_THINNED``.
+            If there are more than ``MAX_DOWNSAMPLED``.
         """
         within = "WHERE t_ns_utc BETWEEN :first AND :last"
         times = {"first": first_ns, "last": last_ns}
         ((begin_ns, end_ns, n_there),) = self._asked(
             f"SELECT min(t_ns_utc), max(t_ns_utc), count(*) FROM estimate {within}", times
         )
-        if n_there > MOST_THINNED:
+        if n_there > MAX_DOWNSAMPLED:
             raise TooLargeError(
-                f"found {n_there} estimates in this time, expected at most {MOST_THINNED}: "
+                f"found {n_there} estimates in this time, expected at most {MAX_DOWNSAMPLED}: "
                 "ask for less of it"
             )
         if n_there <= n_points:
@@ -253,16 +253,16 @@ def rows_of(entries: Iterable[HistoryEntry]) -> list[tuple[object, ...]]:
             entry.in_use,
             entry.innovation,
             entry.misfit,
-            *_shown(entry.measured.vector),
-            *_shown(entry.measured_sigma),
-            *_shown(entry.filtered.vector),
-            *_shown(entry.filtered_sigma),
+            *_with_names(entry.measured.vector),
+            *_with_names(entry.measured_sigma),
+            *_with_names(entry.filtered.vector),
+            *_with_names(entry.filtered_sigma),
         )
         for entry in entries
     ]
 
 
-def _shown(four: NDArray[np.float64]) -> list[float]:
+def _with_names(four: NDArray[np.float64]) -> list[float]:
     found: list[float] = (four * BOUNDARY_SCALE).tolist()
     return found
 

@@ -104,7 +104,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         """
         return tuple(self._judged(record) for record in super().records())
 
-    def write_fate(self, record: ReconstructorRecord) -> None:
+    def write_state(self, record: ReconstructorRecord) -> None:
         """Write beside a product that is stored here what has become of it.
 
         Raises

@@ -117,7 +117,10 @@ def _as_now(values: dict[str, Any]) -> dict[str, Any]:
 
 VERSION = 1
 
-_NOT_KEPT = ("grown", "standing", "candidate", "earlier", "restored_ns_utc")
+_RENAMED = {"move": "offload", "most_modes": "max_modes"}
+"""Keys that services before this one have written, and what they are called now."""
+
+_NOT_KEPT = ("grown", "validity", "suspected_jump", "previous_estimate", "restored_ns_utc")
 """Of the registration and its bias: what the next service works out anew."""
 
 _ACQUISITION_KEPT = (
@@ -129,7 +132,7 @@ _ACQUISITION_KEPT = (
     "attempt",
     "found",
     "n_modes",
-    "most_modes",
+    "max_modes",
     "matrix",
     "sent",
     "held_off",
@@ -178,7 +181,8 @@ class TrackingFile:
         if not self._path.exists():
             return None
         try:
-            return _saved_of(json.loads(self._path.read_text(encoding="utf-8")))
+            text = self._path.read_text(encoding="utf-8")
+            return _saved_of(json.loads(text, object_hook=_with_new_names))
         except (OSError, AttributeError, *NOT_UNDERSTOOD) as error:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
@@ -201,6 +205,10 @@ def _kept(saved: Saved) -> dict[str, Any]:
     return {"version": VERSION, **values}
 
 
+def _with_new_names(values: dict[str, Any]) -> dict[str, Any]:
+    return {_RENAMED.get(name, name): value for name, value in values.items()}
+
+
 def _saved_of(values: dict[str, Any]) -> Saved:
     if values.pop("version") != VERSION:
         raise ValueError(f"expected version {VERSION}")
@@ -211,7 +219,7 @@ def _saved_of(values: dict[str, Any]) -> Saved:
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
     refuse_unknown(values, saved)
-    parts = (saved.registration, saved.acquisition, saved.orders, saved.move)
+    parts = (saved.registration, saved.acquisition, saved.orders, saved.offload)
     if all(part is None for part in parts):
         raise ValueError("neither an α nor an acquisition nor an order")
     if saved.registration is not None:
@@ -219,8 +227,8 @@ def _saved_of(values: dict[str, Any]) -> Saved:
     found = None if saved.acquisition is None else saved.acquisition.found
     if found is not None and not np.isfinite(found.gains).all():
         raise ValueError("a gain is not finite")
-    if saved.move is not None:
-        _check_shapes([(saved.move.step, (4,)), (saved.move.total, (4,))])
+    if saved.offload is not None:
+        _check_shapes([(saved.offload.step, (4,)), (saved.offload.total, (4,))])
     orders = saved.orders
     if orders is not None and (orders.mode is None) is not (orders.settings_mode is None):
         raise ValueError(f"mode is {orders.mode!r} and of the settings {orders.settings_mode!r}")
@@ -233,16 +241,20 @@ def _check_shapes(arrays: list[tuple[NDArray[Any], tuple[int, ...]]]) -> None:
             raise ValueError(f"found numbers of shape {values.shape}, expected {shape} finite ones")
 
 
-def _check(known: Registration) -> None:
+def _check(registration: Registration) -> None:
     """Refuse what no service has written: α and its bias must be a joint normal distribution."""
-    arrays = [(known.covariance, (4, 4)), (known.floor, (4,)), (np.array(known.scatter), ())]
-    bias = known.bias
+    arrays = [
+        (registration.covariance, (4, 4)),
+        (registration.floor, (4,)),
+        (np.array(registration.scatter), ()),
+    ]
+    bias = registration.bias
     if bias is not None:
         arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4))]
         arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
         arrays += [(np.array(bias.scatter), ())]
     _check_shapes(arrays)
-    covariance = known.covariance
+    covariance = registration.covariance
     if bias is not None:
         covariance = np.block([[covariance, bias.shared.T], [bias.shared, bias.covariance]])
     power = np.linalg.eigvalsh(covariance)

@@ -25,7 +25,7 @@ _IN_USE = "the RTC has it, and goes on; it could not be sent again to one that r
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Keeping:
+class RetentionPolicy:
     """What the user has decided to keep; 0 stands for no limit."""
 
     keep_days: float = 0.0
@@ -36,7 +36,7 @@ class Keeping:
     """Free space below which somebody is told."""
 
 
-EVERYTHING = Keeping()
+EVERYTHING = RetentionPolicy()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +121,9 @@ def _item(store: Folder, product_id: str, records: Mapping[str, Any]) -> Item:
     )
 
 
-def due(every: Collection[Item], keeping: Keeping, now_ns: int) -> Iterator[tuple[Item, str]]:
+def due(
+    every: Collection[Item], retention: RetentionPolicy, now_ns: int
+) -> Iterator[tuple[Item, str]]:
     """Yield what is to go, and why: what is too old, then as much as is too much, oldest first.
 
     Recordings are large, and stay until somebody removes them: no matrix goes because of one.
@@ -131,11 +133,11 @@ def due(every: Collection[Item], keeping: Keeping, now_ns: int) -> Iterator[tupl
         age_days = (now_ns - item.stored_ns_utc) / DAY_NS
         if item.kept_because:
             continue
-        if 0 < keeping.keep_days < age_days:
-            why = f"{age_days:.0f} days old, keep_days is {keeping.keep_days:g}"
-        elif 0 < keeping.keep_gb * GIGABYTE < n_bytes:
+        if 0 < retention.keep_days < age_days:
+            why = f"{age_days:.0f} days old, keep_days is {retention.keep_days:g}"
+        elif 0 < retention.keep_gb * GIGABYTE < n_bytes:
             there = n_bytes / GIGABYTE
-            why = f"{there:.3g} GB are there, keep_gb is {keeping.keep_gb:g}"
+            why = f"{there:.3g} GB are there, keep_gb is {retention.keep_gb:g}"
         else:
             continue
         n_bytes -= item.n_bytes
@@ -183,7 +185,7 @@ def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]
             yield None
 
 
-def low_on_space(directory: Path, keeping: Keeping, *, low: bool) -> str | None:
+def low_on_space(directory: Path, retention: RetentionPolicy, *, low: bool) -> str | None:
     """Return what to tell of a disk with little room, None where there is enough.
 
     Where it was told of (``low``) a tenth more has to be free before it is over.
@@ -194,10 +196,10 @@ def low_on_space(directory: Path, keeping: Keeping, *, low: bool) -> str | None:
         If the disk does not say.
     """
     free_gb = shutil.disk_usage(directory).free / GIGABYTE
-    if free_gb >= keeping.reserve_gb * (1.1 if low else 1.0):
+    if free_gb >= retention.reserve_gb * (1.1 if low else 1.0):
         return None
     return (
-        f"{free_gb:.1f} GB are free in {directory}, reserve_gb is {keeping.reserve_gb:g}: free "
+        f"{free_gb:.1f} GB are free in {directory}, reserve_gb is {retention.reserve_gb:g}: free "
         "space there, remove recordings, or lower [archive] keep_days or keep_gb; once it is full "
         "no order is taken"
     )

@@ -116,14 +116,14 @@ def rows_of(samples: Iterable[TrendSample]) -> list[tuple[object, ...]]:
     return [
         (
             *(getattr(sample, name) for name in _PLAIN),
-            *_shown(None if sample.alpha is None else sample.alpha.vector),
-            *_shown(sample.sigma),
+            *_with_names(None if sample.alpha is None else sample.alpha.vector),
+            *_with_names(sample.sigma),
         )
         for sample in samples
     ]
 
 
-def _shown(four: NDArray[np.float64] | None) -> list[float | None]:
+def _with_names(four: NDArray[np.float64] | None) -> list[float | None]:
     found: list[float | None] = [None] * len(PARAMETERS)
     return found if four is None else (four * BOUNDARY_SCALE).tolist()
 

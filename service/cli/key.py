@@ -68,7 +68,7 @@ def _recorded(file: KeyFile, name: str, text: str) -> None:
     index, now_ns = Index(path), time.time_ns()
     try:
         index.open()
-        entry = AuditEntry(t_ns_utc=now_ns, who=_login(), name=name, text=text, whence="cli")
+        entry = AuditEntry(t_ns_utc=now_ns, who=_login(), name=name, text=text, channel="cli")
         index.record((), (entry,))
     except ArchiveError as error:
         say(f"pyrcal: the audit trail does not have it: {error}")

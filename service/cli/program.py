@@ -75,7 +75,7 @@ def _commanded(
     options = read()
     options.own_process = own_process
 
-    def carry_out() -> int:
+    def run_command() -> int:
         check(options)
         command = import_module(options.module)
         if own_process and not serves:
@@ -84,7 +84,7 @@ def _commanded(
         status: int = command.main(options)
         return status
 
-    status = status_of(carry_out)
+    status = status_of(run_command)
     if own_process and serves:
         leave(status)
     return status
@@ -103,7 +103,7 @@ def imported_and_run(
     load: Callable[[], Callable[[], int]],
     *,
     own_process: bool,
-    heard: tuple[signal.Signals, ...] = (signal.SIGINT,),
+    received: tuple[signal.Signals, ...] = (signal.SIGINT,),
 ) -> int:
     """Return the exit status of a task that takes long to import.
 
@@ -120,12 +120,12 @@ def imported_and_run(
     if own_process:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     task = load()
-    for number in heard if own_process else ():
+    for number in received if own_process else ():
         signal.signal(number, signal.default_int_handler)
     return status_of(task)
 
 
-def told_to_stop() -> threading.Event:
+def stop_signal() -> threading.Event:
     """Return what is set from now on when somebody asks this process to end."""
     stopped = threading.Event()
 

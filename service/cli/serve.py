@@ -216,7 +216,7 @@ def _supervisor(
         workers=workers,
         archive=archive,
         actions=actions,
-        keeping=keeping_of(settings),
+        retention=keeping_of(settings),
         clock=clock,
     )
 
@@ -235,13 +235,13 @@ def _desk(settings: Settings, instrument: Instrument) -> FitQueue:
             asked={},
             own_instrument=str(settings.service.instrument),
             own_sha256=instrument_sha256(instrument),
-            most_bytes=most_bytes,
+            max_bytes=most_bytes,
             threads=settings.compute.threads,
             nice=settings.compute.nice,
             memory_mb=settings.fits.memory_limit_mb,
         ),
         limits=FitLimits(
-            most_bytes=most_bytes,
+            max_bytes=most_bytes,
             waiting=settings.fits.waiting,
             seconds=settings.fits.time_limit_s,
         ),

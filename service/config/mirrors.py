@@ -17,7 +17,7 @@ from service.model.kinds import BasisKind, Influence
 from service.model.misregistration import unit_like
 from service.model.tabulated import (
     ENOUGH_POINTS_PER_SUBAPERTURE,
-    LEAST_POINTS_PER_SUBAPERTURE,
+    MIN_POINTS_PER_SUBAPERTURE,
     known_samples,
 )
 
@@ -356,12 +356,11 @@ def _check_table(
     file: MirrorSection, pupil: Pupil, key: str, known: NDArray[np.bool_], pitch_m: float
 ) -> None:
     density = pupil.subaperture_m / pitch_m
-    if density < LEAST_POINTS_PER_SUBAPERTURE:
+    if density < MIN_POINTS_PER_SUBAPERTURE:
         refuse(
             file.where("modes_pitch_m"),
             f"{pitch_m:g} m, {density:.2g} table points per subaperture",
-            f"at least {LEAST_POINTS_PER_SUBAPERTURE:g}, "
-            f"{ENOUGH_POINTS_PER_SUBAPERTURE:g} for 0.5 %",
+            f"at least {MIN_POINTS_PER_SUBAPERTURE:g}, {ENOUGH_POINTS_PER_SUBAPERTURE:g} for 0.5 %",
         )
     width = max(known.shape) * pitch_m / pupil.diameter_m
     if width > _LARGEST_TABLE:

@@ -7,13 +7,13 @@ import os
 import numpy as np
 from numpy.typing import NDArray
 
-from service.archive.retention import Keeping
+from service.archive.retention import RetentionPolicy
 from service.config.settings import OffloadTable, Settings
 from service.control.reconstructor import InversionMethod
-from service.files.prepared import usual_folder
+from service.files.disk_cache import usual_folder
 from service.model.misregistration import BOUNDARY_SCALE
 from service.runtime.worker import Compute, Sampling
-from service.tracking.alarms import Act, Severity
+from service.tracking.alarms import Interlock, Severity
 from service.tracking.policy import Offloading, Policy, Rule
 
 FLAT = (0.004, 0.01, 0.001)
@@ -44,7 +44,7 @@ def floor_of(settings: Settings) -> NDArray[np.float64]:
 def policy_of(settings: Settings) -> Policy:
     """Return the policy in numeric units: radians, rates per square root of a second."""
     dither, tracking, control = settings.dither, settings.tracking, settings.control
-    per_minute = _four(
+    per_minute = _vector(
         tracking.drift_subap_per_minute,
         tracking.drift_deg_per_minute,
         tracking.drift_magnification_per_minute,
@@ -53,7 +53,7 @@ def policy_of(settings: Settings) -> Policy:
         dither_enabled=dither.enabled,
         dither_amplitude_m=dither.amplitude_m,
         dither_budget_m=dither.budget_m,
-        dither_sigma=_four(
+        dither_sigma=_vector(
             dither.sigma_shift_subap, dither.sigma_rotation_deg, dither.sigma_magnification
         ),
         dither_avoid_hz=dither.avoid_hz,
@@ -65,19 +65,19 @@ def policy_of(settings: Settings) -> Policy:
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,
-        flexure_per_degree=_four(
+        flexure_per_degree=_vector(
             tracking.flexure_subap_per_degree,
             tracking.flexure_deg_per_degree,
             tracking.flexure_magnification_per_degree,
         ),
         slew_limit_deg=tracking.slew_limit_deg,
-        stale_sigma=_four(
+        stale_sigma=_vector(
             tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification
         ),
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,
-        update_threshold=_four(
+        update_threshold=_vector(
             control.update_shift_subap, control.update_rotation_deg, control.update_magnification
         ),
         update_gain_m=control.update_gain_nm * 1e-9,
@@ -90,7 +90,7 @@ def policy_of(settings: Settings) -> Policy:
                 about=rule.when[0],
                 how=rule.when[1],
                 than=rule.when[2],
-                blocks=frozenset(Act(act) for act in rule.blocks),
+                blocks=frozenset(Interlock(act) for act in rule.blocks),
                 severity=Severity(rule.severity),
                 text=rule.text,
                 holds_unknown=rule.unknown == "holds",
@@ -107,21 +107,23 @@ def _offloading(table: OffloadTable) -> Offloading | None:
     return Offloading(
         share=table.gain,
         near=np.array(table.dead_band) / BOUNDARY_SCALE,
-        most_step=np.array(table.most_step) / BOUNDARY_SCALE,
-        reach=np.array(table.reach) / BOUNDARY_SCALE,
+        max_step=np.array(table.most_step) / BOUNDARY_SCALE,
+        travel=np.array(table.reach) / BOUNDARY_SCALE,
         settle_s=table.settle_s,
     )
 
 
-def _four(shift_subap: float, rotation_deg: float, magnification: float) -> NDArray[np.float64]:
+def _vector(shift_subap: float, rotation_deg: float, magnification: float) -> NDArray[np.float64]:
     """Return ``(4,)`` in numeric units: the same for both shifts."""
     return np.array([shift_subap, shift_subap, np.deg2rad(rotation_deg), magnification])
 
 
-def keeping_of(settings: Settings) -> Keeping:
+def keeping_of(settings: Settings) -> RetentionPolicy:
     """Return what of the archive is kept."""
     table = settings.archive
-    return Keeping(keep_days=table.keep_days, keep_gb=table.keep_gb, reserve_gb=table.reserve_gb)
+    return RetentionPolicy(
+        keep_days=table.keep_days, keep_gb=table.keep_gb, reserve_gb=table.reserve_gb
+    )
 
 
 def compute_of(settings: Settings) -> Compute:

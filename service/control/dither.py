@@ -31,7 +31,7 @@ NEARLY_BEST = 1.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Demand:
+class DitherRequirement:
     """What is asked of the dither, and what it may cost."""
 
     sigma: Array
@@ -70,7 +70,7 @@ class Schedule:
     """Whether that is what was asked for; otherwise the budget is spent and it is the best."""
 
 
-def schedule(precision: Array, demand: Demand) -> Schedule:
+def schedule(precision: Array, requirement: DitherRequirement) -> Schedule:
     """Return the schedule that keeps ``demand.sigma`` within the budget.
 
     ``precision`` ``(4,)`` is κ of ``σ = κ / (A sqrt(T))``, in numeric units times m sqrt(s), as
@@ -81,39 +81,43 @@ def schedule(precision: Array, demand: Demand) -> Schedule:
     ``sqrt(1 + STRENGTH²)`` of the least possible. Where the walk leaves no pause, the dither is no
     stronger than brings σ within ``NEARLY_BEST`` of the best the budget could buy.
     """
-    total_m = min(_amplitude(precision, demand, demand.sigma / STRENGTH), demand.budget_m)
-    interval_s = min(_longest_interval(precision, demand, total_m), demand.longest_s)
-    if interval_s < demand.window_s:
-        interval_s = demand.window_s
-        total_m = _without_pause(precision, demand)
-    before = _variance_before(precision, demand, total_m, interval_s)
+    total_m = min(
+        _amplitude(precision, requirement, requirement.sigma / STRENGTH), requirement.budget_m
+    )
+    interval_s = min(_longest_interval(precision, requirement, total_m), requirement.longest_s)
+    if interval_s < requirement.window_s:
+        interval_s = requirement.window_s
+        total_m = _without_pause(precision, requirement)
+    before = _variance_before(precision, requirement, total_m, interval_s)
     return Schedule(
         total_m=total_m,
         interval_s=interval_s,
         sigma=np.sqrt(before),
-        sufficient=bool(np.all(before <= demand.sigma**2 * (1.0 + 1e-9))),
+        sufficient=bool(np.all(before <= requirement.sigma**2 * (1.0 + 1e-9))),
     )
 
 
-def burst_s(precision: Array, demand: Demand, lengths_s: tuple[float, ...]) -> float:
+def burst_s(
+    precision: Array, requirement: DitherRequirement, lengths_s: tuple[float, ...]
+) -> float:
     """Return the shortest burst that alone is as precise as asked, on the whole budget.
 
     Of ``lengths_s``, shortest first. One in which α walks further than the noise of its estimate is
     no use: the filter follows α better than that.
     """
     for length_s, longer_s in pairwise(lengths_s):
-        noise = precision**2 / (demand.budget_m**2 * length_s)
-        if np.all(noise <= demand.sigma**2):
+        noise = precision**2 / (requirement.budget_m**2 * length_s)
+        if np.all(noise <= requirement.sigma**2):
             return length_s
-        lacking = noise > demand.sigma**2
-        walk = demand.drift_rate**2 * longer_s
+        lacking = noise > requirement.sigma**2
+        walk = requirement.drift_rate**2 * longer_s
         if np.all(walk[lacking] > (noise * length_s / longer_s)[lacking]):
             return length_s
     return lengths_s[-1]
 
 
 def window_s(
-    precision: Array, demand: Demand, usable: Array, lengths_s: tuple[float, ...]
+    precision: Array, requirement: DitherRequirement, usable: Array, lengths_s: tuple[float, ...]
 ) -> float:
     """Return the shortest window in which the dither, on the whole budget, stands out of the noise.
 
@@ -121,39 +125,41 @@ def window_s(
     the regressors biases the fit; many short windows tell as much as a long one otherwise, sooner,
     and a lost frame or a changed matrix costs less of them.
     """
-    noise = [precision**2 / (demand.budget_m**2 * length) for length in lengths_s]
+    noise = [precision**2 / (requirement.budget_m**2 * length) for length in lengths_s]
     return next(
         (s for s, n in zip(lengths_s, noise, strict=True) if np.all(n <= usable**2)), lengths_s[-1]
     )
 
 
-def _amplitude(precision: Array, demand: Demand, sigma: Array) -> float:
+def _amplitude(precision: Array, requirement: DitherRequirement, sigma: Array) -> float:
     """Return the dither of which one window has no more than this ``sigma`` in any parameter."""
-    return float(np.max(precision / (sigma * np.sqrt(demand.window_s))))
+    return float(np.max(precision / (sigma * np.sqrt(requirement.window_s))))
 
 
-def _longest_interval(precision: Array, demand: Demand, total_m: float) -> float:
-    wanted = demand.sigma**2
-    noise = precision**2 / (total_m**2 * demand.window_s)
-    return float(np.min(wanted**2 / (demand.drift_rate**2 * (wanted + noise))))
+def _longest_interval(precision: Array, requirement: DitherRequirement, total_m: float) -> float:
+    wanted = requirement.sigma**2
+    noise = precision**2 / (total_m**2 * requirement.window_s)
+    return float(np.min(wanted**2 / (requirement.drift_rate**2 * (wanted + noise))))
 
 
-def _variance_before(precision: Array, demand: Demand, total_m: float, interval_s: float) -> Array:
-    walk = demand.drift_rate**2 * interval_s
-    noise = precision**2 / (total_m**2 * demand.window_s)
+def _variance_before(
+    precision: Array, requirement: DitherRequirement, total_m: float, interval_s: float
+) -> Array:
+    walk = requirement.drift_rate**2 * interval_s
+    noise = precision**2 / (total_m**2 * requirement.window_s)
     return np.asarray(0.5 * (walk + np.sqrt(walk**2 + 4.0 * walk * noise)))
 
 
-def _without_pause(precision: Array, demand: Demand) -> float:
+def _without_pause(precision: Array, requirement: DitherRequirement) -> float:
     """Return the weakest dither that, without pause, holds what is asked for or nearly the best.
 
     Each of its windows tells what one alone must.
     """
-    best = _variance_before(precision, demand, demand.budget_m, demand.window_s)
-    allowed = np.maximum(demand.sigma**2, NEARLY_BEST**2 * best)
-    noise = allowed**2 / (demand.drift_rate**2 * demand.window_s) - allowed
-    of_window = np.minimum(np.sqrt(noise), demand.window_sigma)
-    return min(_amplitude(precision, demand, of_window), demand.budget_m)
+    best = _variance_before(precision, requirement, requirement.budget_m, requirement.window_s)
+    allowed = np.maximum(requirement.sigma**2, NEARLY_BEST**2 * best)
+    noise = allowed**2 / (requirement.drift_rate**2 * requirement.window_s) - allowed
+    of_window = np.minimum(np.sqrt(noise), requirement.window_sigma)
+    return min(_amplitude(precision, requirement, of_window), requirement.budget_m)
 
 
 def clear_of(
@@ -237,7 +243,7 @@ def _sums(one: NDArray[np.float32], other: NDArray[np.float32]) -> Array:
     return np.asarray(np.einsum("sm,sm->m", one, other), dtype=np.float64)
 
 
-def most_telling(
+def most_informative(
     information: Array, candidates: Sequence[int], n: int, wanted: Array
 ) -> tuple[int, ...]:
     """Return the ``n`` modes that together come closest to every wanted σ ``(4,)``.
@@ -275,7 +281,7 @@ def _worst(scaled: Array) -> Array:
     return np.asarray(variances.max(axis=-1))
 
 
-MOST_LINES = 8
+MAX_LINES = 8
 FEWEST_LINES = 3
 """Modes dithered at once: two fix neither four parameters nor whether they are right."""
 
@@ -329,13 +335,13 @@ def modes_of(band: Band, n_modes: int, n_lines: int) -> tuple[int, ...]:
     return tuple(int(mode) for mode in np.unique(spread))
 
 
-def lines_of(frame_rate_hz: float, window_s: float, most: int) -> tuple[float, ...]:
+def lines_of(frame_rate_hz: float, window_s: float, n_max: int) -> tuple[float, ...]:
     """Return as many dither lines as the band has room for, at most ``most``; maybe too few.
 
     Each is a whole number of periods of a window, and none is what the pyramid makes of others.
     """
     low, high = (share * frame_rate_hz for share in LINE_BAND)
-    for n_lines in range(min(most, MOST_LINES), FEWEST_LINES - 1, -1):
+    for n_lines in range(min(n_max, MAX_LINES), FEWEST_LINES - 1, -1):
         found = clear_of(
             tuple(np.linspace(low, high, n_lines + 1)[:-1].tolist()),
             (),

@@ -122,7 +122,7 @@ SHAPE_SIGMA = 0.06
 SHAPE_SCALE = 0.7
 """Over which such a departure changes, in units of the logarithm of the mode's number."""
 
-LEAST_SIGMA = 0.02
+MIN_SIGMA = 0.02
 """Of one measured mode, relative: the response is not diagonal."""
 
 TWO_PASSES_ABOVE = 1.1
@@ -205,7 +205,7 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
     expected, covariance = _expected(everywhere) + np.log(passes), _covariance(everywhere, modes)
     variance = np.diag(_covariance(everywhere, everywhere)).copy()
     if len(modes):
-        noise = (spread / found) ** 2 + LEAST_SIGMA**2
+        noise = (spread / found) ** 2 + MIN_SIGMA**2
         weights = np.linalg.solve(_covariance(modes, modes) + np.diag(noise), covariance.T).T
         expected = expected + weights @ (np.log(found) - np.log(passes) - _expected(modes))
         variance -= np.einsum("ij,ij->i", weights, covariance)

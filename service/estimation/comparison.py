@@ -11,7 +11,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.residual import GROUP, LEAST_PARTS, Residual, ResidualLevel, ratio, total_of
+from service.estimation.residual import GROUP, MIN_PARTS, Residual, ResidualLevel, ratio, total_of
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ for one. A loop that is being lost has no time for more: soon everything moves."
 SIGMAS = 4.5
 """Of a part's scatter beyond that: hundreds of modes are looked at thirty times."""
 
-LEAST_SCATTER = 0.1
+MIN_SCATTER = 0.1
 """Of the logarithm of a mode's power in one part."""
 
 COMMON_WORSE = 4.0
@@ -162,7 +162,7 @@ class Before:
             modes=moving,
             n_parts=len(parts),
             power=power,
-            scatter=max(scatter, LEAST_SCATTER),
+            scatter=max(scatter, MIN_SCATTER),
             level=ResidualLevel.of(_residuals(parts)),
             peak=max(part.peak for part in parts),
         )
@@ -200,7 +200,7 @@ def compared(
     worse = (
         rings
         or lost
-        or (len(parts) >= LEAST_PARTS and whole is not None and whole[0] > whole[1])
+        or (len(parts) >= MIN_PARTS and whole is not None and whole[0] > whole[1])
         or common > np.log(COMMON_WORSE)
         or (slow and slopes > np.log(SLOPES_WORSE))
         or (slow and ring is not None and ring > np.log(RING_WORSE))

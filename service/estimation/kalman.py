@@ -85,10 +85,10 @@ def begin_joint(measured: Array, covariance: Array) -> Joint:
     """Return the estimate after a first dithered measurement: nothing is known of the bias."""
     full = np.zeros((8, 8))
     full[:4, :4] = covariance
-    return forgotten(Joint(mean=np.concatenate([measured, np.zeros(4)]), covariance=full))
+    return forget(Joint(mean=np.concatenate([measured, np.zeros(4)]), covariance=full))
 
 
-def forgotten(joint: Joint, excess: Array | None = None) -> Joint:
+def forget(joint: Joint, excess: Array | None = None) -> Joint:
     """Return the estimate with nothing known of the bias any more; α stands.
 
     ``excess`` ``(4,)`` is the bias' variance beyond ``BIAS_FLOOR`` by the look at hand, if any.

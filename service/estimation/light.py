@@ -48,7 +48,7 @@ _BAD_SHARE = 0.25
 """A pixel is bad when it departs from its three companions by so many robust σ and, besides, by
 this share of a lit pixel: diffraction and static aberrations make good ones differ."""
 
-_MOST_BAD = 0.03
+_MAX_BAD = 0.03
 """Share of an image's pixels: beyond it they are not bad, the image is another one."""
 
 _LARGEST_RESIDUAL = 0.25
@@ -158,7 +158,7 @@ def repaired(counts: NDArray[Any], instrument: Instrument) -> tuple[Array, NDArr
     spread = 1.4826 * np.nanmedian(np.abs(difference))
     lit = np.nanpercentile(middle, 75.0)
     bad = ~(np.abs(difference) <= _BAD_SIGMA * spread + _BAD_SHARE * np.maximum(middle, lit))
-    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MOST_BAD)
+    bad &= np.isnan(images) | (bad.mean(axis=(1, 2), keepdims=True) <= _MAX_BAD)
     return np.where(bad, np.nan_to_num(middle) * level[:, None, None], images), bad
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.estimation.comb import SIDE_OFFSETS_HZ, Comb
+from service.estimation.demodulation import SIDE_OFFSETS_HZ, DemodulationBank
 from service.estimation.estimate import DitheredEstimate
 from service.estimation.frames import FrameBlock
 from service.estimation.windows import (
@@ -77,9 +77,9 @@ class LockInPlan(WindowPlan):
             raise ModelError(f"lock-in: lines {lines} Hz closer than 4 bins in one window")
 
     @property
-    def comb(self) -> Comb:
+    def demodulation(self) -> DemodulationBank:
         """What a window is summed with."""
-        return Comb(
+        return DemodulationBank(
             lines_hz=self.frequencies_hz, frame_rate_hz=self.frame_rate_hz, n_frames=self.n_frames
         )
 
@@ -119,7 +119,7 @@ class LockInSums:
     """Sums so far."""
 
     slopes: Array
-    """As :meth:`Comb.empty` has them; so the commands. They are added to where they are."""
+    """As :meth:`DemodulationBank.empty` has them, like the commands; added to in place."""
 
     commands: Array
     dither: Array
@@ -133,22 +133,22 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
     @override
     def begin(self, block: FrameBlock) -> LockInSums:
         """Return empty sums for frames like these."""
-        comb, n_modes = self.plan.comb, block.commands_m.shape[1]
+        bank, n_modes = self.plan.demodulation, block.commands_m.shape[1]
         return LockInSums(
-            slopes=comb.empty(block.slopes.shape[1]),
-            commands=comb.empty(n_modes),
+            slopes=bank.empty(block.slopes.shape[1]),
+            commands=bank.empty(n_modes),
             dither=np.zeros((2 * len(self.plan.modes), n_modes), np.float32),
         )
 
     @override
     def add(self, sums: LockInSums, block: FrameBlock, place: int) -> LockInSums:
         """Return the sums with a block that begins at this place of the window."""
-        comb = self.plan.comb
+        bank = self.plan.demodulation
         # no block without dither columns comes this far
         dither = block.commands_m if block.dither_m is None else block.dither_m
-        comb.add(sums.slopes, block.slopes, place)
-        comb.add(sums.commands, block.commands_m, place)
-        return replace(sums, dither=sums.dither + comb.at_lines(dither, place))
+        bank.add(sums.slopes, block.slopes, place)
+        bank.add(sums.commands, block.commands_m, place)
+        return replace(sums, dither=sums.dither + bank.at_lines(dither, place))
 
     @override
     def close(self, window: Window[LockInSums]) -> Spectra | WindowRefused:
@@ -163,8 +163,8 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
             return WindowRefused(reason=reason, t_ns_utc=window.next_t_ns)
         return Spectra(
             plan=plan,
-            slopes=plan.comb.at_bins(sums.slopes),
-            commands=plan.comb.at_bins(sums.commands),
+            slopes=plan.demodulation.at_bins(sums.slopes),
+            commands=plan.demodulation.at_bins(sums.commands),
             dither=dither,
             **window.telemetry,
         )
@@ -199,7 +199,7 @@ def joined(one: Spectra, other: Spectra) -> Spectra | None:
 N_STEPS = 5
 """Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
 
-_MOST_TERMS = 40
+_MAX_TERMS = 40
 """Of a series; one that needs more is given up, and the loop's equations are solved."""
 
 _GROWN = 10.0
@@ -219,7 +219,7 @@ MAX_LAG_FRAMES = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WindowEstimate(DitheredEstimate):
+class LockInEstimate(DitheredEstimate):
     """What one window of sines says of the registration.
 
     Gains and lags are of the lines: complex, for a lag turns a line's phase. The misfit is the
@@ -233,7 +233,7 @@ class WindowEstimate(DitheredEstimate):
     """Length of the window, seconds; 0: not known."""
 
 
-def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> WindowEstimate:
+def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> LockInEstimate:
     """Estimate α from one window, to first order about the linearisation.
 
     Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per
@@ -260,7 +260,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     every = inverse @ spread @ inverse.T
     covariance = every[:4, :4]
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
-    return WindowEstimate(
+    return LockInEstimate(
         alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
         covariance=(covariance + covariance.T) / 2,
         optical_gain=gains,
@@ -316,7 +316,7 @@ def closed_loop_responses(
 def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
     """Return ``(1 + F)^-1 first`` as a series, ``F = answer * coupling``; None: not that way."""
     reply, largest = first, np.abs(first).max(initial=0.0)
-    for _ in range(_MOST_TERMS):
+    for _ in range(_MAX_TERMS):
         before, reply = reply, first - answer * _apply(coupling, reply.T).T
         change, size = (np.abs(x).max(initial=0.0) for x in (reply - before, reply))
         if change <= _ROUNDING * size:  # zeros are settled, too
@@ -391,13 +391,13 @@ def _unknowns(line: int) -> Array:
 
 
 def _normal_equations(
-    slopes: Array, seen: Array, known: Array, gains: Array, step: Array
+    slopes: Array, seen: Array, known_gains: Array, gains: Array, step: Array
 ) -> tuple[Array, Array]:
     """Return ``M`` and ``b`` of the instrumental-variable step over all lines."""
     n = 4 + 2 * len(gains)
     normal, score = np.zeros((n, n)), np.zeros(n)
     for line, gain in enumerate(gains):
-        conjugate = _regressors(known[line], gain, step).conj()
+        conjugate = _regressors(known_gains[line], gain, step).conj()
         response = _regressors(seen[line], gain, step)
         residual = slopes[line] - gain * response[4]
         at = _unknowns(line)

@@ -116,7 +116,7 @@ class _Batch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Obedience:
+class CommandResidual:
     """How far each mode follows the loop."""
 
     share: NDArray[np.float64]
@@ -174,13 +174,13 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     return _multiplied(check, loop) if len(waiting) >= BATCH else check
 
 
-def obedience(
+def command_residual(
     check: LoopCheck,
     loop: ClosedLoop,
     first_seq: int,
     last_seq: int,
     enough: int = ENOUGH_SAMPLES,
-) -> tuple[LoopCheck, Obedience | None]:
+) -> tuple[LoopCheck, CommandResidual | None]:
     """Return how the modes obeyed in a span of frames, both ends included.
 
     None: too few of this reconstructor have been seen.
@@ -247,7 +247,7 @@ class _Products:
         return np.asarray(np.einsum("i,j,ijm->m", weights, weights, self.asked))
 
 
-def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Obedience:
+def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> CommandResidual:
     products = _Products.of(asked, taken)
     weights = _lag(products, loop)
     obeys = np.abs(_shares(products, weights)[0] - 1.0) < TOLERANCE
@@ -262,7 +262,7 @@ def _judged(asked: Array, taken: Array, held: Array, loop: ClosedLoop) -> Obedie
         uncertain = np.linalg.norm(error[asked_for]) / np.count_nonzero(asked_for)
         if mean > COMMON_TOLERANCE + SIGNIFICANCE * uncertain:
             off |= np.abs(share - 1.0) > COMMON_TOLERANCE
-    return Obedience(
+    return CommandResidual(
         share=np.where(asked_for, share, np.nan),
         held=held,
         disobeys=off & asked_for,

@@ -40,7 +40,7 @@ REPRESENTED = 0.5
 FEWEST = 3
 """Combinations below which single modes lead, smooth or not."""
 
-MOST_SINGLE = 20
+MAX_SINGLE = 20
 
 UNSEEN = 1e-9
 """Response of a mode over the largest, below which it is none."""
@@ -286,7 +286,7 @@ def low_order_of(model: InteractionModel) -> LowOrder:
     kept = size > REPRESENTED
     combined = combined @ (axes[kept].T / size[kept])
     if combined.shape[1] < FEWEST:
-        combined = np.eye(len(response))[:, :MOST_SINGLE]
+        combined = np.eye(len(response))[:, :MAX_SINGLE]
     shapes = model.basis.combined(combined / response[:, None])
     return LowOrder(shapes=shapes, combinations=combined)
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import solver
-from service.estimation.lockin import MAX_LAG_FRAMES, Spectra, WindowEstimate, fit_window
+from service.estimation.lockin import MAX_LAG_FRAMES, LockInEstimate, Spectra, fit_window
 from service.estimation.solver import LONGEST_STEP, Columns
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
 from service.model.interaction import InteractionModel
@@ -40,10 +40,10 @@ LARGEST_GAIN = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FarEstimate:
+class WideCaptureEstimate:
     """Where the mirror is, from one window with the loop open."""
 
-    estimate: WindowEstimate
+    estimate: LockInEstimate
     """Its covariance is the noise's alone."""
 
     unexplained: float
@@ -54,13 +54,13 @@ class FarEstimate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FarSearch:
+class WideCaptureSearch:
     """Where to look, and with what."""
 
-    far: InteractionModel
+    coarse: InteractionModel
     """Of the dithered modes alone, columns in the order of the lines. Coarse: leads."""
 
-    near: InteractionModel
+    fine: InteractionModel
     """The same, fine: decides."""
 
     nominal: Misregistration
@@ -69,12 +69,12 @@ class FarSearch:
     starts: tuple[Misregistration, ...]
     """Tried in this order."""
 
-    def reaches(self, vector: Array) -> bool:
+    def contains(self, vector: Array) -> bool:
         """Return whether a registration ``(4,)`` is within the range."""
         return bool(np.all(np.abs(vector - self.nominal.vector) < LIMIT))
 
 
-def find(spectra: Spectra, search: FarSearch) -> FarEstimate | WindowRefused:
+def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | WindowRefused:
     """Return where the first start leads from which the model explains the columns."""
     columns, noise = _columns(spectra)
     loop = ClosedLoop(
@@ -92,15 +92,15 @@ def find(spectra: Spectra, search: FarSearch) -> FarEstimate | WindowRefused:
     reason = "no start was given"
     for tried, start in enumerate(search.starts, start=1):
         landed = solver.approach(
-            search.far, columns, start.vector, approached=APPROACHED, allowed=search.reaches
+            search.coarse, columns, start.vector, approached=APPROACHED, allowed=search.contains
         )
         if not landed.converged:
             reason = f"steps from {start} do not converge"
             continue
-        there = search.near.linearise(Misregistration.from_vector(landed.vector))
+        there = search.fine.linearise(Misregistration.from_vector(landed.vector))
         estimate = fit_window(alone, there, loop)
-        left = _unexplained(columns, noise, search.near.interaction_matrix(estimate.alpha))
-        found = FarEstimate(estimate=estimate, unexplained=left, n_starts=tried)
+        left = _unexplained(columns, noise, search.fine.interaction_matrix(estimate.alpha))
+        found = WideCaptureEstimate(estimate=estimate, unexplained=left, n_starts=tried)
         why_not = _why_not(found, search)
         if why_not is None:
             return found
@@ -145,7 +145,7 @@ def _unexplained(columns: Columns, noise: Array, matrix: Array) -> float:
     return float(np.mean(left / np.maximum(total - noise, 0.1 * total)))
 
 
-def _why_not(found: FarEstimate, search: FarSearch) -> str | None:
+def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | None:
     """Return why an estimate is not believed, or None."""
     estimate = found.estimate
     gains = np.abs(estimate.optical_gain)
@@ -156,7 +156,7 @@ def _why_not(found: FarEstimate, search: FarSearch) -> str | None:
     lag = float(np.median(estimate.lag_frames))
     if abs(lag) > MAX_LAG_FRAMES:
         return f"columns misaligned: slopes lag commands by {lag:+.2f} frame, 0 is expected"
-    if not search.reaches(estimate.alpha.vector):
+    if not search.contains(estimate.alpha.vector):
         return f"{estimate.alpha} is out of range"
     if np.any(np.abs(estimate.step) > LONGEST_STEP):
         return f"the finer model leads away from {estimate.alpha}"

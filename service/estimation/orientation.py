@@ -35,10 +35,10 @@ Array = NDArray[np.float64]
 ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
 """Rotations tried; shapes of degree 5 have lost a tenth half-way between two of them."""
 
-LEAST_LEAD = 0.08
+MIN_LEAD = 0.08
 """Another class of orientations must correlate worse by this much to be told apart."""
 
-LEAST_CORRELATION = 0.4
+MIN_CORRELATION = 0.4
 """Below, no orientation explains the lowest orders."""
 
 
@@ -71,7 +71,7 @@ class Pose:
         """Flips and swaps of the axes."""
         return sum(getattr(self.slopes.assumed_orientation, name) for name in FLIPS)
 
-    def told(self) -> str:
+    def reported(self) -> str:
         """Return it in the words of the instrument file."""
         return f"{setting_written(self.slopes)} at {np.rad2deg(self.rotation_rad):.0f} deg"
 
@@ -102,14 +102,14 @@ class Search:
     @property
     def refusal(self) -> str:
         """Why no orientation can be told; empty: one can."""
-        if self.best.correlation < LEAST_CORRELATION:
+        if self.best.correlation < MIN_CORRELATION:
             return (
                 f"no orientation of the slopes explains the lowest orders (correlation "
                 f"{self.best.correlation:.2f}): the modes are another basis, or the matrix "
                 "another instrument's"
             )
         if self.ties:
-            named = "; ".join(pose.told() for pose in (self.best, *self.ties))
+            named = "; ".join(pose.reported() for pose in (self.best, *self.ties))
             return (
                 f"the orientation is ambiguous: {named} explain the lowest orders equally well; "
                 "state [slopes] orientation, or measure more of the low modes"
@@ -119,11 +119,11 @@ class Search:
 
 def overruled(stated: Pose, found: Pose) -> str:
     """Return why a stated orientation cannot be the RTC's; empty: it may be."""
-    if found.correlation < stated.correlation + 2.0 * LEAST_LEAD:
+    if found.correlation < stated.correlation + 2.0 * MIN_LEAD:
         return ""
     told = (
         f"with {setting_written(stated.slopes)} the lowest orders correlate with the model by "
-        f"{stated.correlation:.2f}, with {found.told()} by {found.correlation:.2f}"
+        f"{stated.correlation:.2f}, with {found.reported()} by {found.correlation:.2f}"
     )
     if found.mirrored is not stated.mirrored:
         return (
@@ -187,27 +187,27 @@ def _any_way_round(instrument: Instrument, basis: Basis, mapper: Mapper) -> Inte
     )
 
 
-def _settings(told: SlopeRecipe) -> Iterator[SlopeRecipe]:
+def _settings(reported: SlopeRecipe) -> Iterator[SlopeRecipe]:
     """Yield every orientation, and the components exchanged where the order can say that."""
-    order = told.order
+    order = reported.order
     plain, exchanged = order.kind.orders[:2]
     others = {plain: [exchanged], exchanged: [plain]}
-    yield from settings_of(told, [order, *others.get(order, [])])
+    yield from settings_of(reported, [order, *others.get(order, [])])
 
 
-def settings_of(told: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator[SlopeRecipe]:
+def settings_of(reported: SlopeRecipe, orders: Iterable[SlopeOrder]) -> Iterator[SlopeRecipe]:
     """Yield every orientation and pair of signs in each of these orders."""
     flags = (False, True)
     for listed, swap, flip_x, flip_y, sign_x, sign_y in product(
         orders, flags, flags, flags, (1, -1), (1, -1)
     ):
         axes = Orientation(swap_xy=swap, flip_x=flip_x, flip_y=flip_y, sign_x=sign_x, sign_y=sign_y)
-        yield replace(told, order=listed, orientation=axes)
+        yield replace(reported, order=listed, orientation=axes)
 
 
 def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
     best = max(pose.correlation for pose in poses)
-    near = [pose for pose in poses if pose.correlation > best - LEAST_LEAD]
+    near = [pose for pose in poses if pose.correlation > best - MIN_LEAD]
     leader = max(near, key=lambda pose: pose.correlation)
 
     def preference(pose: Pose) -> tuple[float, float]:

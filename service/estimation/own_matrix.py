@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.dialect import LARGEST_CONDITION
+from service.estimation.slope_convention import LARGEST_CONDITION
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
@@ -45,7 +45,7 @@ LINEAR = np.array([0.1, 0.1, np.deg2rad(0.5), 0.005])
 LONGEST_STEP = np.array([0.7, 0.7, np.deg2rad(4.0), 0.04])
 """Of one iteration, numeric units."""
 
-MOST_STRANGE = 0.3
+MAX_STRANGE = 0.3
 """Share of columns that may be no mode of the model before all are taken for another basis."""
 
 UNLIKE_NEIGHBOURS = 1.6
@@ -89,7 +89,7 @@ class OwnMatrix:
     def wrong(self) -> str:
         """Which modes have another sign or place than the instrument file says; empty: none."""
         strange = self.modes < 0
-        if strange.mean() > MOST_STRANGE:
+        if strange.mean() > MAX_STRANGE:
             return (
                 f"{int(strange.sum())} of the {len(self.modes)} modes that the RTC's own matrix "
                 "controls are none of the instrument file's: its slopes are listed in another "

@@ -42,7 +42,7 @@ is let in."""
 BAND_FRAMES = 32
 """Filtered in one product: more are mostly products with nothing, fewer mostly calls."""
 
-LEAST_DELAY_FRAMES = 2
+MIN_DELAY_FRAMES = 2
 """With less the instrument may not look ahead, and a tenth of the signal is left."""
 
 _LOOP_GAIN = 0.35
@@ -59,7 +59,7 @@ TAPER_FRAMES = 32
 a thousand times stronger than the noise that is looked for: a sum of their products that is cut off
 is worse than none. Runs of less than twice as many frames are left out."""
 
-MOST_OTHER_MODES = 8
+MAX_OTHER_MODES = 8
 """Modes outside the loop that a dither of sines may move; where more move it is turbulence or
 random signs, which the filtered commands have nothing in common with."""
 
@@ -139,12 +139,12 @@ def high_pass(delay_frames: float) -> HighPass:
     Raises
     ------
     ModelError
-        If the delay is shorter than ``LEAST_DELAY_FRAMES``.
+        If the delay is shorter than ``MIN_DELAY_FRAMES``.
     """
-    if delay_frames < LEAST_DELAY_FRAMES:
+    if delay_frames < MIN_DELAY_FRAMES:
         raise ModelError(
             f"passive estimate: found a delay of {delay_frames:g} frames, expected at least "
-            f"{LEAST_DELAY_FRAMES}: a loop as quick answers noise before it can be told from the "
+            f"{MIN_DELAY_FRAMES}: a loop as quick answers noise before it can be told from the "
             "response"
         )
     ahead = int(delay_frames) - 1
@@ -233,11 +233,11 @@ class Passive:
     @property
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""
-        if self.delay_frames >= LEAST_DELAY_FRAMES:
+        if self.delay_frames >= MIN_DELAY_FRAMES:
             return None
         return (
             f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
-            f"{LEAST_DELAY_FRAMES} are needed to tell the mirror's response from noise"
+            f"{MIN_DELAY_FRAMES} are needed to tell the mirror's response from noise"
         )
 
 
@@ -276,7 +276,7 @@ def _with_dither_beside(state: Passive, block: FrameBlock) -> FrameBlock:
     if dither is None:
         return block
     moved = np.flatnonzero(dither[:, : state.n_modes].any(axis=0))
-    if not 0 < len(moved) <= MOST_OTHER_MODES:
+    if not 0 < len(moved) <= MAX_OTHER_MODES:
         return block
     return replace(block, commands_m=np.hstack([block.commands_m, dither[:, moved]]))
 
@@ -297,7 +297,7 @@ def _others(state: Passive, *blocks: FrameBlock) -> NDArray[np.intp]:
     """Return which modes outside the loop move; none where more do than any dither of sines."""
     moves = [block.commands_m[:, state.n_modes :].any(axis=0) for block in blocks]
     others = state.n_modes + np.flatnonzero(np.any(moves, axis=0))
-    return others[:0] if len(others) > MOST_OTHER_MODES else others
+    return others[:0] if len(others) > MAX_OTHER_MODES else others
 
 
 def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:

@@ -47,10 +47,10 @@ PART_S = 0.1
 LONGEST_PART_S = 0.2
 """A block that lasts longer makes more than one part."""
 
-LEAST_PART = 50
+MIN_PART = 50
 """Frames: fewer scatter too much to be looked at."""
 
-LEAST_BEFORE_S = 0.8
+MIN_BEFORE_S = 0.8
 """Telemetry with the matrix before; with less nothing is said."""
 
 SETTLING_S = 0.03
@@ -153,7 +153,7 @@ def observe(
             state = _swapped(state, some)
         if state.before is None and state.healthy is None:
             state = replace(state, reader=_reader(state.reader, matrix))
-        state = _observed(_watched(state, some), some, modes, lines_hz, edge)
+        state = _observed(_note_runaway(state, some), some, modes, lines_hz, edge)
     return state
 
 
@@ -163,7 +163,7 @@ def _reader(reader: Reader | None, matrix: NDArray[np.float32] | None) -> Reader
     return reader if reader is not None and reader.matrix is matrix else Reader.of(matrix)
 
 
-def _watched(state: Comparison, block: FrameBlock) -> Comparison:
+def _note_runaway(state: Comparison, block: FrameBlock) -> Comparison:
     """Look at the slopes frame by frame: a loop that is lost at once waits for no part."""
     before = state.before
     if before is None or not before.peak or block.cm_id is None or state.returned:
@@ -230,7 +230,7 @@ def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
     if state.cm_id is None or block.cm_id is None or state.modes is None or not same_session:
         return fresh
     lasted_s = sum(part.n_frames for part in state.parts) * block.dt_ns * 1e-9
-    if lasted_s < LEAST_BEFORE_S:
+    if lasted_s < MIN_BEFORE_S:
         why = f"only {lasted_s:.1f} s of telemetry with {state.cm_id} to compare with"
         return replace(fresh, found=not_compared(state.cm_id, block.cm_id, why))
     before = Before.of(state.cm_id, state.parts, state.modes)
@@ -282,7 +282,7 @@ def _sines(n_frames: int, lines: tuple[float, ...]) -> NDArray[np.float32]:
 def _added(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     """Add sums to the part under way, or begin another one."""
     dt_s, parts = block.dt_ns * 1e-9, state.parts
-    length = max(PART_S / dt_s, LEAST_PART)
+    length = max(PART_S / dt_s, MIN_PART)
     last = parts[-1] if parts else None
     if last is not None and last.n_frames < length - _REACH:
         part, parts = last.plus(part), parts[:-1]
@@ -297,7 +297,7 @@ def _looked(state: Comparison, block: FrameBlock) -> Comparison:
         return state
     dt_s = block.dt_ns * 1e-9
     # a block that does not follow another loses some frames to the filter
-    if state.parts[-1].n_frames < max(PART_S / dt_s, LEAST_PART) - _REACH:
+    if state.parts[-1].n_frames < max(PART_S / dt_s, MIN_PART) - _REACH:
         return state
     known = np.intersect1d(before.modes, () if state.modes is None else state.modes)
     modes = np.setdiff1d(known, np.fromiter(state.dithered, np.intp))

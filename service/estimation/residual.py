@@ -31,10 +31,10 @@ WORSE = 1.21
 SIGMAS = 4.0
 """Of the scatter beyond that: it is known from a few groups only."""
 
-LEAST_SCATTER = 0.12
+MIN_SCATTER = 0.12
 """Of the logarithm of the residual's power in one group: turbulence is never steadier."""
 
-LEAST_PARTS = GROUP + 1
+MIN_PARTS = GROUP + 1
 """Fewer say nothing: what is worse by far shows in the steps and in the slopes."""
 
 LATELY = 3
@@ -130,7 +130,7 @@ class ResidualLevel:
         modes = np.arange(len(total.seen))
         known = [g for g in groups if g is not None and g.n_moved]
         logs = [np.log(ratio(total, group, modes)) for group in known]
-        scatter = max(float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0, LEAST_SCATTER)
+        scatter = max(float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0, MIN_SCATTER)
         return cls(total=total, scatter=scatter, n_groups=len(known))
 
     def limit(self, n_parts: int) -> float:

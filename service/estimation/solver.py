@@ -48,8 +48,8 @@ SETTLED = np.array([5e-4, 5e-4, np.deg2rad(5e-4), 1e-5])
 LIMIT = np.array([4.0, 4.0, np.inf, 0.25])
 """No registration lies further from the nominal one (numeric units; any rotation may)."""
 
-MOST_FAR_STEPS = 12
-MOST_NEAR_STEPS = 6
+MAX_FAR_STEPS = 12
+MAX_NEAR_STEPS = 6
 _HALVINGS = 3
 
 SLOPE_TURN_SIGMA_RAD = np.deg2rad(1.5)
@@ -217,7 +217,7 @@ def approach(
     matrix = model.interaction_matrix(Misregistration.from_vector(vector))
     misfit, n = columns.misfit(matrix), 1
     converged = False
-    for _ in range(MOST_FAR_STEPS):
+    for _ in range(MAX_FAR_STEPS):
         derivatives = model.derivatives(Misregistration.from_vector(vector))
         seen, n = columns.project(matrix, derivatives), n + 4
         if not seen.gains.any():
@@ -371,7 +371,7 @@ def refine(
     columns: Columns,
     start: Array,
     nuisances: Nuisances,
-    most_steps: int = MOST_NEAR_STEPS,
+    max_steps: int = MAX_NEAR_STEPS,
 ) -> Solution:
     """Return the minimum on the fine grid, with derivatives frozen on a cheaper one.
 
@@ -386,7 +386,7 @@ def refine(
     extra = nuisances.derivatives(models, here, matrix)
     every = np.concatenate([frozen, extra])
     seen, converged = columns.project(matrix, every), False
-    for _ in range(most_steps):
+    for _ in range(max_steps):
         step = _bounded_step(seen, values, nuisances)
         if not within_limits(vector + step[:4]):
             break

@@ -73,7 +73,7 @@ def kind_of(path: Path) -> FileKind:
 # --- what is asked of a fit
 
 
-MOST_MODES = 100_000
+MAX_MODES = 100_000
 
 _PART = re.compile(r"(\d+)(?::(\d+)(?::(\d+))?)?")
 
@@ -96,10 +96,8 @@ def parse_modes(text: str) -> NDArray[np.intp]:
             raise ValueError(f"found {text!r}, {expected}")
         first, end, step = match.groups()
         last = int(end) if end is not None else int(first) + 1
-        if last > MOST_MODES or step == "0":
-            raise ValueError(
-                f"found {text!r}, expected modes below {MOST_MODES} and a step above 0"
-            )
+        if last > MAX_MODES or step == "0":
+            raise ValueError(f"found {text!r}, expected modes below {MAX_MODES} and a step above 0")
         indices.extend(range(int(first), last, int(step or 1)))
     if not indices:
         raise ValueError(f"found {text!r}, which is no mode at all; {expected}")

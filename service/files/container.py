@@ -23,13 +23,13 @@ from service.errors import MatrixError
 from service.files import FileKind, kind_of
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
 
-MOST_BYTES = 4 << 30
+MAX_BYTES = 4 << 30
 """Largest array that is read: a cube of 400 full frames of 512 x 512 is a tenth of it."""
 
 ROOMY_BYTES = 64 << 20
 """An array that takes no more in memory is read, however few bytes the file has of it."""
 
-MOST_SWELLING = 1000
+MAX_SWELLING = 1000
 """Bytes in memory for each in the file, of larger ones: gzip does not compress noise any better."""
 
 _LISTED = 12
@@ -75,7 +75,7 @@ class StoredArray:
             If it is too large, claims more than the file can hold, or the file is damaged there.
         """
         n_bytes = max(math.prod(self.shape), math.prod(self.at_once)) * max(self.dtype.itemsize, 8)
-        most = min(MOST_BYTES, max(ROOMY_BYTES, MOST_SWELLING * self.stored_bytes))
+        most = min(MAX_BYTES, max(ROOMY_BYTES, MAX_SWELLING * self.stored_bytes))
         if n_bytes > most:
             raise MatrixError(
                 f"{self.where}: found shape {self.shape}, {n_bytes / 1e9:.1f} GB in memory, of "

@@ -46,7 +46,7 @@ class FitRequest:
     own_sha256: str
     """Of the instrument as the service has read it: the file may have changed since."""
 
-    most_bytes: int
+    max_bytes: int
     """Of the files of an archive together."""
 
     threads: int

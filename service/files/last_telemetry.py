@@ -42,9 +42,9 @@ class LastTelemetry:
         Beyond it the oldest go.
     """
 
-    def __init__(self, seconds: float, most_bytes: int) -> None:
+    def __init__(self, seconds: float, max_bytes: int) -> None:
         self._seconds = seconds
-        self._most_bytes = most_bytes
+        self._max_bytes = max_bytes
         self._held: deque[Arrived] = deque()
         self._n_bytes = 0
         self._lock = threading.Lock()
@@ -58,7 +58,7 @@ class LastTelemetry:
             self._held.append(now)
             self._n_bytes += now.n_bytes
             while self._held and (
-                self._n_bytes > self._most_bytes or now.at_s - self._held[0].at_s > self._seconds
+                self._n_bytes > self._max_bytes or now.at_s - self._held[0].at_s > self._seconds
             ):
                 self._n_bytes -= self._held.popleft().n_bytes
 

@@ -15,11 +15,11 @@ from typing import Final
 from service import wire
 from service.errors import WireError
 from service.estimation.frames import FrameBlock
+from service.link.leader_election import SessionWatch
 from service.link.matrices import LinkEvent
 from service.link.ring import COUNTED, LEAP, FrameRing
-from service.link.rivals import SessionWatch
 from service.link.session import Endpoint
-from service.link.statistics import MALFORMED, USED, LinkStatistics, Tally
+from service.link.statistics import MALFORMED, USED, Counters, LinkStatistics
 from service.tracking import events as ev
 from service.tracking.alarms import OTHER_BASIS, SECOND_RTC
 from service.tracking.state import Level
@@ -45,7 +45,7 @@ STATUS_INTERVAL_S: Final = 0.45
 CHANGES: Final = 10
 """Statuses that say something else each, which are taken within that time all the same."""
 
-SPARED: Final = "spared"
+COALESCED: Final = "spared"
 """What became of a status that a later one made superfluous."""
 
 PLACED: Final = {
@@ -109,14 +109,14 @@ class Intake:
         self._shape: tuple[int, int] | None = None
         self._counts: Counter[str] = Counter()
         self._counted: Counter[str] = Counter()
-        self._tally = Tally()
+        self._counters = Counters()
         self._rtc_alive = False
         self._begun_s = clock()
         self._last_frame_s: float | None = None
         self._last_status_s: float | None = None
         self._essentials: tuple[object, ...] = ()
         self._changes = 0
-        self._spared: bytes | None = None
+        self._coalesced: bytes | None = None
         self._latency_s: deque[float] = deque(maxlen=LATENCIES)
 
     def expect(self, basis_id: str | None, config_id: str | None) -> None:
@@ -202,10 +202,10 @@ class Intake:
         now_s = self._clock()
         with self._lock:
             if self._superfluous(found, now_s):
-                self._spared = data
-                self._tally.add("status", SPARED, 1, now_s)
+                self._coalesced = data
+                self._counters.add("status", COALESCED, 1, now_s)
                 return
-            self._spared = None
+            self._coalesced = None
         self._take_status(data, found)
         self._wake()
 
@@ -226,7 +226,7 @@ class Intake:
         with self._up_to_date():
             if not self._admit("status", status.session, 1, now_s):
                 return
-            self._tally.add("status", USED, 1, now_s)
+            self._counters.add("status", USED, 1, now_s)
             self._essentials = found
             self._last_status_s = now_s
             self._expected(status.basis_id, status.config_id, now_s)
@@ -235,23 +235,23 @@ class Intake:
 
     def acknowledgement(self, acknowledgement: wire.Acknowledgement, *, known: bool) -> None:
         """Take the RTC's word on a reconstructor."""
-        self._take_spared(at_once=True)
+        self._take_coalesced(at_once=True)
         now_s = self._clock()
         with self._up_to_date():
             self._counted["unknown"] += not known
             if self._admit("ack", acknowledgement.session, 1, now_s):
-                self._tally.add("ack", USED, 1, now_s)
+                self._counters.add("ack", USED, 1, now_s)
                 self._put(acknowledgement)
         self._wake()
 
     def liveliness(self, *, alive: bool) -> None:
         """Take the appearance or disappearance of the RTC's token."""
-        self._take_spared(at_once=True)
+        self._take_coalesced(at_once=True)
         with self._up_to_date():
             self._rtc_alive = alive
             if not alive:
                 self._sessions.leave()
-        appeared = ev.Noted(name="rtc.appeared", text="the RTC is there")
+        appeared = ev.LogEvent(name="rtc.appeared", text="the RTC is there")
         self.event(appeared if alive else ev.RtcVanished())
 
     def malformed(self, kind: str, error: WireError) -> None:
@@ -261,20 +261,20 @@ class Intake:
         self._wake()
 
     def _complain(self, kind: str, error: WireError, now_s: float) -> None:
-        self._tally.add(kind, MALFORMED, 1, now_s, str(error))
-        if self._is_news(f"malformed {kind}", now_s):
+        self._counters.add(kind, MALFORMED, 1, now_s, str(error))
+        if self._is_new(f"malformed {kind}", now_s):
             text = f"{kind}: {error}"
-            self._put(ev.Noted(name="message.malformed", text=text, level=Level.WARNING))
+            self._put(ev.LogEvent(name="message.malformed", text=text, level=Level.WARNING))
 
     def failed(self, kind: str) -> bool:
         """Count a fault of the service itself; return whether it is the first of a burst."""
         with self._lock:
             self._counted["failed"] += 1
-            return self._is_news(f"failed {kind}", self._clock())
+            return self._is_new(f"failed {kind}", self._clock())
 
     def event(self, event: LinkEvent) -> None:
         """Queue an event and wake the consumer."""
-        self._take_spared(at_once=True)
+        self._take_coalesced(at_once=True)
         with self._up_to_date():
             self._put(event)
         self._wake()
@@ -284,7 +284,7 @@ class Intake:
         ring = self._ring
         self._events.append(_Put(event=event, ring=ring, end=0 if ring is None else ring.head))
 
-    def _is_news(self, complaint: str, now_s: float) -> bool:
+    def _is_new(self, complaint: str, now_s: float) -> bool:
         """Return whether a complaint is the first of a burst of equal ones."""
         if now_s - self._complained_s.get(complaint, -math.inf) < BURST_S:
             return False
@@ -317,23 +317,23 @@ class Intake:
     def events(self) -> list[LinkEvent]:
         """Return what has happened since the last call, oldest first."""
         self._rung = False
-        self._take_spared()
+        self._take_coalesced()
         with self._up_to_date():
             events = [put.event for put in self._events]
             self._events.clear()
         return events
 
-    def _take_spared(self, *, at_once: bool = False) -> None:
+    def _take_coalesced(self, *, at_once: bool = False) -> None:
         """Take the last of a flood of statuses in once it is due, or before what it said next.
 
         Told after its word on a matrix, or its end, it would deny what has happened since.
         """
         with self._lock:
-            data, last_s = self._spared, self._last_status_s
+            data, last_s = self._coalesced, self._last_status_s
             due = at_once or (last_s or 0.0) + STATUS_INTERVAL_S <= self._clock()
             if data is None or not due:
                 return
-            self._spared, self._changes = None, 0
+            self._coalesced, self._changes = None, 0
         try:
             self._take_status(data, wire.essentials(data))
         except WireError as error:
@@ -348,7 +348,7 @@ class Intake:
     def statistics(self) -> LinkStatistics:
         """Return all counters as they are now."""
         with self._up_to_date():
-            now_s, tally = self._clock(), self._tally
+            now_s, tally = self._clock(), self._counters
             malformed = {k: n for (k, fate), n in tally.totals.items() if fate == MALFORMED}
             return LinkStatistics(
                 rtc_alive=self._rtc_alive,
@@ -365,7 +365,7 @@ class Intake:
                 events_dropped=self._counted["dropped"],
                 callback_errors=self._counted["failed"],
                 frame_age_s=_age_s(self._last_frame_s, now_s),
-                fates=tally.fates(now_s),
+                dispositions=tally.dispositions(now_s),
                 status_age_s=_age_s(self._last_status_s, now_s),
                 session_age_s=now_s - self._begun_s,
                 session_waiting=self._sessions.waiting(now_s),
@@ -379,7 +379,7 @@ class Intake:
         wrong = self._expected(header.basis_id, header.config_id, now_s) or self._misshapen(header)
         if wrong:
             reason, text = wrong
-            self._tally.add("frames", reason, header.n, now_s, text)
+            self._counters.add("frames", reason, header.n, now_s, text)
         return not wrong
 
     def _misshapen(self, header: wire.FrameHeader) -> tuple[str, str] | None:
@@ -405,7 +405,7 @@ class Intake:
             reason, text = wrong
             batches = self._ring.leapt(batch) if reason == LEAP else []
             if not batches:
-                self._tally.add("frames", reason, header.n, now_s, text)
+                self._counters.add("frames", reason, header.n, now_s, text)
         for each in batches:
             self._place(self._ring, each, now_s)
 
@@ -414,9 +414,9 @@ class Intake:
         counts = self._counts
         before = counts.copy()
         ring.store(batch, now_s)
-        self._tally.add("frames", USED, counts["received"] - before["received"], now_s)
+        self._counters.add("frames", USED, counts["received"] - before["received"], now_s)
         for name, text in PLACED.items():
-            self._tally.add("frames", name, counts[name] - before[name], now_s, text)
+            self._counters.add("frames", name, counts[name] - before[name], now_s, text)
 
     def _capacity(self, header: wire.FrameHeader) -> int:
         row_bytes = 4 * (header.n_slopes + 2 * header.n_modes)
@@ -430,15 +430,15 @@ class Intake:
         if admission.changed:
             self._shape, self._begun_s = None, now_s
             self._last_status_s, self._essentials = None, ()
-            self._tally.begin()
+            self._counters.begin()
             self._put(ev.SessionStarted(session=session))
         if not admission.accepted:
             text = f"session {session}, while session {current} sends"
-            self._tally.add(kind, "session", n, now_s, text)
-        rival = admission.rival
-        if rival is not None and current and self._is_news(f"second {rival}", now_s):
+            self._counters.add(kind, "session", n, now_s, text)
+        rival = admission.other_session
+        if rival is not None and current and self._is_new(f"second {rival}", now_s):
             told = f"two RTCs send at once, sessions {current} and {rival}: stop one of them"
-            self._put(ev.Trouble(name=SECOND_RTC, text=told))
+            self._put(ev.ConditionChanged(name=SECOND_RTC, text=told))
         return admission.accepted
 
     def _expected(self, basis_id: str, config_id: str, now_s: float) -> tuple[str, str] | None:
@@ -447,16 +447,16 @@ class Intake:
             self._basis_id = self._basis_id or basis_id
             self._config_id = self._config_id or config_id
             told = f"basis {self._basis_id}, configuration {self._config_id}"
-            self._put(ev.Noted(name="ids.adopted", text=told))
+            self._put(ev.LogEvent(name="ids.adopted", text=told))
         expected, found = (self._basis_id, self._config_id), (basis_id, config_id)
         if found == expected:
             return None
-        if self._is_news("ids", now_s):
+        if self._is_new("ids", now_s):
             told = (
                 f"the RTC's basis and configuration are {' and '.join(found)}, expected "
                 f"{' and '.join(expected)}: no estimate, no publication until they agree"
             )
-            self._put(ev.Trouble(name=OTHER_BASIS, text=told))
+            self._put(ev.ConditionChanged(name=OTHER_BASIS, text=told))
         which = "basis" if basis_id != self._basis_id else "config"
         return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"
 

@@ -21,7 +21,7 @@ MALFORMED: Final = "malformed"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fate:
+class Disposition:
     """What has become of messages of one kind, or of frames, in the last seconds."""
 
     kind: str
@@ -40,7 +40,7 @@ class Fate:
     """Of the last one: what was found and what was expected; empty: nothing was wrong."""
 
 
-class Tally:
+class Counters:
     """Counts what has become of everything that came; not thread-safe."""
 
     __slots__ = ("_bins", "_last", "totals")
@@ -71,17 +71,19 @@ class Tally:
         """Return the totals of one kind since the start, by outcome."""
         return {o: n for (k, o), n in self.totals.items() if k == kind and o not in but}
 
-    def fates(self, now_s: float) -> tuple[Fate, ...]:
+    def dispositions(self, now_s: float) -> tuple[Disposition, ...]:
         """Return what has become of everything, the most frequent first."""
         recent: Counter[tuple[str, str]] = Counter()
         for start_s, counts in self._bins:
             if now_s - start_s <= RECENT_S:
                 recent.update(counts)
         fates = (
-            Fate(kind=kind, outcome=outcome, n=recent[kind, outcome], age_s=now_s - s, text=text)
+            Disposition(
+                kind=kind, outcome=outcome, n=recent[kind, outcome], age_s=now_s - s, text=text
+            )
             for (kind, outcome), (s, text) in self._last.items()
         )
-        return tuple(sorted(fates, key=lambda fate: -fate.n))
+        return tuple(sorted(fates, key=lambda disposition: -disposition.n))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,7 +144,7 @@ class LinkStatistics:
     frame_age_s: float | None
     """Seconds since the last frame arrived, by arrival; None: none has."""
 
-    fates: tuple[Fate, ...] = ()
+    dispositions: tuple[Disposition, ...] = ()
     """What has become of frames and messages, by kind and outcome, the most frequent first."""
 
     status_age_s: float | None = None

@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 MARGIN_SUBAP = 3.0
 """Surface kept around the nominal pupil: what the largest shift and magnification can reach."""
 
-LEAST_POINTS_PER_SUBAPERTURE = 2.0
+MIN_POINTS_PER_SUBAPERTURE = 2.0
 """Below, the table itself has lost the high modes."""
 
 ENOUGH_POINTS_PER_SUBAPERTURE = 4.0
@@ -143,10 +143,10 @@ def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedB
         If the table is too coarse for the sensor.
     """
     step = table.pitch_m / instrument.subaperture_m
-    if step > 1.0 / LEAST_POINTS_PER_SUBAPERTURE:
+    if step > 1.0 / MIN_POINTS_PER_SUBAPERTURE:
         raise ModelError(
             f"modes: found a table of {1 / step:.2f} points per subaperture; expected at least "
-            f"{LEAST_POINTS_PER_SUBAPERTURE:g}, {ENOUGH_POINTS_PER_SUBAPERTURE:g} for good"
+            f"{MIN_POINTS_PER_SUBAPERTURE:g}, {ENOUGH_POINTS_PER_SUBAPERTURE:g} for good"
         )
     reach = (instrument.wfs.pupil_diameter / 2 + MARGIN_SUBAP) / step
     ny, nx = table.known.shape

@@ -22,7 +22,7 @@ from service.runtime.estimates import NoisySums
 from service.runtime.ports import RtcPort, StorePort, WorkerPort
 from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking import events as ev
-from service.tracking.alarms import Act, forbidding
+from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.events import Effect, Event
 from service.tracking.loop import commanded_gains, extended_gains, same_gains
 from service.tracking.products import (
@@ -91,8 +91,8 @@ class Actions:
         match effect:
             case ev.MakeMatrix():
                 return await self._make(effect, state)
-            case ev.CopyMatrix():
-                return await self._copy(effect, state)
+            case ev.RepublishMatrix():
+                return await self._republish(effect, state)
             case ev.JudgeMatrix() | ev.JudgeProposal():
                 return await self._judge(effect, state)
             case ev.FetchMatrix(id=matrix_id):
@@ -136,7 +136,7 @@ class Actions:
         self._bridge.offer(record.manifest(layout, state.rtc, system), matrix)
         self._bridge.set_current(record.id)
 
-    async def keep_measured(self, heard: MeasuredMatrix) -> Event:
+    async def keep_measured(self, received: MeasuredMatrix) -> Event:
         """Archive an interaction matrix the RTC has measured, whoever asked for it.
 
         Raises
@@ -144,11 +144,11 @@ class Actions:
         ArchiveError
             If it cannot be written, or another one has its id.
         """
-        record = MeasurementRecord.sent(heard.manifest)
-        if heard.matrix is not None:
+        record = MeasurementRecord.sent(received.manifest)
+        if received.matrix is not None:
             instrument = self.instrument.name
             store = self._archive.measured.store
-            await asyncio.to_thread(store, record, heard.matrix, instrument)
+            await asyncio.to_thread(store, record, received.matrix, instrument)
         return ev.MatrixMeasured(record=record)
 
     async def _ask(self, request: wire.Command) -> Event | None:
@@ -180,7 +180,7 @@ class Actions:
             record=record, wanted=False, asked_modes=effect.n_modes, why_fewer=made.why_fewer
         )
 
-    async def _copy(self, effect: ev.CopyMatrix, state: TrackerState) -> Event:
+    async def _republish(self, effect: ev.RepublishMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), state.registration
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
@@ -414,7 +414,7 @@ def judged_now(state: TrackerState, gains: tuple[float, ...]) -> Judged:
 def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None:
     """Return how many modes the loop holds with, if these are its gains; None: it does not."""
     rtc = state.rtc
-    if rtc is None or rtc.loop == "open" or forbidding(state, Act.MEASURE) is not None:
+    if rtc is None or rtc.loop == "open" or blocking_alarm(state, Interlock.MEASURE) is not None:
         return None
     n_modes = rtc.n_controlled
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None

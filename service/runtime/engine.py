@@ -13,32 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.estimation.dither_monitor import LOUDER, DitherMeasurement
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra
 from service.estimation.passive import Passive
-from service.estimation.played import LOUDER, Finding
 from service.estimation.random_dither import Correlated
 from service.estimation.windows import WindowRefused
 from service.model.slopes import likely_kind
-from service.runtime.looks import taken
-from service.runtime.streams import (
+from service.runtime.estimator_bank import (
     VERDICTS,
-    Streams,
+    EstimatorBank,
     Window,
-    fed,
+    process_block,
     with_dither,
     with_matrix,
     with_rtc,
 )
+from service.runtime.passive_sums import take_passive_sums
 from service.runtime.worker import Description
 from service.tracker import step
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.activity import Activity, under_way
-from service.tracking.alarms import Act, forbidding
+from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
+from service.tracking.running_operations import OperationKind, under_way
 from service.tracking.state import Level, TrackerState
 from service.wire import Status
 
@@ -91,25 +91,25 @@ class Engine:
     ) -> None:
         self.state = state
         self.policy = policy
-        self.streams: Streams | None = None
+        self.bank: EstimatorBank | None = None
         """None until the optical model is prepared."""
 
         self._driver = driver
         self._step = step
-        self._lent: tuple[Streams, TrackerState] | None = None
+        self._checked_out: tuple[EstimatorBank, TrackerState] | None = None
 
-    def prepared(self, description: Description) -> None:
+    def set_description(self, description: Description) -> None:
         """Take what the optical model expects of telemetry: estimators begin to listen."""
-        self.streams = Streams(description=description)
+        self.bank = EstimatorBank(description=description)
         self.policy = replace(
             self.policy, mode_information=description.mode_information, start=description.start
         )
 
     def begin_anew(self) -> None:
         """Give up what the estimators have gathered; they listen from here on."""
-        self._lent = None
-        if self.streams is not None:
-            self.streams = Streams(description=self.streams.description)
+        self._checked_out = None
+        if self.bank is not None:
+            self.bank = EstimatorBank(description=self.bank.description)
             self._follow()
 
     def post(self, event: Event) -> tuple[Effect, ...]:
@@ -132,39 +132,39 @@ class Engine:
             self._driver.swapped(self.state.in_use)
         return effects
 
-    def hear(self, event: Event) -> None:
+    def receive(self, event: Event) -> None:
         """Take in what came over the link besides frames."""
         self.post(event)
-        if self.streams is not None:
-            for news in shape_news(self.streams, self.state):
+        if self.bank is not None:
+            for news in detect_shape_change(self.bank, self.state):
                 self.post(news)
 
     def feed(self, blocks: Iterable[FrameBlock]) -> None:
         """Take in frames; windows that end in them are handed on to be fitted."""
-        streams = self.lend()
-        if streams is None:
+        bank = self.checkout()
+        if bank is None:
             return
         windows: list[Window] = []
         try:
-            streams, windows = looked_at(streams, blocks)
+            bank, windows = process_blocks(bank, blocks)
         finally:
-            self.give_back(streams, windows)
+            self.checkin(bank, windows)
 
-    def lend(self) -> Streams | None:
+    def checkout(self) -> EstimatorBank | None:
         """Return the estimators, to look at frames elsewhere; None: the model is being prepared.
 
         Until they are given back they follow nothing, and nobody may have sums of them, or teach
         them a matrix. A look that fails gives them back as they were.
         """
-        self._lent = None if self.streams is None else (self.streams, self.state)
-        return self.streams
+        self._checked_out = None if self.bank is None else (self.bank, self.state)
+        return self.bank
 
-    def give_back(self, streams: Streams, windows: Iterable[Window]) -> None:
+    def checkin(self, bank: EstimatorBank, windows: Iterable[Window]) -> None:
         """Take the estimators as they are after frames, unless they have begun anew meanwhile."""
-        if self._lent is None:
+        if self._checked_out is None:
             return
-        (before, state), self._lent = self._lent, None
-        self.streams = streams
+        (before, state), self._checked_out = self._checked_out, None
+        self.bank = bank
         if self.state is not state:
             self._follow()
         for window in windows:
@@ -172,7 +172,7 @@ class Engine:
                 self.post(ev.WindowLost(refused=window))
             else:
                 self._driver.fit(window)
-        for event in news(before.dither_silent_s, self.streams, self.state):
+        for event in detect_changes(before.dither_silent_s, self.bank, self.state):
             self.post(event)
 
     @property
@@ -184,133 +184,142 @@ class Engine:
         state, now_ns = self.state, self._driver.now_ns()
         if state.registration is None or state.alarms or state.on_probation:
             return 0.0
-        dithers = (Activity.OWN_DITHER, Activity.OTHER_DITHER)
-        steady = all(running.activity in dithers for running in under_way(state, now_ns))
+        dithers = (OperationKind.OWN_DITHER, OperationKind.OTHER_DITHER)
+        steady = all(running.kind in dithers for running in under_way(state, now_ns))
         return STEADY_GATHER_S if steady else 0.0
 
     def take_sums(self) -> Passive | str | None:
         """Return the sums of ordinary telemetry and begin new ones, or why there are none yet.
 
-        None: some is left out beside a dither. Ask every ``WATCH_INTERVAL_S``.
+        None: some is left out beside a dither. Ask every ``PASSIVE_INTERVAL_S``.
         """
-        if self.streams is None:
+        if self.bank is None:
             return "no passive estimate: the optical model is being prepared"
-        known, now_ns = self.state.registration, self._driver.now_ns()
+        registration, now_ns = self.state.registration, self._driver.now_ns()
         told = (
-            known is not None
-            and not known.doubt
-            and now_ns - known.window_ns_utc < TOLD_S * SECOND_NS
+            registration is not None
+            and not registration.doubt
+            and now_ns - registration.window_ns_utc < TOLD_S * SECOND_NS
         )
-        self.streams, sums = taken(self.streams, told=told)
+        self.bank, sums = take_passive_sums(self.bank, has_windows=told)
         return sums
 
     def learn(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:
         """Know the numbers of a reconstructor, to compare commands with them."""
-        if self.streams is not None:
-            self.streams = with_matrix(self.streams, matrix_id, matrix)
+        if self.bank is not None:
+            self.bank = with_matrix(self.bank, matrix_id, matrix)
 
     def _follow(self) -> None:
         """Keep the estimators in step with the RTC and the dither."""
-        if self.streams is None or self._lent is not None:
+        if self.bank is None or self._checked_out is not None:
             return
-        self.streams, note = followed(self.streams, self.state, self.policy)
+        self.bank, note = follow_state(self.bank, self.state, self.policy)
         if note is not None:
             self.post(note)
 
 
-def looked_at(streams: Streams, blocks: Iterable[FrameBlock]) -> tuple[Streams, list[Window]]:
+def process_blocks(
+    bank: EstimatorBank, blocks: Iterable[FrameBlock]
+) -> tuple[EstimatorBank, list[Window]]:
     """Return the estimators after these frames, and the windows that ended in them."""
     windows: list[Window] = []
     for block in blocks:
-        streams, ended = fed(streams, block)
+        bank, ended = process_block(bank, block)
         windows += ended
-    return streams, windows
+    return bank, windows
 
 
-def followed(
-    streams: Streams, state: TrackerState, policy: Policy
-) -> tuple[Streams, ev.Noted | None]:
+def follow_state(
+    bank: EstimatorBank, state: TrackerState, policy: Policy
+) -> tuple[EstimatorBank, ev.LogEvent | None]:
     """Keep the streaming estimators in step with the RTC and the dither.
 
     Returns the streams, and what to put on record when the dither cannot be read.
     """
-    if forbidding(state, Act.ASK) is not None:
-        return with_rtc(streams, None), None
-    streams = with_rtc(streams, state.rtc)
+    if blocking_alarm(state, Interlock.ASK) is not None:
+        return with_rtc(bank, None), None
+    bank = with_rtc(bank, state.rtc)
     dither = state.dither
     try:
-        return with_dither(streams, dither, policy.window_s), None
+        return with_dither(bank, dither, policy.window_s), None
     except ModelError as error:
         unusable = None if dither is None else replace(dither, asked_ns_utc=0)
-        note = ev.Noted(name="dither.unusable", text=str(error), level=Level.WARNING)
-        return replace(streams, cutter=None, dither=unusable), note
+        note = ev.LogEvent(name="dither.unusable", text=str(error), level=Level.WARNING)
+        return replace(bank, cutter=None, dither=unusable), note
 
 
-def news(was_silent_s: float, streams: Streams, state: TrackerState) -> list[Event]:
+def detect_changes(was_silent_s: float, bank: EstimatorBank, state: TrackerState) -> list[Event]:
     """Return what blocks of telemetry have brought besides windows.
 
     A dither that should be in the frames is missed twice a second; ``was_silent_s`` is for how
     long it had been before these blocks.
     """
     found: list[Event] = []
-    silent_s, dither = streams.dither_silent_s, streams.dither
+    silent_s, dither = bank.dither_silent_s, bank.dither
     due = silent_s >= SILENT_S and int(2 * silent_s) > int(2 * was_silent_s)
     if dither is not None and due:
         found.append(ev.DitherSilent(id=dither.id, silent_s=silent_s))
-    if dither is not None and streams.played is not None:
-        found += _misplayed(dither.id, streams.played, state)
-        found += _answered(streams, state)
-    lines = () if streams.vibrations is None else streams.vibrations.lines_hz
-    if streams.vibrations is not None and lines != state.vibrations_hz:
+    if dither is not None and bank.dither_measurement is not None:
+        found += _detect_other_dither(dither.id, bank.dither_measurement, state)
+        found += _answered(bank, state)
+    lines = () if bank.vibrations is None else bank.vibrations.lines_hz
+    if bank.vibrations is not None and lines != state.vibrations_hz:
         found.append(ev.Vibrations(lines_hz=lines))
-    for name, trouble, over in troubles(streams):
-        found += ev.Trouble.news(state, name, trouble, over, streams.heard_ns_utc)
-    holds = streams.rejection.holds
+    for name, trouble, over in detect_conditions(bank):
+        found += ev.ConditionChanged.detect(state, name, trouble, over, bank.received_ns_utc)
+    holds = bank.rejection.holds
     if holds is not None and holds is not state.loop_holds:
         found.append(ev.LoopHeld(holds=holds))
-    judged, trial = streams.comparison.found, state.probation
+    judged, trial = bank.comparison.found, state.probation
     if judged is not None and trial is not None and trial.awaits(judged.before, judged.after):
         found.append(ev.Compared(finding=judged))
     return found
 
 
-def _misplayed(dither_id: str, played: Finding, state: TrackerState) -> list[Event]:
+def _detect_other_dither(
+    dither_id: str, measurement: DitherMeasurement, state: TrackerState
+) -> list[Event]:
     """Return what the frames hold of the dither, where it is told for the first time or is over."""
-    told = state.dithering
+    told = state.dither_policy
     raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
-    louder = played.found_m > LOUDER * told.amiss_m
-    news = told.amiss_id != dither_id or louder if played.text else raised
+    louder = measurement.found_m > LOUDER * told.amiss_m
+    news = told.amiss_id != dither_id or louder if measurement.text else raised
     if not news:
         return []
     return [
         ev.DitherMeasured(
-            id=dither_id, found_m=played.found_m, asked_m=played.asked_m, text=played.text
+            id=dither_id,
+            found_m=measurement.found_m,
+            asked_m=measurement.asked_m,
+            text=measurement.text,
         )
     ]
 
 
-def _answered(streams: Streams, state: TrackerState) -> list[Event]:
+def _answered(bank: EstimatorBank, state: TrackerState) -> list[Event]:
     """Return that the slopes do not answer the dither, or do so again.
 
     Of an open loop, and of one that is being closed, the optical gain may be next to nothing.
     """
-    found = None if streams.played is None else streams.played.unanswered
+    found = None if bank.dither_measurement is None else bank.dither_measurement.unanswered
     raised = state.alarm(alarms.MIRROR_SILENT) is not None
-    closed = len(streams.in_loop) > 0 and not state.acquisition.under_way
+    closed = len(bank.in_loop) > 0 and not state.acquisition.under_way
     if found is None or not closed or not (found or raised):
         return []
     text = found or "the slopes answer the dither again"
-    t_ns = streams.heard_ns_utc
-    return [ev.Trouble(name=alarms.MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)]
+    t_ns = bank.received_ns_utc
+    return [
+        ev.ConditionChanged(name=alarms.MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)
+    ]
 
 
-def shape_news(streams: Streams, state: TrackerState) -> list[ev.Trouble]:
+def detect_shape_change(bank: EstimatorBank, state: TrackerState) -> list[ev.ConditionChanged]:
     """Return whether it has changed that the RTC's telemetry fits the instrument file."""
     if state.rtc is None:
         return []
-    wrong = shape_mismatch(streams.description, state.rtc)
+    wrong = shape_mismatch(bank.description, state.rtc)
     over = "the RTC's telemetry fits the instrument file again"
-    return ev.Trouble.news(state, alarms.OTHER_INSTRUMENT, wrong, over)
+    return ev.ConditionChanged.detect(state, alarms.OTHER_INSTRUMENT, wrong, over)
 
 
 def shape_mismatch(description: Description, rtc: Status) -> str | None:
@@ -324,9 +333,9 @@ def shape_mismatch(description: Description, rtc: Status) -> str | None:
     )
 
 
-def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
+def detect_conditions(bank: EstimatorBank) -> list[tuple[str, str | None, str]]:
     """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
-    health, edge, off = streams.health, streams.edge, streams.off
+    health, edge, off = bank.health, bank.edge, bank.command_residual
     diverging = (
         f"the loop is diverging: its high modes carry {health.ratio:.0f} times what turbulence "
         "asks of them; open the loop, lower the gain or control fewer modes"
@@ -341,12 +350,13 @@ def troubles(streams: Streams) -> list[tuple[str, str | None, str]]:
         "measured, made or sent until the RTC sends metres"
     )
     unlawful = (
-        f"the RTC's loop is not what its status tells: {'; '.join(streams.unlawful[-1:])}; mend "
+        f"the RTC's loop is not what its status tells: {'; '.join(bank.control_law_errors[-1:])}; "
+        f"mend "
         "its status, or its loop"
     )
-    n_verdicts = len(streams.unlawful)
+    n_verdicts = len(bank.control_law_errors)
     return [
-        (alarms.SLOPES_STAND, streams.standstill.text, "the slopes change again"),
+        (alarms.SLOPES_STAND, bank.standstill.text, "the slopes change again"),
         (
             alarms.WRONG_UNIT,
             absurd if health.absurd else None,

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
 from service.estimation import lockin, random_dither
-from service.estimation.lockin import Spectra, WindowEstimate
-from service.estimation.openloop import FarEstimate
+from service.estimation.lockin import LockInEstimate, Spectra
+from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.orientation import setting_written
 from service.estimation.passive import Passive
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
@@ -24,9 +24,8 @@ from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.runtime.worker import OpticsWorker, run_job
 from service.tracking import events as ev
-from service.tracking.alarms import WRONG_MATRIX, Act, forbidding
+from service.tracking.alarms import WRONG_MATRIX, Interlock, blocking_alarm
 from service.tracking.events import Event
-from service.tracking.evidence import fit_begins_at
 from service.tracking.loop import loop_numbers
 from service.tracking.products import (
     MeasurementRecord,
@@ -35,6 +34,7 @@ from service.tracking.products import (
     ReconstructorRecord,
 )
 from service.tracking.state import Level, TrackerState
+from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
 
 MatrixOf = Callable[[str], NDArray[np.float32]]
@@ -44,7 +44,7 @@ LONGEST_S = 30.0
 """Later ones are not joined to a window: α moves meanwhile."""
 
 
-class Backlog:
+class PendingWindow:
     """The window that waits for the worker: those that end meanwhile are joined to it.
 
     So windows grow as long as the worker needs, and what they say is not lost.
@@ -53,7 +53,7 @@ class Backlog:
     def __init__(self) -> None:
         self._window: Spectra | Correlated | None = None
         self._first_end_ns = 0
-        self._news = asyncio.Event()
+        self._new = asyncio.Event()
 
     @property
     def waits(self) -> bool:
@@ -66,7 +66,7 @@ class Backlog:
         late = window.t_end_ns_utc - self._first_end_ns > LONGEST_S * 1e9
         both = None if waiting is None or late else _joined(waiting, window)
         self._window = both or window
-        self._news.set()
+        self._new.set()
         if both is not None:
             return None
         self._first_end_ns = window.t_end_ns_utc
@@ -80,11 +80,11 @@ class Backlog:
 
     async def some(self) -> None:
         """Wait until a window is there."""
-        await self._news.wait()
+        await self._new.wait()
 
     def take(self) -> Spectra | Correlated | None:
         """Return the window that waits."""
-        self._news.clear()
+        self._new.clear()
         window, self._window = self._window, None
         return window
 
@@ -104,26 +104,26 @@ async def fitted(
     try:
         outcome = await _outcome(window, state, workers, matrix_of)
     except PyrcalError as error:
-        return lost(window, str(error))
+        return window_lost(window, str(error))
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
     began_ns = 0
     if state.rtc is not None:
         n_frames = window.n_windows * window.plan.n_frames
         began_ns = window.t_end_ns_utc - round(n_frames * 1e9 / state.rtc.frame_rate_hz)
-    if isinstance(outcome, FarEstimate):
-        return ev.FarFitted(found=outcome, began_ns_utc=began_ns)
+    if isinstance(outcome, WideCaptureEstimate):
+        return ev.WideCaptureFitted(found=outcome, began_ns_utc=began_ns)
     return ev.WindowFitted(estimate=outcome, began_ns_utc=began_ns)
 
 
 async def _outcome(
     window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
-) -> WindowEstimate | RandomEstimate | FarEstimate | WindowRefused:
-    rtc, known = state.rtc, state.registration
-    start = None if known is None else known.alpha
+) -> LockInEstimate | RandomEstimate | WideCaptureEstimate | WindowRefused:
+    rtc, registration = state.rtc, state.registration
+    start = None if registration is None else registration.alpha
     if isinstance(window, Correlated):
         return await workers.call(OpticsWorker.fit_random, window, start)
-    if state.acquisition.looks_afar:
+    if state.acquisition.uses_wide_capture:
         flux = None if rtc is None else rtc.flux
         return await workers.call(OpticsWorker.find, window, state.acquisition.alpha, flux)
     if rtc is None:
@@ -153,9 +153,9 @@ def _reconstructor(
     return np.zeros((0, spectra.slopes.shape[-1]), np.float32)
 
 
-async def watched(
+async def fit_passive(
     sums: Passive | str | None, state: TrackerState, workers: WorkerPort
-) -> ev.Watched | ev.Unwatched | ev.Noted | None:
+) -> ev.PassiveFitted | ev.PassiveUnavailable | ev.LogEvent | None:
     """Return what the watchdog makes of ordinary telemetry, or why it can make nothing of it.
 
     None: there is no more to tell than before.
@@ -163,18 +163,20 @@ async def watched(
     if sums is None:
         return None
     if isinstance(sums, str):
-        return None if sums == state.unwatched else ev.Unwatched(text=sums)
+        return (
+            None if sums == state.passive_unavailable_reason else ev.PassiveUnavailable(text=sums)
+        )
     last = sums.tail
     if last is None:
         return None
     end_ns = last.t0_ns_utc + (last.n_frames - 1) * last.dt_ns
     try:
-        estimate = await workers.call(OpticsWorker.watch, sums, fit_begins_at(state))
+        estimate = await workers.call(OpticsWorker.fit_passive, sums, fit_begins_at(state))
     except PyrcalError as error:
-        return ev.Noted(name="watchdog.failed", text=str(error), level=Level.WARNING)
+        return ev.LogEvent(name="watchdog.failed", text=str(error), level=Level.WARNING)
     if estimate is None:
         return None
-    return ev.Watched(
+    return ev.PassiveFitted(
         estimate=estimate,
         t_ns_utc=end_ns,
         began_ns_utc=sums.since_ns_utc,
@@ -182,7 +184,7 @@ async def watched(
     )
 
 
-async def listened(
+async def read_own_matrix(
     record: ReconstructorRecord,
     matrix: NDArray[np.float32],
     state: TrackerState,
@@ -195,28 +197,28 @@ async def listened(
     """
     if record.judged is not None and workers.first is not None:
         return []
-    known = state.registration
-    near = None if known is None else known.alpha
+    registration = state.registration
+    near = None if registration is None else registration.alpha
     try:
-        dialect = await workers.call(OpticsWorker.listen, matrix, near)
+        dialect = await workers.call(OpticsWorker.read_slope_convention, matrix, near)
         own, response = None, None
         if not dialect.wrong:
             own, response = await workers.call(
                 OpticsWorker.recognise, matrix, near, dialect.rotation_rad
             )
     except PyrcalError as error:
-        return [ev.Noted(name="slopes.unknown", text=str(error), level=Level.WARNING)]
+        return [ev.LogEvent(name="slopes.unknown", text=str(error), level=Level.WARNING)]
     events: list[Event] = []
     slopes = dialect.found if dialect.adopted else None
     if slopes is not None:
         text = f'orientation "auto": found {setting_written(slopes)} by {record.id}'
-        events.append(ev.Noted(name="slopes.adopted", text=text))
+        events.append(ev.LogEvent(name="slopes.adopted", text=text))
     if not dialect.wrong:
         workers.first = partial(run_job, OpticsWorker.adopt, slopes, response)
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} is as told"
-        events.append(ev.Trouble(name=WRONG_MATRIX, text=text, over=not wrong))
+        events.append(ev.ConditionChanged(name=WRONG_MATRIX, text=text, over=not wrong))
     if own is not None:
         strange = tuple(own.columns[~own.known].tolist())
         events.append(
@@ -231,7 +233,7 @@ async def listened(
     return events
 
 
-def lost(window: Telemetry, reason: str) -> Event:
+def window_lost(window: Telemetry, reason: str) -> Event:
     """Return what becomes of a window that cannot be fitted."""
     refused = WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc)
     return ev.WindowLost(refused=refused)
@@ -252,10 +254,13 @@ class NoisySums:
 
     def take(self, window: Correlated, state: TrackerState) -> None:
         """Add a window, if it is of the matrix under way and its telemetry can be believed."""
-        record, dither = state.gathering, state.dither
+        record, dither = state.noisy_measurement, state.dither
         if record is None or (dither is not None and dither.id != record.id):
             return
-        if window.plan.modes != record.modes or forbidding(state, Act.MEASURE) is not None:
+        if (
+            window.plan.modes != record.modes
+            or blocking_alarm(state, Interlock.MEASURE) is not None
+        ):
             return
         total = self._total if self._id == record.id else None
         self._id = record.id
@@ -274,11 +279,11 @@ class NoisySums:
         PyrcalError
             If it cannot be fitted or archived.
         """
-        total, known = self._total, state.registration
+        total, registration = self._total, state.registration
         if self._id != record.id or total is None:
             raise CommandError("no window of its dither was whole: see the log for the reasons")
         self._id = self._total = None
-        start = None if known is None else known.alpha
+        start = None if registration is None else registration.alpha
         record, numbers = await self._workers.call(work_out, record, total, start)
         store = self._archive.noisy.store
         await asyncio.to_thread(store, record, numbers, self._instrument.name)

@@ -35,7 +35,7 @@ ITS_WORK = "service.runtime.worker"
 R = TypeVar("R")
 
 
-class Apart:
+class JobProcess:
     """A process that does one piece of work after another; nothing runs before the first."""
 
     def __init__(self, *, nice: int) -> None:
@@ -117,7 +117,7 @@ class Apart:
         return self._line
 
 
-class Worker(Apart):
+class Worker(JobProcess):
     """A process that keeps the optical models between jobs."""
 
     def __init__(self) -> None:
@@ -131,7 +131,7 @@ class Worker(Apart):
             self._started()
         return self
 
-    def told(self, enter: Callable[[], None]) -> Worker:
+    def begun(self, enter: Callable[[], None]) -> Worker:
         """Tell it what to do before its first job, and return it; one that runs does it now."""
         self._enter = enter
         if self._line is not None:
@@ -141,7 +141,7 @@ class Worker(Apart):
         return self
 
     def run(self, job: Callable[[], R]) -> R:
-        """Do a job on the optical models; see :meth:`Apart.do`."""
+        """Do a job on the optical models; see :meth:`JobProcess.do`."""
         if self._enter is not None:
             self.do(self._enter, sent=self._enters)
             self._enter = None

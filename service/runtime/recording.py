@@ -19,7 +19,7 @@ import msgspec
 import structlog
 
 from service.archive import Archive, AuditEntry
-from service.archive.retention import Keeping, due, items, low_on_space, remove
+from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError
 from service.tracking import events as ev
@@ -31,7 +31,7 @@ from service.tracking.products import ReconstructorRecord
 from service.tracking.registration import HistoryEntry
 from service.tracking.resume import orders_of, resumed, saved_of, with_orders
 from service.tracking.state import Level, LogEntry, TrackerState
-from service.tracking.turn import logged
+from service.tracking.step_context import logged
 from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
 
 RETRY_S = 2.0
@@ -46,7 +46,7 @@ PRUNE_S = 3600.0
 REST_S = 0.5
 """Between two products that are removed: others want the disk, too."""
 
-MOST_WAITING = 10_000
+MAX_WAITING = 10_000
 """Lines of the audit trail, and estimates, that wait for a disk; newer ones are counted and
 dropped."""
 
@@ -54,11 +54,11 @@ BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 """What is not done unless why it is done is on the disk. What ends something never waits."""
 
 
-_LOGGED = ("who", "text", "address", "whence", "why", "answer")
+_LOGGED = ("who", "text", "address", "channel", "why", "answer")
 """What the log tells of an order."""
 
 
-class Whence(StrEnum):
+class Channel(StrEnum):
     """What an order came through."""
 
     PAGE = "page"
@@ -72,14 +72,14 @@ class Whence(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Caller:
+class Actor:
     """Whoever gives an order, besides the name in it."""
 
     address: str = ""
     key: str = ""
     """Name of the API key it was given with; empty: none is needed."""
 
-    whence: Whence = Whence.REST
+    channel: Channel = Channel.REST
     check: Callable[[], None] = lambda: None
     """Raises where what the order was decided on has changed."""
 
@@ -93,7 +93,7 @@ class Caller:
             name=name,
             text=text,
             address=self.address,
-            whence=self.whence,
+            channel=self.channel,
             why=why,
             answer=answer,
         )
@@ -119,7 +119,7 @@ class Recorder:
         self,
         archive: Archive,
         state: Callable[[], TrackerState],
-        post: Callable[[ev.Trouble], object],
+        post: Callable[[ev.ConditionChanged], object],
     ) -> None:
         self._archive = archive
         self._state = state
@@ -132,7 +132,7 @@ class Recorder:
         self._guard = threading.Lock()
         self._writing = threading.Lock()
         self._saving = asyncio.Lock()
-        self._news = asyncio.Event()
+        self._lines = asyncio.Event()
         self._trouble = ""
         self._log = structlog.get_logger()
         self.failures = 0
@@ -143,7 +143,7 @@ class Recorder:
         """Lines of the audit trail that are not on the disk yet."""
         return len(self._entries) + self._lost
 
-    def changed(self, before: TrackerState, after: TrackerState, news: Iterable[LogEntry]) -> None:
+    def changed(self, before: TrackerState, after: TrackerState, lines: Iterable[LogEntry]) -> None:
         """Take what a step has changed, to be written soon."""
         if after.reconstructors is not before.reconstructors:
             old = {record.id: record for record in before.reconstructors}
@@ -151,23 +151,23 @@ class Recorder:
             with self._guard:
                 self._records |= new
             if new:
-                self._news.set()
+                self._lines.set()
         if after.history is not before.history:
             last = before.history[-1:]
             new_ones = takewhile(lambda entry: entry not in last, reversed(after.history))
             with self._guard:
-                room = MOST_WAITING - len(self._estimates)
+                room = MAX_WAITING - len(self._estimates)
                 found = list(new_ones)[::-1]
                 self._estimates += found[:room]
                 self._lost += len(found[room:])
-        for entry in news:
+        for entry in lines:
             if entry.level is Level.DEBUG:
                 continue
             self.add(
                 AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
             )
 
-    async def ordered(self, command: Command, caller: Caller) -> None:
+    async def ordered(self, command: Command, actor: Actor) -> None:
         """Write down what an operator asks for, before it is done.
 
         Raises
@@ -175,21 +175,21 @@ class Recorder:
         StorageError
             If the disk refuses: it must not be done.
         """
-        self._order(command, caller)
+        self._order(command, actor)
         await self.flush()
 
-    def answered(self, command: Command, caller: Caller, answer: str) -> None:
+    def answered(self, command: Command, actor: Actor, answer: str) -> None:
         """Take down what an order has led to, as its giver was told."""
-        self._order(command, caller, ".answered", answer)
+        self._order(command, actor, ".answered", answer)
 
-    def refused(self, command: Command, caller: Caller, error: Exception) -> None:
+    def refused(self, command: Command, actor: Actor, error: Exception) -> None:
         """Take down why an operator does not get what was asked for."""
-        self._order(command, caller, ".refused", str(error))
+        self._order(command, actor, ".refused", str(error))
 
-    def _order(self, command: Command, caller: Caller, end: str = "", answer: str = "") -> None:
-        entry = caller.entry(
+    def _order(self, command: Command, actor: Actor, end: str = "", answer: str = "") -> None:
+        entry = actor.entry(
             f"{type(command).__name__}{end}",
-            asked_for(command, caller),
+            asked_for(command, actor),
             by=command.by,
             why=command.reason,
             answer=answer,
@@ -232,26 +232,26 @@ class Recorder:
     def failed(self, error: StorageError) -> None:
         """Raise the alarm, until the disk can be written again."""
         self.failures += 1
-        self._news.set()
+        self._lines.set()
         if self._trouble != str(error):
             self._trouble = str(error)
             text = (
                 f"{error}: free space there or mend the disk; until it can be written orders are "
                 "refused, nothing is made or sent by itself, and the audit trail waits in memory"
             )
-            self._post(ev.Trouble(name=ARCHIVE_FAILED, text=text))
+            self._post(ev.ConditionChanged(name=ARCHIVE_FAILED, text=text))
 
     async def run(self) -> None:
         """Write whenever there is something to be written."""
         while True:
-            await self._news.wait()
-            self._news.clear()
+            await self._lines.wait()
+            self._lines.clear()
             try:
                 await asyncio.to_thread(self._write)
                 if self._trouble:
                     await asyncio.to_thread(self._archive.probe)
                     self._trouble = ""
-                    self._post(ev.Trouble(name=ARCHIVE_FAILED, text="", over=True))
+                    self._post(ev.ConditionChanged(name=ARCHIVE_FAILED, text="", over=True))
             except StorageError as error:
                 self.failed(error)
                 await asyncio.sleep(RETRY_S)
@@ -263,12 +263,12 @@ class Recorder:
             await asyncio.sleep(SAVE_INTERVAL_S / 10)
             state = self._state()
             due = is_urgent(saved, state) or time.monotonic() >= next_s
-            if not (due and has_news(saved, state)):
+            if not (due and is_unsaved(saved, state)):
                 continue
             next_s = time.monotonic() + SAVE_INTERVAL_S
             try:
                 saved = await self._save_now()
-                self._news.set()  # estimates are written as seldom as what the next service needs
+                self._lines.set()  # estimates are written as seldom as what the next service needs
             except StorageError as error:
                 self.failed(error)
                 await asyncio.sleep(RETRY_S)
@@ -288,29 +288,31 @@ class Recorder:
             await asyncio.to_thread(leave, self._archive, state, time.time_ns())
         return state
 
-    async def keep_house(self, keeping: Keeping) -> None:
+    async def keep_house(self, retention: RetentionPolicy) -> None:
         """Look after the disk until cancelled, as the user has decided; in threads."""
         next_s = time.monotonic() + LOOK_S
         while True:
             low = self._state().alarm(DISK_LOW) is not None
             try:
                 folder = self._archive.directory
-                text = await asyncio.to_thread(low_on_space, folder, keeping, low=low)
+                text = await asyncio.to_thread(low_on_space, folder, retention, low=low)
                 if text is not None or low:
-                    self._post(ev.Trouble(name=DISK_LOW, text=text or "", over=text is None))
+                    self._post(
+                        ev.ConditionChanged(name=DISK_LOW, text=text or "", over=text is None)
+                    )
                 if time.monotonic() >= next_s:
                     next_s = time.monotonic() + PRUNE_S
-                    await self._prune(keeping)
+                    await self._prune(retention)
             except (OSError, ArchiveError) as error:  # a disk that refuses is told of elsewhere
                 self._log.warning("archive.not-looked-after", text=str(error))
             except Exception:  # noqa: BLE001 - a bug must not end the service
                 self._log.exception("archive.not-looked-after")
             await asyncio.sleep(LOOK_S)
 
-    async def _prune(self, keeping: Keeping) -> None:
+    async def _prune(self, retention: RetentionPolicy) -> None:
         """Remove what is old or too much, one by one; what has come into use meanwhile stays."""
         every = await asyncio.to_thread(items, self._archive, needed(self._state()))
-        for item, why in tuple(due(every, keeping, time.time_ns())):
+        for item, why in tuple(due(every, retention, time.time_ns())):
             if item.id in needed(self._state()):
                 continue
             entry = await asyncio.to_thread(remove, self._archive, item, why)
@@ -336,17 +338,17 @@ class Recorder:
     def add(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail, to be written soon."""
         with self._guard:
-            if len(self._entries) < MOST_WAITING:
+            if len(self._entries) < MAX_WAITING:
                 self._entries.append(entry)
             else:
                 self._lost += 1
-        self._news.set()
+        self._lines.set()
 
     def sampled(self, sample: TrendSample) -> None:
         """Take a sample of the trends; while the disk refuses, the oldest ones go."""
         with self._guard:
-            self._samples = [*self._samples, sample][-MOST_WAITING:]
-        self._news.set()
+            self._samples = [*self._samples, sample][-MAX_WAITING:]
+        self._lines.set()
 
     def _write(self) -> None:
         """Write all that waits as one; in a thread, one at a time."""
@@ -355,7 +357,7 @@ class Recorder:
                 records, entries = dict(self._records), tuple(self._entries)
                 estimates, samples = tuple(self._estimates), tuple(self._samples)
                 lost = self._lost
-            told = _told(lost) if lost else ()
+            told = _loss_text(lost) if lost else ()
             try:
                 if records or entries or estimates or samples:
                     entries_told = (*entries, *told)
@@ -386,12 +388,12 @@ def ids_of(text: str, state: TrackerState) -> dict[str, object]:
     return {name: found for name, found in ids.items() if found}
 
 
-def asked_for(command: Command, caller: Caller) -> str:
+def asked_for(command: Command, actor: Actor) -> str:
     """Return the fields of a command that say more than who and why, as JSON.
 
     Beside a key the name in the command is what somebody has called themselves.
     """
-    told = {"reason"} | ({"by"} if command.by == caller.key or not caller.key else set())
+    told = {"reason"} | ({"by"} if command.by == actor.key or not actor.key else set())
     said = {
         field.name: getattr(command, field.name)
         for field in fields(command)
@@ -400,8 +402,8 @@ def asked_for(command: Command, caller: Caller) -> str:
     return msgspec.json.encode(said).decode()
 
 
-def _told(lost: int) -> tuple[AuditEntry]:
-    text = f"{lost} lines came while the disk refused and {MOST_WAITING} waited already"
+def _loss_text(lost: int) -> tuple[AuditEntry]:
+    text = f"{lost} lines came while the disk refused and {MAX_WAITING} waited already"
     return (AuditEntry(t_ns_utc=time.time_ns(), who="service", name="archive.lost", text=text),)
 
 
@@ -440,7 +442,7 @@ def leave(archive: Archive, state: TrackerState, now_ns: int) -> None:
         archive.tracking.write(saved)
 
 
-def has_news(before: TrackerState, after: TrackerState) -> bool:
+def is_unsaved(before: TrackerState, after: TrackerState) -> bool:
     """Return whether something has been measured, or begun, that is not saved yet."""
     if is_urgent(before, after):
         return True
@@ -456,7 +458,7 @@ def is_urgent(before: TrackerState, after: TrackerState) -> bool:
     A service killed a second later would leave its own loop open to one that cannot know, or one
     that undoes what an operator has ordered; or would not know where the mirror's image was moved.
     """
-    if before.move is not after.move:
+    if before.offload is not after.offload:
         return True
     return orders_of(before) != orders_of(after) or _course(before) != _course(after)
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from service.control.gains import ModeGain
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
-from service.tracking.activity import Operating, operating
-from service.tracking.alarms import ALARMS, Kind, Note, Severity, Waiting
-from service.tracking.attention import muted, note_of, stale, worst
+from service.tracking.alarm_records import muted, record_of, stale, worst
+from service.tracking.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
 from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
 from service.tracking.policy import Policy
 from service.tracking.registration import Registration
+from service.tracking.running_operations import Operating, operating
 from service.tracking.sending import why_no_return
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
@@ -28,7 +28,7 @@ WINDOW_REFUSED = "window.refused"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pace:
+class WorkerLoad:
     """What the work of the last minute cost, and whether it keeps up."""
 
     worker_per_s: float | None = None
@@ -75,10 +75,10 @@ class Snapshot:
     ready_reason: str
     """What it waits for, or that it waits for nothing."""
 
-    waiting_for: tuple[Waiting, ...] = ()
+    waiting_for: tuple[Prerequisite, ...] = ()
     """Whom the service waits for and what they should do, what hinders most first."""
 
-    pace: Pace = field(default_factory=Pace)
+    worker_load: WorkerLoad = field(default_factory=WorkerLoad)
     """What the work costs."""
 
     archive_failures: int = 0
@@ -95,7 +95,7 @@ class Snapshot:
     @property
     def operating(self) -> Operating:
         """What the service is in, as a control room has it."""
-        hindered = "; ".join(wait.text for wait in self.waiting_for if wait.hinders)
+        hindered = "; ".join(wait.text for wait in self.waiting_for if wait.blocks)
         return operating(self.tracker, hindered, self.now_ns)
 
     @property
@@ -111,18 +111,20 @@ class Snapshot:
         return last and replace(last, t_ns_utc=last.last_ns_utc or last.t_ns_utc)
 
     @property
-    def alarms(self) -> tuple[AlarmShown, ...]:
+    def alarms(self) -> tuple[AlarmStatus, ...]:
         """Those that last, in the order in which they were raised."""
         raised = self.tracker.alarms
-        return tuple(AlarmShown(note=note_of(self.tracker, a), kind=a.kind) for a in raised)
+        return tuple(
+            AlarmStatus(record=record_of(self.tracker, a), definition=a.definition) for a in raised
+        )
 
     @property
-    def stale_alarms(self) -> tuple[AlarmShown, ...]:
+    def stale_alarms(self) -> tuple[AlarmStatus, ...]:
         """Those that have gone and nobody has acknowledged."""
-        return tuple(AlarmShown(note=note) for note in stale(self.tracker))
+        return tuple(AlarmStatus(record=record) for record in stale(self.tracker))
 
     @property
-    def muted_alarms(self) -> tuple[Note, ...]:
+    def muted_alarms(self) -> tuple[AlarmRecord, ...]:
         """Those that are muted, whether they last or not."""
         return muted(self.tracker)
 
@@ -134,8 +136,8 @@ class Snapshot:
     @property
     def alpha(self) -> Alpha | None:
         """Null until the first accepted window."""
-        known = self.tracker.registration
-        return None if known is None else Alpha(known=known, snapshot=self)
+        registration = self.tracker.registration
+        return None if registration is None else Alpha(registration=registration, snapshot=self)
 
     @property
     def no_return(self) -> str | None:
@@ -146,21 +148,21 @@ class Snapshot:
     def rtc(self) -> Rtc | None:
         """Null: no RTC has been heard, or it has vanished."""
         known = self.tracker.rtc
-        return None if known is None else Rtc(known=known)
+        return None if known is None else Rtc(status=known)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmShown:
+class AlarmStatus:
     """An alarm that lasts, or went unseen: how much it matters, what to do, who knows of it."""
 
-    note: Note
-    kind: Kind | None = None
+    record: AlarmRecord
+    definition: AlarmDefinition | None = None
     """None: it does not last."""
 
     @property
     def severity(self) -> Severity | None:
         """Null: it does not last."""
-        return None if self.kind is None else self.kind.severity
+        return None if self.definition is None else self.definition.severity
 
     @property
     def cause(self) -> str:
@@ -173,21 +175,21 @@ class AlarmShown:
         return self._known.do if self._known else ""
 
     @property
-    def _known(self) -> Kind | None:
-        return self.kind or ALARMS.get(self.note.name)
+    def _known(self) -> AlarmDefinition | None:
+        return self.definition or ALARMS.get(self.record.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Alpha:
     """The current estimate of the registration."""
 
-    known: Registration
+    registration: Registration
     snapshot: Snapshot
 
     @property
     def covariance(self) -> list[list[float]]:
         """4 x 4, now, floor included, in the units of the names and the order of ``parameters``."""
-        found: list[list[float]] = (self.known.total_covariance * COVARIANCE_SCALE).tolist()
+        found: list[list[float]] = (self.registration.total_covariance * COVARIANCE_SCALE).tolist()
         return found
 
     @property
@@ -198,12 +200,12 @@ class Alpha:
     @property
     def age_s(self) -> float:
         """Since the last telemetry that entered it arrived, seconds."""
-        return (self.snapshot.now_ns - self.known.arrived_ns_utc) / 1e9
+        return (self.snapshot.now_ns - self.registration.arrived_ns_utc) / 1e9
 
     @property
     def window_age_s(self) -> float | None:
         """Since the last dithered window arrived, seconds; null: not known."""
-        window_ns = self.known.window_ns_utc
+        window_ns = self.registration.window_ns_utc
         return (self.snapshot.now_ns - window_ns) / 1e9 if window_ns else None
 
     @property
@@ -212,17 +214,21 @@ class Alpha:
 
         Null: no jump is suspected.
         """
-        return None if self.known.candidate is None else self.known.candidate.alpha
+        return (
+            None
+            if self.registration.suspected_jump is None
+            else self.registration.suspected_jump.alpha
+        )
 
     @property
     def passive_bias(self) -> NDArray[np.float64] | None:
         """What the passive estimate reads more than α, as far as learnt; null: nothing is known."""
-        return None if self.known.bias is None else self.known.bias.offset
+        return None if self.registration.bias is None else self.registration.bias.offset
 
     @property
     def passive_bias_sigma(self) -> NDArray[np.float64] | None:
         """1 σ of it."""
-        bias = self.known.bias
+        bias = self.registration.bias
         return None if bias is None else np.sqrt(np.diag(bias.covariance))
 
 
@@ -230,13 +236,13 @@ class Alpha:
 class Rtc:
     """The RTC as its last status message shows it."""
 
-    known: Status
+    status: Status
 
     @property
     def gains(self) -> tuple[GainGroup, ...]:
         """Of all modes of the basis, 0 where uncontrolled: neighbours with the same gain."""
         groups, first = [], 0
-        for gain, run in groupby(self.known.gains):
+        for gain, run in groupby(self.status.gains):
             last = first + sum(1 for _ in run) - 1
             groups.append(GainGroup(first=first, last=last, gain=gain))
             first = last + 1
@@ -244,7 +250,7 @@ class Rtc:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GainTableShown:
+class ModeGainTable:
     """Optical gains, and the factors of the loop gains that undo them, mode by mode."""
 
     reconstructor: str | None

@@ -15,7 +15,7 @@ import structlog
 from numpy.typing import NDArray
 
 from service.archive import Archive, AuditEntry
-from service.archive.retention import EVERYTHING, Keeping
+from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra
@@ -25,38 +25,38 @@ from service.link.statistics import LinkStatistics
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
-from service.runtime.answers import Given
 from service.runtime.clock import ServiceClock
-from service.runtime.engine import Engine, looked_at
-from service.runtime.estimates import Backlog, fitted, listened, watched
-from service.runtime.keeping import TelemetryKeeper
-from service.runtime.looks import WATCH_INTERVAL_S
-from service.runtime.recording import Caller, Recorder, ids_of
-from service.runtime.refits import Refits
-from service.runtime.snapshot import Snapshot
-from service.runtime.streams import Streams, Window
-from service.runtime.trends import TrendSampler
-from service.runtime.waiting import (
-    Facts,
+from service.runtime.command_results import CarriedOut
+from service.runtime.engine import Engine, process_blocks
+from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
+from service.runtime.estimator_bank import EstimatorBank, Window
+from service.runtime.passive_sums import PASSIVE_INTERVAL_S
+from service.runtime.readiness import (
     Losses,
+    ReadinessInputs,
+    ReadinessLog,
     Revival,
-    Told,
-    news_of_link,
+    detect_link_changes,
     state_message,
     waiting_for,
 )
+from service.runtime.recording import Actor, Recorder, ids_of
+from service.runtime.refits import Refits
+from service.runtime.snapshot import Snapshot
+from service.runtime.telemetry_recorder import TelemetryRecorder
+from service.runtime.trends import TrendSampler
 from service.runtime.worker import Description, OpticsWorker
-from service.runtime.workers import PaceMeter, WorkerPool
+from service.runtime.workers import WorkerLoadMeter, WorkerPool
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Waiting
-from service.tracking.attention import is_news
+from service.tracking.alarm_records import changes_value
+from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState
-from service.tracking.turn import new_lines
+from service.tracking.step_context import new_lines
 from service.wire import TEXT_LIMIT, AlarmMessage
 
 GATHER_S = 0.16
@@ -70,7 +70,7 @@ ANSWERED_WITHIN_S = 3.0
 
 ASK_AGAIN_S = 0.02
 
-OPERATOR = Caller()
+OPERATOR = Actor()
 
 _LEVELS = {Level.ALARM: "error"}
 """Names of structlog's where they are others."""
@@ -88,7 +88,7 @@ class Supervisor:
         workers: WorkerPool,
         archive: Archive,
         actions: Actions,
-        keeping: Keeping = EVERYTHING,
+        retention: RetentionPolicy = EVERYTHING,
         clock: ServiceClock | None = None,
     ) -> None:
         self._clock = clock or ServiceClock()
@@ -103,10 +103,10 @@ class Supervisor:
 
         self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
         self._actions = actions
-        self._keeping = keeping
-        self.recordings = TelemetryKeeper(
+        self._telemetry_recorder = retention
+        self.recordings = TelemetryRecorder(
             archive=archive,
-            keeping=keeping,
+            retention=retention,
             system=state.system,
             tap=bridge.keep,
             audit=self._recorder.add,
@@ -114,16 +114,16 @@ class Supervisor:
         """Telemetry kept on request."""
         self.refits = Refits()
         """Reconstructors that operators have ordered."""
-        self._backlog = Backlog()
-        self._meter = PaceMeter(workers)
+        self._pending_window = PendingWindow()
+        self._worker_load = WorkerLoadMeter(workers)
         self._trends = TrendSampler(
             state=lambda: self._engine.state,
             frames=lambda: self.newest_frames,
             matrix=self.matrix,
             keep=self._recorder.sampled,
         )
-        self._eyes = ThreadPoolExecutor(1, "telemetry")
-        self._looking = asyncio.Lock()
+        self._telemetry_executor = ThreadPoolExecutor(1, "telemetry")
+        self._telemetry_lock = asyncio.Lock()
         """Held by whoever has, or changes, the estimators."""
 
         self._running: set[asyncio.Task[None]] = set()
@@ -145,36 +145,37 @@ class Supervisor:
     def snapshot(self) -> Snapshot:
         """Return what is known now."""
         link = self._bridge.statistics()
-        waiting = self._waiting(link)
+        waiting = self._waiting_for(link)
         return Snapshot(
             tracker=self._engine.state,
             link=link,
             now_ns=self._clock.now_ns(),
             started_ns=self._started_ns,
             policy=self.policy,
-            ready=not any(wait.hinders for wait in waiting),
-            ready_reason="; ".join(f"{wait.party}: {wait.text}" for wait in waiting) or "ready",
+            ready=not any(wait.blocks for wait in waiting),
+            ready_reason="; ".join(f"{wait.responsible}: {wait.text}" for wait in waiting)
+            or "ready",
             waiting_for=waiting,
-            pace=self._meter.pace,
+            worker_load=self._worker_load.worker_load,
             archive_failures=self._recorder.failures,
             archive_waiting=self._recorder.waiting,
         )
 
-    def _waiting(self, link: LinkStatistics) -> tuple[Waiting, ...]:
+    def _waiting_for(self, link: LinkStatistics) -> tuple[Prerequisite, ...]:
         """Return whom the service waits for now."""
-        facts = Facts(
+        inputs = ReadinessInputs(
             state=self._engine.state,
             link=link,
-            preparing=self._engine.streams is None,
-            worker_trouble=self._workers.trouble,
+            preparing=self._engine.bank is None,
+            worker_problem=self._workers.problem,
         )
-        return waiting_for(facts)
+        return waiting_for(inputs)
 
     def audit(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail that is of no command."""
         self._recorder.add(entry)
 
-    async def submit(self, command: Command, caller: Caller = OPERATOR) -> str:
+    async def submit(self, command: Command, actor: Actor = OPERATOR) -> str:
         """Carry out an operator's command; return one sentence on what came of it.
 
         It is on record before it is done, and so is why it is refused.
@@ -188,41 +189,41 @@ class Supervisor:
         StorageError
             If it cannot be recorded; nothing has been done.
         """
-        told = isinstance(command, cmd.SetValue) and not is_news(
+        told = isinstance(command, cmd.SetValue) and not changes_value(
             self._engine.state, command, self._clock.now_ns()
         )
         if told or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
-            return await self._carried_out(command)
+            return await self._result_of(command)
         try:
-            await self._recorder.ordered(command, caller)
+            await self._recorder.ordered(command, actor)
         except StorageError as error:
             if not isinstance(command, cmd.StopEverything):  # that one waits for no disk
-                self._recorder.refused(command, caller, error)
+                self._recorder.refused(command, actor, error)
                 raise
         try:
-            caller.check()
-            answer = await self._carried_out(command)
+            actor.check()
+            answer = await self._result_of(command)
         except PyrcalError as error:
-            self._recorder.refused(command, caller, error)
+            self._recorder.refused(command, actor, error)
             raise
-        self._recorder.answered(command, caller, answer)
+        self._recorder.answered(command, actor, answer)
         if isinstance(command, cmd.StopEverything | cmd.Resume):
             await self._recorder.keep_orders()
         return answer
 
-    async def _carried_out(self, command: Command) -> str:
+    async def _result_of(self, command: Command) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         before, running = self._engine.state, set(self._running)
         for effect in self._post(command):
             if isinstance(command, cmd.Refit) and isinstance(effect, ev.MakeMatrix):
                 self.refits.begin(effect, self._clock.now_ns())
-        given = Given(command, before, self._engine.state)
+        given = CarriedOut(command, before, self._engine.state)
         asked = self._running - running
         if asked and isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
             await asyncio.wait(asked)
         until_s = time.monotonic() + ANSWERED_WITHIN_S
         while True:
-            answer = given.answer(self._engine.state)
+            answer = given.result(self._engine.state)
             if answer.final or time.monotonic() > until_s:
                 return answer.text
             await asyncio.sleep(ASK_AGAIN_S)
@@ -240,7 +241,7 @@ class Supervisor:
             for action in self._running:
                 action.cancel()
             await asyncio.gather(*self._running, return_exceptions=True)
-            self._eyes.shutdown(wait=False)
+            self._telemetry_executor.shutdown(wait=False)
             self._recorder.close()
 
     async def _work(self) -> None:
@@ -248,18 +249,18 @@ class Supervisor:
             group.create_task(self._recorder.run())
             group.create_task(self._recorder.save())
             group.create_task(self.recordings.run())
-            group.create_task(self._recorder.keep_house(self._keeping))
+            group.create_task(self._recorder.keep_house(self._telemetry_recorder))
             description = await self._described()
-            self._engine.prepared(description)
+            self._engine.set_description(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
-            self._post(ev.Noted(name="service.ready", text=text))
-            for work in (self._listen, self._tick, self._fit, self._watch, self._trends.run):
+            self._post(ev.LogEvent(name="service.ready", text=text))
+            for work in (self._listen, self._tick, self._fit, self._fit_passive, self._trends.run):
                 group.create_task(work())
 
     @property
     def description(self) -> Description | None:
         """What the model expects of telemetry; None: it is being prepared."""
-        return None if self._engine.streams is None else self._engine.streams.description
+        return None if self._engine.bank is None else self._engine.bank.description
 
     async def _described(self) -> Description:
         """Return what the model expects of telemetry; a worker that dies is replaced."""
@@ -283,34 +284,38 @@ class Supervisor:
                     await rung.wait()
             rung.clear()
             await self._feed()
-            for heard in self._bridge.events():
-                if isinstance(heard, MeasuredMatrix):
-                    self._start(self._keep_measured(heard))
+            for event in self._bridge.events():
+                if isinstance(event, MeasuredMatrix):
+                    self._start(self._keep_measured(event))
                     continue
                 with self._surviving("an event of the link"):
-                    self._engine.hear(heard)
+                    self._engine.receive(event)
 
     async def _feed(self) -> None:
         """Take in frames, in a thread: who asks something meanwhile has an answer."""
         loop = asyncio.get_running_loop()
-        async with self._looking:
-            streams = self._engine.lend()
-            if streams is None:
+        async with self._telemetry_lock:
+            bank = self._engine.checkout()
+            if bank is None:
                 return
             blocks: list[FrameBlock] = []
-            found: tuple[Streams, list[Window]] = streams, []
+            found: tuple[EstimatorBank, list[Window]] = bank, []
             with self._surviving("telemetry"):
                 try:
-                    blocks, found = await loop.run_in_executor(self._eyes, self._taken_in, streams)
+                    blocks, found = await loop.run_in_executor(
+                        self._telemetry_executor, self._taken_in, bank
+                    )
                 finally:
-                    self._engine.give_back(*found)
+                    self._engine.checkin(*found)
             self.newest_frames = blocks[-1] if blocks else self.newest_frames
             for block in blocks:
-                self._meter.heard(block.n_frames * block.dt_ns * 1e-9)
+                self._worker_load.count_frames(block.n_frames * block.dt_ns * 1e-9)
 
-    def _taken_in(self, streams: Streams) -> tuple[list[FrameBlock], tuple[Streams, list[Window]]]:
+    def _taken_in(
+        self, bank: EstimatorBank
+    ) -> tuple[list[FrameBlock], tuple[EstimatorBank, list[Window]]]:
         blocks = self._bridge.drain(before_events=True)
-        return blocks, looked_at(streams, blocks)
+        return blocks, process_blocks(bank, blocks)
 
     @contextlib.contextmanager
     def _surviving(self, what: str) -> Iterator[None]:
@@ -333,15 +338,15 @@ class Supervisor:
         """Put a window where the worker finds it."""
         if isinstance(window, Correlated):
             self._actions.noisy.take(window, self._engine.state)
-        if self._backlog.waits:
-            self._meter.was_late()
-        given_up = self._backlog.put(window)
+        if self._pending_window.waits:
+            self._worker_load.was_late()
+        given_up = self._pending_window.put(window)
         if given_up is not None:
             self._post(ev.WindowLost(refused=given_up))
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, revival, losses = Told(), Revival(), Losses()
+        told, revival, losses = ReadinessLog(), Revival(), Losses()
         while True:
             link = self._bridge.statistics()
             if revival.due(link, time.monotonic()):
@@ -349,16 +354,16 @@ class Supervisor:
                 link = self._bridge.statistics()
             with self._surviving("a tick"):
                 self._post(ev.Tick())
-            self._meter.look()
-            for trouble in self._meter.news(self._engine.state):
+            self._worker_load.look()
+            for trouble in self._worker_load.detect_changes(self._engine.state):
                 self._post(trouble)
             now_ns = self._clock.now_ns()
             lost = losses.complaint(link, time.monotonic())
             also = {FRAMES_LOST: lost, CLOCK_LEAPT: self._clock.complaint()}
-            for event in news_of_link(link, self._engine.state, now_ns, also):
+            for event in detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
-            waiting = self._waiting(link)
-            for text in told.news(waiting, self._engine.state.alarms, now_ns):
+            waiting = self._waiting_for(link)
+            for text in told.due_lines(waiting, self._engine.state.alarms, now_ns):
                 self._note("waiting", text, Level.INFO)
             self._bridge.publish_state(state_message(self._engine.state, now_ns, waiting))
             raised = frozenset((a.name, a.text) for a in self._engine.state.alarms)
@@ -390,24 +395,24 @@ class Supervisor:
 
     async def _fit(self) -> None:
         while True:
-            await self._backlog.some()
+            await self._pending_window.some()
             async with self._workers.turn("fit"):
-                window = self._backlog.take()
+                window = self._pending_window.take()
                 if window is None:
                     continue
                 if isinstance(window, Spectra):
-                    self._meter.fitted(window.window_s)
+                    self._worker_load.fitted(window.window_s)
                 state, matrix = self._engine.state, self._actions.matrix
                 event = await fitted(window, state, self._workers, matrix)
             self._post(event)
 
-    async def _watch(self) -> None:
+    async def _fit_passive(self) -> None:
         while True:
-            await asyncio.sleep(WATCH_INTERVAL_S)
+            await asyncio.sleep(PASSIVE_INTERVAL_S)
             async with self._workers.turn("watch"):
-                async with self._looking:
+                async with self._telemetry_lock:
                     sums = self._engine.take_sums()
-                event = await watched(sums, self._engine.state, self._workers)
+                event = await fit_passive(sums, self._engine.state, self._workers)
             if event is not None:
                 self._post(event)
 
@@ -439,9 +444,9 @@ class Supervisor:
         """Offer the matrix in use to an RTC that comes late or asks again; watch what it does."""
         try:
             await asyncio.to_thread(self._actions.offer, self._engine.state)
-            if in_use is not None and self._engine.streams is not None:
+            if in_use is not None and self._engine.bank is not None:
                 matrix = await asyncio.to_thread(self._actions.matrix, in_use)
-                async with self._looking:
+                async with self._telemetry_lock:
                     self._engine.learn(in_use, matrix)
                 await self._hear_out(in_use, matrix)
         except PyrcalError as error:
@@ -452,7 +457,7 @@ class Supervisor:
         record = self._engine.state.reconstructor(in_use)
         if record is None:
             return
-        for event in await listened(record, matrix, self._engine.state, self._workers):
+        for event in await read_own_matrix(record, matrix, self._engine.state, self._workers):
             if self._engine.state.in_use == in_use:
                 self._post(event)
 
@@ -488,7 +493,7 @@ class Supervisor:
             self._note("measurement.not-kept", str(error), Level.WARNING)
 
     def _note(self, name: str, text: str, level: Level) -> None:
-        self._post(ev.Noted(name=name, text=text, level=level))
+        self._post(ev.LogEvent(name=name, text=text, level=level))
 
     def _tell(self, before: TrackerState) -> None:
         """Log what is new in the state's log, at its level, and have it recorded."""

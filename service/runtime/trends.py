@@ -75,14 +75,19 @@ def sample_of(
     state: TrackerState, now_ns: int, telemetry_ns: int | None, residual_m: float | None
 ) -> TrendSample:
     """Return what is known at this moment of what goes into a chart."""
-    known, rtc, margin, pointing = state.registration, state.rtc, state.margin, state.pointing
-    gains = () if known is None else known.optical_gains
+    registration, rtc, margin, pointing = (
+        state.registration,
+        state.rtc,
+        state.margin,
+        state.pointing,
+    )
+    gains = () if registration is None else registration.optical_gains
     flux = None if rtc is None else rtc.flux_images
     return TrendSample(
         t_ns_utc=now_ns,
         telemetry_ns_utc=telemetry_ns,
-        alpha=None if known is None else known.alpha,
-        sigma=None if known is None else known.sigma,
+        alpha=None if registration is None else registration.alpha,
+        sigma=None if registration is None else registration.sigma,
         wavefront_m=_wavefront_m(state),
         residual_m=residual_m,
         margin=None if margin is None else _finite(margin.worst_pole_radius / margin.bound),

@@ -116,7 +116,7 @@ class FitJob:
 class FitLimits:
     """What fits of uploads may take."""
 
-    most_bytes: int
+    max_bytes: int
     """Of one upload."""
 
     waiting: int
@@ -256,11 +256,11 @@ class FitQueue:
             await self._forget(job.id)
             raise
         self._put(replace(self._jobs[job.id], state=FitState.WAITING))
-        self._start(job.id, self._carry_out(job.id, asked))
+        self._start(job.id, self._fit_job(job.id, asked))
         return self.job(job.id)
 
     def _check_room(self, n_bytes: int | None) -> None:
-        most = self._limits.most_bytes
+        most = self._limits.max_bytes
         if n_bytes is not None and n_bytes > most:
             raise _too_large(f"{n_bytes / 1e6:.0f} MB", most)
         unfinished = sum(job.state in UNFINISHED for job in self._jobs.values())
@@ -296,8 +296,8 @@ class FitQueue:
             if n_bytes == 0 and chunk:
                 _check_kind(chunk)
             n_bytes += len(chunk)
-            if n_bytes > self._limits.most_bytes:
-                raise _too_large("more", self._limits.most_bytes)
+            if n_bytes > self._limits.max_bytes:
+                raise _too_large("more", self._limits.max_bytes)
             block += chunk
             if len(block) >= _BLOCK:
                 await flush()
@@ -308,7 +308,7 @@ class FitQueue:
             )
         self._put(replace(self._jobs[fit_id], n_bytes=n_bytes, sha256=digest.hexdigest()))
 
-    async def _carry_out(self, fit_id: str, asked: Mapping[str, Any]) -> None:
+    async def _fit_job(self, fit_id: str, asked: Mapping[str, Any]) -> None:
         folder = self._folder / fit_id
         try:
             async with self._turn:
@@ -376,7 +376,7 @@ def _check_kind(first: bytes) -> None:
         )
 
 
-def _too_large(found: str, most: int) -> TooLargeError:
+def _too_large(found: str, max_bytes: int) -> TooLargeError:
     return TooLargeError(
-        f"upload: found {found}, expected at most {most / 1e6:.0f} MB (fits.upload_limit_mb)"
+        f"upload: found {found}, expected at most {max_bytes / 1e6:.0f} MB (fits.upload_limit_mb)"
     )

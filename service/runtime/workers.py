@@ -15,7 +15,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
 from service.runtime.processes import Worker
-from service.runtime.snapshot import Pace
+from service.runtime.snapshot import WorkerLoad
 from service.runtime.worker import Done, OpticsWorker, run_job
 from service.tracking import events as ev
 from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
@@ -37,7 +37,7 @@ HUNG_S = 15.0
 UNKNOWN_LIMIT_S = 900.0
 """Processor time of a job of which none has been done yet; ten times the largest telescopes'."""
 
-LEAST_LIMIT_S = 60.0
+MIN_LIMIT_S = 60.0
 LIMIT_RATIO = 20.0
 """Processor time of a job, over the longest one of its kind so far."""
 
@@ -68,7 +68,7 @@ class WorkerPool:
         self._busy_s = 0.0
         self._busy_since_s: float | None = None
         self.n_lost = 0
-        self.trouble = ""
+        self.problem = ""
         """What is wrong with the worker, until one has done a job again; empty: nothing."""
 
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
@@ -158,10 +158,10 @@ class WorkerPool:
             raise
         finally:
             self._busy_s, self._busy_since_s = self.busy_s, None
-        self.trouble = ""
+        self.problem = ""
         self.cpu_s[name] += done.cpu_s
         self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
-        self._limit_s[name] = max(LEAST_LIMIT_S, LIMIT_RATIO * self._longest_s[name])
+        self._limit_s[name] = max(MIN_LIMIT_S, LIMIT_RATIO * self._longest_s[name])
         return done
 
     async def _watched(self, name: str, worker: Worker, under_way: asyncio.Future[Done[R]]) -> None:
@@ -177,12 +177,12 @@ class WorkerPool:
         while not (await asyncio.wait({under_way}, timeout=LOOK_S))[0]:
             cpu_s, now_s = worker.cpu_s(), time.monotonic()
             if cpu_s != last_cpu_s:
-                last_cpu_s, moved_s, self.trouble = cpu_s, now_s, ""
+                last_cpu_s, moved_s, self.problem = cpu_s, now_s, ""
             still_s = now_s - moved_s
             if still_s >= STILL_S:
-                self.trouble = f"the worker has stood still for {still_s:.0f} s in {name}"
+                self.problem = f"the worker has stood still for {still_s:.0f} s in {name}"
             if still_s >= HUNG_S:
-                raise TimeoutError(self.trouble)
+                raise TimeoutError(self.problem)
             if cpu_s - begun_cpu_s > limit_s:
                 self._limit_s[name] = 2 * limit_s  # a telescope where it takes so long
                 raise TimeoutError(f"the worker took more than {limit_s:.0f} s for {name}")
@@ -190,7 +190,7 @@ class WorkerPool:
     def _lost(self, text: str) -> str:
         self.n_lost += 1
         self.close()
-        self.trouble = text
+        self.problem = text
         return text
 
 
@@ -226,7 +226,7 @@ JOB = "job "
 """Before the name of a job, among what is counted."""
 
 
-class PaceMeter:
+class WorkerLoadMeter:
     """Counts what the work costs; ``look`` at it once a second."""
 
     def __init__(self, workers: WorkerPool) -> None:
@@ -235,7 +235,7 @@ class PaceMeter:
         self._marks = deque([self._mark()])
         self._behind = False
 
-    def heard(self, seconds: float) -> None:
+    def count_frames(self, seconds: float) -> None:
         """Count telemetry that was taken in."""
         self._counted["telemetry_s"] += seconds
 
@@ -248,23 +248,23 @@ class PaceMeter:
         self._counted["fitted"] += 1
         self._counted["fitted_s"] += window_s
 
-    def look(self) -> Pace:
+    def look(self) -> WorkerLoad:
         """Take note of where everything stands, and return how it goes."""
         now = self._mark()
         self._marks.append(now)
         while len(self._marks) > 2 and now["clock_s"] - self._marks[1]["clock_s"] >= MEMORY_S:
             self._marks.popleft()
-        return self.pace
+        return self.worker_load
 
     @property
-    def pace(self) -> Pace:
+    def worker_load(self) -> WorkerLoad:
         """What the work of the last minute cost."""
         spent = self._spent()
         lasted_s, telemetry_s = max(spent["clock_s"], 1e-9), spent["telemetry_s"]
         fitted = spent["fitted"]
         jobs = {key.removeprefix(JOB): s for key, s in spent.items() if key.startswith(JOB)}
         per_s = {name: s / telemetry_s for name, s in jobs.items() if s > 0} if telemetry_s else {}
-        return Pace(
+        return WorkerLoad(
             worker_per_s=sum(per_s.values()) if telemetry_s else None,
             by_job=dict(sorted(per_s.items(), key=lambda item: -item[1])),
             service_per_s=spent["service_s"] / lasted_s,
@@ -273,29 +273,29 @@ class PaceMeter:
             windows_late=round(spent["late"]),
         )
 
-    def news(self, state: TrackerState) -> list[ev.Trouble]:
+    def detect_changes(self, state: TrackerState) -> list[ev.ConditionChanged]:
         """Return which alarms of the worker come or go."""
-        lost = self._workers.trouble
+        lost = self._workers.problem
         if lost:
             lost = f"{lost}; another one takes over, what it was at is lost. If it comes again: is "
             lost += "there memory enough, and does the machine get to run it?"
         keeps_up = "the worker keeps up with the telemetry again"
         return [
-            *ev.Trouble.news(state, WORKER_LOST, lost, "the worker does its work again"),
-            *ev.Trouble.news(state, WORKER_BEHIND, self._why_behind(), keeps_up),
+            *ev.ConditionChanged.detect(state, WORKER_LOST, lost, "the worker does its work again"),
+            *ev.ConditionChanged.detect(state, WORKER_BEHIND, self._why_behind(), keeps_up),
         ]
 
     def _why_behind(self) -> str:
-        pace, spent = self.pace, self._spent()
-        if spent["clock_s"] < ENOUGH_S or pace.busy_ratio is None:
+        load, spent = self.worker_load, self._spent()
+        if spent["clock_s"] < ENOUGH_S or load.busy_ratio is None:
             return ""
         if self._behind:
-            self._behind = pace.busy_ratio > AT_EASE and pace.windows_late > 0
+            self._behind = load.busy_ratio > AT_EASE and load.windows_late > 0
         else:
-            self._behind = pace.busy_ratio > FULLY_BUSY and pace.windows_late >= LATE_WINDOWS
+            self._behind = load.busy_ratio > FULLY_BUSY and load.windows_late >= LATE_WINDOWS
         if not self._behind:
             return ""
-        most = ", ".join(f"{name} {share:.2f}" for name, share in list(pace.by_job.items())[:3])
+        most = ", ".join(f"{name} {share:.2f}" for name, share in list(load.by_job.items())[:3])
         got = sum(s for key, s in spent.items() if key.startswith(JOB))
         share = got / max(spent["busy_s"], 1e-9)
         cause = (
@@ -304,9 +304,9 @@ class PaceMeter:
             else "the machine is too slow for this instrument"
         )
         return (
-            f"the worker does not keep up: it is busy {pace.busy_ratio:.0%} of the time and takes "
-            f"{pace.worker_per_s or 0.0:.2f} s of processor time for each second of telemetry "
-            f"({most or 'nothing done yet'}); {cause}. Windows are now {pace.window_s or 0.0:.1f} "
+            f"the worker does not keep up: it is busy {load.busy_ratio:.0%} of the time and takes "
+            f"{load.worker_per_s or 0.0:.2f} s of processor time for each second of telemetry "
+            f"({most or 'nothing done yet'}); {cause}. Windows are now {load.window_s or 0.0:.1f} "
             "s long and α comes as much later; end other work there, or control and dither less"
         )
 

@@ -21,17 +21,17 @@ from service.estimation.windows import RefusalKind
 from service.tracking import acquisition_stages as stages
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import reconstructors, worth
-from service.tracking.activity import ramping
-from service.tracking.alarms import ACQUISITION, Act
+from service.tracking import reconstructors, update_policy
+from service.tracking.alarms import ACQUISITION, Interlock
 from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.loop import present
 from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.running_operations import ramping
 from service.tracking.sending import why_unsendable
 from service.tracking.state import Acquisition, AcquisitionStage, Interruption, Mode, TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, LoopRequest, Reply, Status
 
 ENOUGH_WINDOWS = 2
@@ -48,37 +48,37 @@ PATIENCE_S = 180.0
 _LOST = (MatrixState.REJECTED, MatrixState.FAILED)
 
 
-def acquire_on_command(turn: Turn, _: cmd.Acquire) -> None:
+def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
     """Begin one because an operator says so."""
-    allow(turn)
-    _begin(turn, present(turn.rtc), "the operator asks", commanded=True)
+    allow(context)
+    _begin(context, present(context.rtc), "the operator asks", commanded=True)
 
 
-def abort_on_command(turn: Turn, _: cmd.AbortAcquisition) -> None:
+def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
     """End one because an operator says so."""
-    turn.calm(ACQUISITION)
-    stages.abort(turn, "by the operator", held_off=True)
+    context.clear_alarm(ACQUISITION)
+    stages.abort(context, "by the operator", held_off=True)
 
 
-def acquire(turn: Turn) -> None:
+def acquire(context: StepContext) -> None:
     """Take an acquisition further after an event, or begin one where the service needs it."""
-    acquisition = turn.acquisition
+    acquisition = context.acquisition
     if acquisition.stage is AcquisitionStage.INTERRUPTED:
-        _take_up(turn)
+        _take_up(context)
     elif not acquisition.under_way:
-        if turn.state.windows_accepted > turn.before.windows_accepted:
-            stages.go_on(turn, replace(acquisition, misses=0))
-        _forget_when_over(turn)
-        stages.tell_of_misses(turn)
-        why = stages.why_needed(turn.state, turn.policy, turn.now_ns)
-        if why is not None and turn.rtc and ramping(turn.state, turn.now_ns) is None:
-            _begin(turn, turn.rtc, why, commanded=False)
-    elif isinstance(turn.event, ev.RtcVanished):
+        if context.state.windows_accepted > context.before.windows_accepted:
+            stages.go_on(context, replace(acquisition, misses=0))
+        _forget_when_over(context)
+        stages.tell_of_misses(context)
+        why = stages.why_needed(context.state, context.policy, context.now_ns)
+        if why is not None and context.rtc and ramping(context.state, context.now_ns) is None:
+            _begin(context, context.rtc, why, commanded=False)
+    elif isinstance(context.event, ev.RtcVanished):
         # the state before still knows in which session that was
-        stages.go_on(turn, _cut_off(turn.before, "the RTC vanished"))
-        _wait(turn, NO_RTC)
+        stages.go_on(context, _cut_off(context.before, "the RTC vanished"))
+        _wait(context, NO_RTC)
     else:
-        _advance(turn)
+        _advance(context)
 
 
 def left_behind(state: TrackerState) -> Acquisition | None:
@@ -95,262 +95,266 @@ def left_behind(state: TrackerState) -> Acquisition | None:
     return _kept(acquisition) if aborted or lasts else None
 
 
-def inherit(turn: Turn, left: Acquisition) -> None:
+def inherit(context: StepContext, left: Acquisition) -> None:
     """Take over the acquisition that the service before this one has left."""
-    stages.go_on(turn, left)
+    stages.go_on(context, left)
     if left.stage is AcquisitionStage.FAILED:
-        turn.alarm(ACQUISITION, left.text)
+        context.raise_alarm(ACQUISITION, left.text)
     elif left.stage is not AcquisitionStage.ABORTED:
-        _wait(turn, NO_RTC)
+        _wait(context, NO_RTC)
 
 
-def _begin(turn: Turn, rtc: Status, why: str, *, commanded: bool) -> None:
-    turn.calm(ACQUISITION)
-    make_way(turn)
-    cut_off(turn, "an acquisition has begun")
-    lost = _own_loop_lost(turn)
-    stages.begin(turn, rtc, why=why, commanded=commanded)
-    turn.log("acquisition.begun", why)
+def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> None:
+    context.clear_alarm(ACQUISITION)
+    make_way(context)
+    cut_off(context, "an acquisition has begun")
+    lost = _own_loop_lost(context)
+    stages.begin(context, rtc, why=why, commanded=commanded)
+    context.log("acquisition.begun", why)
     if lost is not None:
-        most = worth.half_of(rtc.n_controlled)
-        first = min(turn.acquisition.n_modes, most)
-        stages.go_on(turn, replace(turn.acquisition, most_modes=most, n_modes=first))
-        worth.limit_modes(turn, most, f"{lost} with {rtc.n_controlled} modes")
-    stages.far_stage(turn, rtc)
+        most = update_policy.half_of(rtc.n_controlled)
+        first = min(context.acquisition.n_modes, most)
+        stages.go_on(context, replace(context.acquisition, max_modes=most, n_modes=first))
+        update_policy.limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
+    stages.wide_capture_stage(context, rtc)
 
 
-def _own_loop_lost(turn: Turn) -> str | None:
+def _own_loop_lost(context: StepContext) -> str | None:
     """Return the alarm of a loop that did not hold on a matrix made for where the mirror is.
 
     On as many modes it would not hold the next time; the RTC's own matrix says nothing of that.
     """
-    state = turn.state
+    state = context.state
     record = state.reconstructor(state.in_use) if state.in_use is not None else None
     if record is None or record.alpha is None:
         return None
-    alarm = turn.forbidden(Act.HOLD)
+    alarm = context.blocking_alarm(Interlock.HOLD)
     return None if alarm is None else alarm.name
 
 
-def _advance(turn: Turn) -> None:
+def _advance(context: StepContext) -> None:
     """Take one that is under way further."""
-    n_effects = len(turn.effects)
-    if not _end_by_event(turn):
-        _take_in(turn)
-    acted = len(turn.effects) > n_effects
-    if acted or not turn.acquisition.under_way or turn.rtc is None:
+    n_effects = len(context.effects)
+    if not _end_by_event(context):
+        _take_in(context)
+    acted = len(context.effects) > n_effects
+    if acted or not context.acquisition.under_way or context.rtc is None:
         return
-    if turn.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
-        _closed_stage(turn, turn.rtc)
+    if context.acquisition.stage in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
+        _closed_stage(context, context.rtc)
     else:
-        stages.far_stage(turn, turn.rtc)
+        stages.wide_capture_stage(context, context.rtc)
 
 
-def _end_by_event(turn: Turn) -> bool:
+def _end_by_event(context: StepContext) -> bool:
     """End one that cannot go on after the event, or begin it anew; return whether that is so."""
-    acquisition, state = turn.acquisition, turn.state
-    late = turn.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
-    match turn.event:
+    acquisition, state = context.acquisition, context.state
+    late = context.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
+    match context.event:
         case cmd.StopDither():
-            stages.abort(turn, "because the dither was stopped")
+            stages.abort(context, "because the dither was stopped")
         case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
-            stages.abort(turn, f"because the mode is {mode}")
+            stages.abort(context, f"because the mode is {mode}")
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
-            stages.restart(turn, "the RTC began a new session")
-        case ev.DitherMeasured(id=loud, text=text) if loud == state.dithering.loud_id and text:
-            stages.give_up(turn, text)
-        case ev.Noted(name="dither.unusable", text=text):
-            stages.give_up(turn, f"its dither cannot be read: {text}")
+            stages.restart(context, "the RTC began a new session")
+        case ev.DitherMeasured(id=loud, text=text) if loud == state.dither_policy.loud_id and text:
+            stages.give_up(context, text)
+        case ev.LogEvent(name="dither.unusable", text=text):
+            stages.give_up(context, f"its dither cannot be read: {text}")
         case ev.Tick() if late:
-            stages.restart(turn, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
+            stages.restart(context, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
         case _:
-            return _end_by_answer(turn)
+            return _end_by_answer(context)
     return True
 
 
-def _end_by_answer(turn: Turn) -> bool:
-    acquisition = turn.acquisition
-    match turn.event:
+def _end_by_answer(context: StepContext) -> bool:
+    acquisition = context.acquisition
+    match context.event:
         case ev.Answered(
             request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
         ):
-            stages.give_up(turn, f"the RTC will not change its loop: {reason}")
+            stages.give_up(context, f"the RTC will not change its loop: {reason}")
         case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
-            stages.restart(turn, text)
+            stages.restart(context, text)
         case _:
             return False
     return True
 
 
-def _take_in(turn: Turn) -> None:
-    match turn.event:
-        case ev.FarFitted():
-            stages.on_far(turn, turn.event)
+def _take_in(context: StepContext) -> None:
+    match context.event:
+        case ev.WideCaptureFitted():
+            stages.on_wide_capture(context, context.event)
         case ev.WindowLost(refused=refused) if refused.kind is RefusalKind.NOT_FOUND:
-            stages.on_missed(turn, refused.reason)
+            stages.on_missed(context, refused.reason)
         case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
-            stages.on_missed(turn, f"the RTC refused the dither: {reason}")
+            stages.on_missed(context, f"the RTC refused the dither: {reason}")
         case ev.MatrixMade():
-            _on_made(turn, turn.event)
+            _on_made(context, context.event)
         case _:
             pass
 
 
-def _closed_stage(turn: Turn, rtc: Status) -> None:
+def _closed_stage(context: StepContext, rtc: Status) -> None:
     """Make, send, close; then let ordinary windows sharpen α and go on to more modes."""
-    acquisition = turn.acquisition
-    record = turn.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
+    acquisition = context.acquisition
+    record = context.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
     if record is not None and record.state in _LOST:
-        stages.restart(turn, f"{record.id} was not applied: {record.reason}")
+        stages.restart(context, f"{record.id} was not applied: {record.reason}")
     elif acquisition.stage is AcquisitionStage.WIDENING:
-        _widen(turn, rtc, record)
+        _widen(context, rtc, record)
     elif record is None:
         if acquisition.command is None or rtc.leak <= FORGIVING_LEAK:
-            _make(turn, acquisition.n_modes, rtc)
+            _make(context, acquisition.n_modes, rtc)
     elif rtc.cm_id != record.id:
         return
     elif rtc.loop == "open":
         if acquisition.command is None:
-            stages.request_loop(turn, cmd.SetLoop(loop="closed"))
+            stages.request_loop(context, cmd.SetLoop(loop="closed"))
     else:
-        n_windows = turn.state.windows_accepted
-        stages.go_on(turn, replace(acquisition, applied=record.id, windows=n_windows))
+        n_windows = context.state.windows_accepted
+        stages.go_on(context, replace(acquisition, applied=record.id, windows=n_windows))
         text = f"closed on {record.n_modes} modes: sharpening the registration"
-        stages.enter_stage(turn, AcquisitionStage.WIDENING, text)
+        stages.enter_stage(context, AcquisitionStage.WIDENING, text)
 
 
-def _on_made(turn: Turn, made: ev.MatrixMade) -> None:
+def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
     """Send a reconstructor that has passed the gate, with the gains it was judged with."""
-    record, acquisition, rtc = made.record, turn.acquisition, turn.rtc
+    record, acquisition, rtc = made.record, context.acquisition, context.rtc
     if acquisition.stage not in {AcquisitionStage.PARTIAL, AcquisitionStage.WIDENING}:
         return
     if record.state is MatrixState.REFUSED:
-        _on_refused(turn, record)
+        _on_refused(context, record)
         return
     found = acquisition.found
     if rtc is None or found is None:
-        stages.restart(turn, f"{record.id} cannot be sent: no RTC is there")
+        stages.restart(context, f"{record.id} cannot be sent: no RTC is there")
         return
     gains = stages.gains_for(found, record.n_modes, rtc.n_modes)
-    stale = worth.why_worthless(turn.state, record.judged, gains[: record.n_modes])
+    stale = update_policy.verdict_doubtful_reason(
+        context.state, record.judged, gains[: record.n_modes]
+    )
     if stale is not None:
         reconstructors.change_state(
-            turn, record.id, MatrixState.DISCARDED, f"while it was made, {stale}"
+            context, record.id, MatrixState.DISCARDED, f"while it was made, {stale}"
         )
-        turn.log("reconstructor.discarded", f"{record.id}: {stale}")
+        context.log("reconstructor.discarded", f"{record.id}: {stale}")
         return
-    reason = why_unsendable(turn.state, record)
+    reason = why_unsendable(context.state, record)
     if reason is not None:
-        stages.restart(turn, f"{record.id} cannot be sent: {reason}")
+        stages.restart(context, f"{record.id} cannot be sent: {reason}")
         return
-    reconstructors.send_with(turn, record.id, gains)
-    most = acquisition.most_modes
+    reconstructors.send_with(context, record.id, gains)
+    most = acquisition.max_modes
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         most = record.n_modes
     sent = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None)
-    stages.go_on(turn, replace(sent, most_modes=most))
+    stages.go_on(context, replace(sent, max_modes=most))
 
 
-def _on_refused(turn: Turn, record: ReconstructorRecord) -> None:
+def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     """With the loop closed be content with the modes there are; else try a leak for the edge."""
-    acquisition, gate, rtc = turn.acquisition, record.gate, turn.rtc
+    acquisition, gate, rtc = context.acquisition, record.gate, context.rtc
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
-        stages.go_on(turn, replace(acquisition, most_modes=acquisition.n_modes))
+        stages.go_on(context, replace(acquisition, max_modes=acquisition.n_modes))
     elif slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
         text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
-        turn.log("acquisition.leak", text)
-        stages.request_loop(turn, cmd.SetLoop(leak=FORGIVING_LEAK))
+        context.log("acquisition.leak", text)
+        stages.request_loop(context, cmd.SetLoop(leak=FORGIVING_LEAK))
     else:
         reason = gate.reason if gate is not None else record.reason
-        stages.give_up(turn, f"no number of modes passes the gate: {reason}")
+        stages.give_up(context, f"no number of modes passes the gate: {reason}")
 
 
-def _widen(turn: Turn, rtc: Status, record: ReconstructorRecord | None) -> None:
-    acquisition, known = turn.acquisition, turn.known
-    slipped = turn.forbidden(Act.HOLD)
+def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None) -> None:
+    acquisition, registration = context.acquisition, context.registration
+    slipped = context.blocking_alarm(Interlock.HOLD)
     if slipped is not None:
-        stages.restart(turn, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True)
+        stages.restart(context, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True)
         return
     if rtc.loop == "open":
-        stages.restart(turn, "somebody opened the loop")
+        stages.restart(context, "somebody opened the loop")
         return
-    doubted = known is not None and bool(known.doubt)
-    waiting = doubted or turn.state.making_since_ns_utc is not None
+    doubted = registration is not None and bool(registration.doubt)
+    waiting = doubted or context.state.making_since_ns_utc is not None
     if record is not None and rtc.cm_id == record.id and not waiting:
         if record.applied_frame_seq is not None and acquisition.applied != record.id:
-            n_windows = turn.state.windows_accepted
+            n_windows = context.state.windows_accepted
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
-            stages.go_on(turn, acquisition)
-        seen, goal = turn.state.windows_accepted - acquisition.windows, _goal(acquisition)
-        if seen >= 1 and (record.n_modes < goal or worth.moved(turn.state, record, turn.policy)):
-            _make(turn, goal, rtc, at_least=record.n_modes)
+            stages.go_on(context, acquisition)
+        seen, goal = context.state.windows_accepted - acquisition.windows, _goal(acquisition)
+        if seen >= 1 and (
+            record.n_modes < goal or update_policy.moved(context.state, record, context.policy)
+        ):
+            _make(context, goal, rtc, at_least=record.n_modes)
             return
         if seen >= ENOUGH_WINDOWS:
-            _finish(turn, record)
+            _finish(context, record)
             return
-    choose_dither(turn, rtc)
+    choose_dither(context, rtc)
 
 
-def _make(turn: Turn, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
+def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
     """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
-    found, state = turn.acquisition.found, turn.state
+    found, state = context.acquisition.found, context.state
     if state.making_since_ns_utc is not None or found is None:
         return
-    if turn.now_ns >= state.no_making_before_ns_utc:
+    if context.now_ns >= state.no_making_before_ns_utc:
         effect = ev.MakeMatrix(
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
             gains=stages.gains_for(found, n_modes, rtc.n_modes),
-            fewer=tuple(rung for rung in worth.fewer_than(n_modes) if rung > at_least),
+            fewer=tuple(rung for rung in update_policy.fewer_than(n_modes) if rung > at_least),
         )
-        reconstructors.make(turn, effect)
+        reconstructors.make(context, effect)
 
 
 def _goal(acquisition: Acquisition) -> int:
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    return goal if acquisition.most_modes is None else min(goal, acquisition.most_modes)
+    return goal if acquisition.max_modes is None else min(goal, acquisition.max_modes)
 
 
-def _finish(turn: Turn, record: ReconstructorRecord) -> None:
-    acquisition = turn.acquisition
+def _finish(context: StepContext, record: ReconstructorRecord) -> None:
+    acquisition = context.acquisition
     goal = acquisition.found.n_controlled if acquisition.found is not None else record.n_modes
-    took_s = (turn.now_ns - acquisition.started_ns_utc) / SECOND_NS
+    took_s = (context.now_ns - acquisition.started_ns_utc) / SECOND_NS
     of_goal = "" if record.n_modes >= goal else f" of {goal}"
     text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
-    stages.enter_stage(turn, AcquisitionStage.TRACKING, text)
-    turn.calm(ACQUISITION)
+    stages.enter_stage(context, AcquisitionStage.TRACKING, text)
+    context.clear_alarm(ACQUISITION)
 
 
-def _forget_when_over(turn: Turn) -> None:
+def _forget_when_over(context: StepContext) -> None:
     """Forget an acquisition that holds back the next, once it need not.
 
     One that had failed: when α is known without it, for whoever closed the loop has mended what it
     could not, and the next trouble is another one. One that an operator ended: then too, or when an
     operator sets the mode, which is to say what the service may do by itself.
     """
-    acquisition, event = turn.acquisition, turn.event
+    acquisition, event = context.acquisition, context.event
     if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
         return
     if acquisition.held_off and isinstance(event, cmd.SetMode):
         text = f"an operator has set the mode, {event.mode}, since the last was ended"
-    elif _followed(turn.state):
+    elif _followed(context.state):
         text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    stages.go_on(turn, Acquisition(text=text, since_ns_utc=turn.now_ns))
-    turn.calm(ACQUISITION)
-    turn.log("acquisition.idle", text)
+    stages.go_on(context, Acquisition(text=text, since_ns_utc=context.now_ns))
+    context.clear_alarm(ACQUISITION)
+    context.log("acquisition.idle", text)
 
 
 def _followed(state: TrackerState) -> bool:
     """Return whether windows that came since agree on α, in a closed loop."""
-    rtc, known = state.rtc, state.registration
-    if rtc is None or not rtc.in_loop or known is None:
+    rtc, registration = state.rtc, state.registration
+    if rtc is None or not rtc.in_loop or registration is None:
         return False
     since = state.windows_accepted - state.acquisition.windows
-    believed = known.usable and known.candidate is None
-    return believed and min(since, known.n_windows) >= ENOUGH_WINDOWS
+    believed = registration.usable and registration.suspected_jump is None
+    return believed and min(since, registration.n_windows) >= ENOUGH_WINDOWS
 
 
 def _kept(acquisition: Acquisition) -> Acquisition:
@@ -365,63 +369,65 @@ def _cut_off(state: TrackerState, cause: str) -> Acquisition:
     return replace(_kept(state.acquisition), interruption=interruption)
 
 
-def _take_up(turn: Turn) -> None:
+def _take_up(context: StepContext) -> None:
     """Begin an acquisition that was cut off anew, or say why not and what the operator can do."""
-    rtc = turn.rtc
+    rtc = context.rtc
     if rtc is None:
         return
     if rtc.loop != "open":
-        _note_closed(turn, rtc)
+        _note_closed(context, rtc)
         return
-    why_not = _why_not_by_itself(turn, rtc)
+    why_not = _why_not_by_itself(context, rtc)
     if why_not is not None:
         do = (
             "The loop may be open, and its matrix is for a registration that was not believed: "
             "acquire again, or close the loop on a matrix of your own"
         )
-        _wait(turn, f"it does not begin anew by itself: {why_not}", do)
+        _wait(context, f"it does not begin anew by itself: {why_not}", do)
         return
-    cause = _cause(turn.acquisition)
-    stages.go_on(turn, replace(turn.acquisition, interruption=None))
-    turn.calm(ACQUISITION)
-    stages.restart(turn, cause)
+    cause = _cause(context.acquisition)
+    stages.go_on(context, replace(context.acquisition, interruption=None))
+    context.clear_alarm(ACQUISITION)
+    stages.restart(context, cause)
 
 
-def _why_not_by_itself(turn: Turn, rtc: Status) -> str | None:
-    state = turn.state
+def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
+    state = context.state
     if stages.left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
     if state.mode is not Mode.AUTO:
         return f"the mode is {state.mode}"
-    if not turn.policy.acquires:
+    if not context.policy.acquires:
         return "the settings forbid that"
     if state.dither_stopped:
         return "the dither was stopped"
-    return stages.why_not_now(state, turn.policy)
+    return stages.why_not_now(state, context.policy)
 
 
-def _wait(turn: Turn, what: str, do: str = "") -> None:
+def _wait(context: StepContext, what: str, do: str = "") -> None:
     """Say what was going on, and what it waits for."""
-    text = f"{_said(turn.acquisition)}; {what}{'. ' if do else ''}{do}"
-    if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in turn.state.alarms):
+    text = f"{_cause_text(context.acquisition)}; {what}{'. ' if do else ''}{do}"
+    if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in context.state.alarms):
         return
     stage = AcquisitionStage.INTERRUPTED
-    stages.go_on(turn, replace(turn.acquisition, stage=stage, text=text, since_ns_utc=turn.now_ns))
-    turn.warn("acquisition.interrupted", what)
-    turn.alarm(ACQUISITION, text)
+    stages.go_on(
+        context, replace(context.acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
+    )
+    context.warn("acquisition.interrupted", what)
+    context.raise_alarm(ACQUISITION, text)
 
 
-def _note_closed(turn: Turn, rtc: Status) -> None:
+def _note_closed(context: StepContext, rtc: Status) -> None:
     """End it after somebody, or the acquisition itself, has closed the loop."""
     matrix, told = rtc.cm_id or "an unknown matrix", "which it has not judged"
-    if rtc.cm_id is not None and rtc.cm_id == turn.acquisition.matrix:
+    if rtc.cm_id is not None and rtc.cm_id == context.acquisition.matrix:
         told = "which had passed the gate: the registration is followed from there"
-    text = f"{_said(turn.acquisition)}; the loop is closed on {matrix}, {told}"
-    turn.calm(ACQUISITION)
-    stages.enter_stage(turn, AcquisitionStage.ABORTED, text)
+    text = f"{_cause_text(context.acquisition)}; the loop is closed on {matrix}, {told}"
+    context.clear_alarm(ACQUISITION)
+    stages.enter_stage(context, AcquisitionStage.ABORTED, text)
 
 
-def _said(acquisition: Acquisition) -> str:
+def _cause_text(acquisition: Acquisition) -> str:
     left = acquisition.interruption
     doing = "unknown" if left is None else left.doing
     return f"{_cause(acquisition)} during an acquisition ({doing})"

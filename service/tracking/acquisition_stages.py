@@ -20,7 +20,7 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
-from service.tracking.alarms import ACQUISITION, NOT_FOUND, Act, forbidding, forbids
+from service.tracking.alarms import ACQUISITION, NOT_FOUND, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
 from service.tracking.loop import NO_RTC
@@ -36,8 +36,8 @@ from service.tracking.state import (
     Mode,
     TrackerState,
 )
-from service.tracking.turn import Turn
-from service.tracking.worth import half_of, limit_modes
+from service.tracking.step_context import StepContext
+from service.tracking.update_policy import half_of, limit_modes
 from service.wire import DitherKind, DitherRequest, Status
 
 WINDOW_S = 2.0
@@ -58,7 +58,7 @@ MISSES_BEFORE = 3
 MISSES_DESPITE = 10
 """The same while α is known: what comes may only be bad telemetry, which opens no loop."""
 
-MOST_ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 """Times the loop is opened for one acquisition."""
 
 HELD_OFF = (
@@ -77,7 +77,7 @@ _BELIEVED = (
 AGREE = 23.5
 """χ² of the difference of two estimates (4 degrees of freedom) that one in 10^4 exceeds."""
 
-MOST_MISSES = 4
+MAX_MISSES = 4
 """Windows of a stage that lead nowhere before the loop is opened anew."""
 
 STOPS_WITHIN_S = 2.0
@@ -89,7 +89,9 @@ def reach_of(stage: AcquisitionStage) -> Band:
     return SMOOTH if stage is AcquisitionStage.COARSE else FINER
 
 
-def far_dither(stage: AcquisitionStage, rtc: Status, policy: Policy, now_ns: int) -> Dither | str:
+def wide_capture_dither(
+    stage: AcquisitionStage, rtc: Status, policy: Policy, now_ns: int
+) -> Dither | str:
     """Return the dither of a stage with the loop open, or why there is none.
 
     It is strong: an open loop leaves the pyramid little response, and nothing is observed
@@ -135,7 +137,7 @@ def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
 def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
     """Return the loop as it is, and as it shall be closed again."""
     closed = rtc.loop != "open"
-    out_of_hand = forbidding(state, Act.HOLD) is not None
+    out_of_hand = blocking_alarm(state, Interlock.HOLD) is not None
     goal = rtc.n_controlled or min(policy.n_modes_target, rtc.n_modes)
     gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
     return LoopFound(
@@ -163,25 +165,25 @@ def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...
     return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
 
 
-def begin(turn: Turn, rtc: Status, *, why: str, commanded: bool) -> None:
+def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> None:
     """Begin one: nothing is known of α any more."""
-    left = left_open(turn.state, rtc)
+    left = left_open(context.state, rtc)
     found = left.found if left is not None else None
-    found = found or loop_found(turn.state, rtc, turn.policy)
-    turn.acquisition = Acquisition(
+    found = found or loop_found(context.state, rtc, context.policy)
+    context.acquisition = Acquisition(
         stage=AcquisitionStage.OPENING,
         text=f"opening the loop: {why}",
-        started_ns_utc=turn.now_ns,
-        since_ns_utc=turn.now_ns,
+        started_ns_utc=context.now_ns,
+        since_ns_utc=context.now_ns,
         commanded=commanded,
         attempt=1,
         found=found,
         n_modes=min(found.n_controlled, FIRST_CLOSED),
         sent=left is not None and left.sent,
     )
-    validity.void(turn, "the acquisition had not begun")
-    validity.forget(turn)
-    forget_verdict(turn)
+    validity.invalidate_telemetry(context, "the acquisition had not begun")
+    validity.forget(context)
+    forget_verdict(context)
 
 
 def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
@@ -192,11 +194,11 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     if not policy.dither_enabled or state.dither_stopped or state.measuring is not None:
         return None
     failed = acquisition.stage is AcquisitionStage.FAILED
-    if failed or acquisition.held_off or forbidding(state, Act.SEND_NEW) is not None:
+    if failed or acquisition.held_off or blocking_alarm(state, Interlock.SEND_NEW) is not None:
         return None
     for alarm in state.alarms:
         lasted_ns = now_ns - alarm.since_ns_utc
-        if forbids(alarm, Act.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
+        if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     if _missed_enough(state) and not state.loop_holds:
         return f"{acquisition.misses} windows in a row found no registration"
@@ -208,24 +210,24 @@ def _missed_enough(state: TrackerState) -> bool:
     return state.acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE)
 
 
-def tell_of_misses(turn: Turn) -> None:
+def tell_of_misses(context: StepContext) -> None:
     """Say that no registration is found in a loop that holds well: it is not opened for that."""
-    if turn.state.loop_holds and _missed_enough(turn.state):
+    if context.state.loop_holds and _missed_enough(context.state):
         text = (
             "window after window finds no registration, though the loop holds well: modes or "
             "slopes are probably in another order, or of another sign, than the instrument file "
             "tells; compare both with it, or measure an interaction matrix; the loop is left "
             "closed (acquire opens it to look from afar)"
         )
-        turn.alarm(NOT_FOUND, text)
-    elif not turn.acquisition.misses:
-        turn.calm(NOT_FOUND)
+        context.raise_alarm(NOT_FOUND, text)
+    elif not context.acquisition.misses:
+        context.clear_alarm(NOT_FOUND)
 
 
-def count_miss(turn: Turn, kind: RefusalKind) -> None:
+def count_miss(context: StepContext, kind: RefusalKind) -> None:
     """Count a refused window, if α was out of its reach and no acquisition is under way."""
-    if not turn.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
-        turn.acquisition = replace(turn.acquisition, misses=turn.acquisition.misses + 1)
+    if not context.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
+        context.acquisition = replace(context.acquisition, misses=context.acquisition.misses + 1)
 
 
 def why_not_now(state: TrackerState, policy: Policy) -> str | None:
@@ -234,7 +236,7 @@ def why_not_now(state: TrackerState, policy: Policy) -> str | None:
         return NO_RTC
     if not policy.dither_enabled:
         return "the settings forbid any dither"
-    alarm = forbidding(state, Act.SEND_NEW)
+    alarm = blocking_alarm(state, Interlock.SEND_NEW)
     if alarm is not None:
         return f"{alarm.name}: {alarm.text}"
     modes, _ = _far_modes(AcquisitionStage.COARSE, state.rtc)
@@ -249,179 +251,186 @@ def sigma_of(acquisition: Acquisition) -> str:
     return f"{x:.3f}, {y:.3f} subap, {np.rad2deg(rotation):.2f} deg, {magnification:.3f} (1 sigma)"
 
 
-def go_on(turn: Turn, acquisition: Acquisition) -> None:
+def go_on(context: StepContext, acquisition: Acquisition) -> None:
     """Note how far it has come."""
-    turn.acquisition = acquisition
+    context.acquisition = acquisition
 
 
-def enter_stage(turn: Turn, stage: AcquisitionStage, text: str) -> None:
+def enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
     """Begin a stage."""
-    turn.acquisition = replace(
-        turn.acquisition, stage=stage, text=text, since_ns_utc=turn.now_ns, misses=0, command=None
+    context.acquisition = replace(
+        context.acquisition,
+        stage=stage,
+        text=text,
+        since_ns_utc=context.now_ns,
+        misses=0,
+        command=None,
     )
     level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
-    turn.log(f"acquisition.{stage}", text, level)
+    context.log(f"acquisition.{stage}", text, level)
 
 
-def request_loop(turn: Turn, command: cmd.SetLoop) -> None:
+def request_loop(context: StepContext, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop, and remember having asked."""
-    set_loop(turn, command)
-    asked = turn.state.loop_command
-    turn.acquisition = replace(turn.acquisition, command=None if asked is None else asked.id)
+    set_loop(context, command)
+    asked = context.state.loop_command
+    context.acquisition = replace(context.acquisition, command=None if asked is None else asked.id)
 
 
-def restart(turn: Turn, reason: str, *, slipped: bool = False) -> None:
+def restart(context: StepContext, reason: str, *, slipped: bool = False) -> None:
     """Begin anew with the loop opened again, at once, a few times; then give up.
 
     A loop that has slipped is closed on half as many modes next time.
     """
-    acquisition = turn.acquisition
-    if acquisition.attempt >= MOST_ATTEMPTS:
-        give_up(turn, f"{reason}, after {acquisition.attempt} attempts")
+    acquisition = context.acquisition
+    if acquisition.attempt >= MAX_ATTEMPTS:
+        give_up(context, f"{reason}, after {acquisition.attempt} attempts")
         return
-    most = acquisition.most_modes
+    most = acquisition.max_modes
     if slipped:
         most = half_of(acquisition.n_modes)
-        limit_modes(turn, most, reason)
+        limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    validity.void(turn, "the acquisition had not begun anew")
-    make_way(turn)
-    validity.forget(turn)
-    turn.acquisition = replace(
+    validity.invalidate_telemetry(context, "the acquisition had not begun anew")
+    make_way(context)
+    validity.forget(context)
+    context.acquisition = replace(
         acquisition,
         attempt=acquisition.attempt + 1,
         alpha=None,
         covariance=None,
         matrix=None,
-        most_modes=most,
+        max_modes=most,
         n_modes=min(acquisition.n_modes, most or goal),
     )
-    enter_stage(turn, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
-    if turn.rtc is not None and turn.rtc.loop != "open":
-        request_loop(turn, cmd.SetLoop(loop="open"))
+    enter_stage(context, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
+    if context.rtc is not None and context.rtc.loop != "open":
+        request_loop(context, cmd.SetLoop(loop="open"))
 
 
-def give_up(turn: Turn, reason: str) -> None:
+def give_up(context: StepContext, reason: str) -> None:
     """Give up: the loop stays as it is, but one that is out of hand is opened."""
-    closed = turn.rtc is not None and turn.rtc.loop != "open"
-    out_of_hand = turn.forbidden(Act.HOLD) is not None
-    make_way(turn)
-    validity.forget(turn)
-    turn.acquisition = replace(turn.acquisition, windows=turn.state.windows_accepted)
+    closed = context.rtc is not None and context.rtc.loop != "open"
+    out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
+    make_way(context)
+    validity.forget(context)
+    context.acquisition = replace(context.acquisition, windows=context.state.windows_accepted)
     if closed and out_of_hand:
-        request_loop(turn, cmd.SetLoop(loop="open"))
+        request_loop(context, cmd.SetLoop(loop="open"))
     text = (
         f"no registration was acquired: {reason}; see the log, then acquire again, or close the "
         "loop on a matrix of your own"
     )
-    enter_stage(turn, AcquisitionStage.FAILED, text)
-    turn.alarm(ACQUISITION, text)
+    enter_stage(context, AcquisitionStage.FAILED, text)
+    context.raise_alarm(ACQUISITION, text)
 
 
-def abort(turn: Turn, why: str, *, held_off: bool = False) -> None:
+def abort(context: StepContext, why: str, *, held_off: bool = False) -> None:
     """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
 
     As is means open, or closed on a reconstructor that has passed the gate. ``held_off``: none
     begins by itself for now, though what made this one begin may last.
     """
-    make_way(turn)
-    if turn.acquisition.stage not in _BELIEVED:
-        validity.forget(turn)
-    left, found = "left as it is", _to_give_back(turn.state)
+    make_way(context)
+    if context.acquisition.stage not in _BELIEVED:
+        validity.forget(context)
+    left, found = "left as it is", _to_give_back(context.state)
     if found is not None:
         left = "closed as it was found"
-        request_loop(turn, cmd.SetLoop(loop="closed", leak=found.leak))
+        request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
-    over = replace(turn.acquisition, held_off=held_off, windows=turn.state.windows_accepted)
-    turn.acquisition = over
-    enter_stage(turn, AcquisitionStage.ABORTED, text)
+    over = replace(context.acquisition, held_off=held_off, windows=context.state.windows_accepted)
+    context.acquisition = over
+    enter_stage(context, AcquisitionStage.ABORTED, text)
 
 
-def far_stage(turn: Turn, rtc: Status) -> None:
+def wide_capture_stage(context: StepContext, rtc: Status) -> None:
     """Open the loop, then keep the dither of the stage running."""
-    acquisition = turn.acquisition
+    acquisition = context.acquisition
     if acquisition.stage is AcquisitionStage.OPENING:
         if rtc.loop != "open":
             if acquisition.command is None:
-                request_loop(turn, cmd.SetLoop(loop="open"))
+                request_loop(context, cmd.SetLoop(loop="open"))
             return
         text = "looking for the registration with the loop open, on smooth modes"
-        enter_stage(turn, AcquisitionStage.COARSE, text)
+        enter_stage(context, AcquisitionStage.COARSE, text)
     elif rtc.loop != "open":
-        restart(turn, "somebody closed the loop")
+        restart(context, "somebody closed the loop")
         return
-    _keep_dithering(turn, rtc)
+    _keep_dithering(context, rtc)
 
 
-def on_far(turn: Turn, event: ev.FarFitted) -> None:
+def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
-    rtc, before, estimate = turn.rtc, turn.acquisition, event.found.estimate
+    rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
     if (
-        validity.why_void(turn.state, validity.taken(event.began_ns_utc, estimate.t_ns_utc))
+        validity.why_telemetry_invalid(
+            context.state, validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+        )
         is not None
     ):
         return
-    if rtc is None or not before.looks_afar or estimate.session != rtc.session:
+    if rtc is None or not before.uses_wide_capture or estimate.session != rtc.session:
         return
-    if not _of_stage(turn, rtc, estimate.modes):
+    if not _of_stage(context, rtc, estimate.modes):
         return
     covariance = estimate.covariance + np.diag(reach_of(before.stage).floor ** 2)
-    turn.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
-    place = f"{estimate.alpha} +- {sigma_of(turn.acquisition)}"
+    context.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
+    place = f"{estimate.alpha} +- {sigma_of(context.acquisition)}"
     if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
-        make_way(turn)
-        enter_stage(turn, AcquisitionStage.CONFIRMING, f"{place}: other modes must confirm it")
+        make_way(context)
+        enter_stage(context, AcquisitionStage.CONFIRMING, f"{place}: other modes must confirm it")
         return
     difference = estimate.alpha.vector - before.alpha.vector
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
     if chi2 > AGREE:
-        turn.acquisition = before
+        context.acquisition = before
         reason = (
             f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
             f"chi2 {chi2:.0f}, expected at most {AGREE}"
         )
-        restart(turn, reason)
+        restart(context, reason)
         return
     registration = Registration(
         alpha=estimate.alpha,
         covariance=covariance,
-        floor=turn.policy.floor,
+        floor=context.policy.floor,
         t_ns_utc=estimate.t_ns_utc,
-        arrived_ns_utc=turn.now_ns,
+        arrived_ns_utc=context.now_ns,
         n_windows=1,
-        basis_id=turn.state.basis_id,
-        config_id=turn.state.config_id,
+        basis_id=context.state.basis_id,
+        config_id=context.state.config_id,
     )
-    validity.hold(turn, registration)
-    make_way(turn)
-    enter_stage(turn, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
+    validity.store_registration(context, registration)
+    make_way(context)
+    enter_stage(context, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
 
 
-def on_missed(turn: Turn, reason: str) -> None:
+def on_missed(context: StepContext, reason: str) -> None:
     """Count a window that led nowhere; after a few begin anew."""
-    misses = turn.acquisition.misses + 1
-    if misses >= MOST_MISSES:
-        restart(turn, reason)
+    misses = context.acquisition.misses + 1
+    if misses >= MAX_MISSES:
+        restart(context, reason)
     else:
-        turn.acquisition = replace(turn.acquisition, misses=misses)
+        context.acquisition = replace(context.acquisition, misses=misses)
 
 
-def _keep_dithering(turn: Turn, rtc: Status) -> None:
+def _keep_dithering(context: StepContext, rtc: Status) -> None:
     """Ask for the dither of the stage once no other one runs."""
-    if turn.dither is not None or turn.now_ns < turn.state.no_dither_before_ns_utc:
+    if context.dither is not None or context.now_ns < context.state.no_dither_before_ns_utc:
         return
     if rtc.dither_id is not None:
-        stopping = rtc.dither_id == turn.dithering.stopped_id
-        since_s = (turn.now_ns - turn.acquisition.since_ns_utc) / SECOND_NS
+        stopping = rtc.dither_id == context.dither_policy.stopped_id
+        since_s = (context.now_ns - context.acquisition.since_ns_utc) / SECOND_NS
         if not (stopping and since_s < STOPS_WITHIN_S):
-            turn.put_off(dither_s=STOPS_WITHIN_S)
-            ask_to_stop(turn)
+            context.put_off(dither_s=STOPS_WITHIN_S)
+            ask_to_stop(context)
         return
-    dither = far_dither(turn.acquisition.stage, rtc, turn.policy, turn.now_ns)
+    dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, context.now_ns)
     if isinstance(dither, str):
-        give_up(turn, dither)
+        give_up(context, dither)
     else:
-        ask_for(turn, dither)
+        ask_for(context, dither)
 
 
 def _to_give_back(state: TrackerState) -> LoopFound | None:
@@ -435,7 +444,7 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     return found
 
 
-def _of_stage(turn: Turn, rtc: Status, modes: tuple[int, ...]) -> bool:
+def _of_stage(context: StepContext, rtc: Status, modes: tuple[int, ...]) -> bool:
     """Return whether these are the modes of the present stage."""
-    dither = far_dither(turn.acquisition.stage, rtc, turn.policy, 0)
+    dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, 0)
     return not isinstance(dither, str) and dither.request.modes == modes

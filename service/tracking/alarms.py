@@ -61,7 +61,7 @@ SLOPES_STAND = "slopes-stand"
 NOT_FOUND = "registration-not-found"
 
 
-class Act(StrEnum):
+class Interlock(StrEnum):
     """What an alarm may forbid."""
 
     MEASURE = auto()
@@ -101,7 +101,7 @@ class Severity(StrEnum):
         return other is None or order.index(self) > order.index(other)
 
 
-class Party(StrEnum):
+class Responsible(StrEnum):
     """Whom the service waits for."""
 
     RTC = "rtc"
@@ -114,24 +114,24 @@ class Party(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Waiting:
+class Prerequisite:
     """Something the service waits for."""
 
     name: str
     """Machine-readable."""
 
-    party: Party
+    responsible: Responsible
     """Who can end it."""
 
     text: str
     """What is missing, and what to do."""
 
-    hinders: bool = False
+    blocks: bool = False
     """Whether the service can do nothing of its work meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class AlarmDefinition:
     """What there is to know of an alarm, whenever it is raised."""
 
     severity: Severity
@@ -141,12 +141,12 @@ class Kind:
     do: str
     """What an operator does about it."""
 
-    forbids: frozenset[Act] = frozenset()
+    blocks: frozenset[Interlock] = frozenset()
 
     because: str = ""
     """What was the matter while it lasted, for the reason of a refusal; empty: refuses nothing."""
 
-    party: Party | None = None
+    responsible: Responsible | None = None
     """Who can end it, where that is waited for though it may forbid nothing."""
 
 
@@ -166,17 +166,17 @@ class Alarm:
     """When it was raised, by the RTC's clock: telemetry from before does not tell that it is over.
     0: not known."""
 
-    own: Kind | None = None
+    own: AlarmDefinition | None = None
     """Where it is otherwise than the table has it; None: as there."""
 
     @property
-    def kind(self) -> Kind:
+    def definition(self) -> AlarmDefinition:
         """What there is to know of it; of a name that is in no table, nothing."""
         listed = self.own or ALARMS.get(self.name)
-        return listed or Kind(severity=Severity.WARNING, means="", do="")
+        return listed or AlarmDefinition(severity=Severity.WARNING, means="", do="")
 
 
-class Attention(StrEnum):
+class AlarmState(StrEnum):
     """How far an alarm has come with operators."""
 
     ACTIVE = "active"
@@ -190,7 +190,7 @@ class Attention(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Remark:
+class OperatorNote:
     """What an operator has said of an alarm."""
 
     by: str
@@ -201,7 +201,7 @@ class Remark:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Note:
+class AlarmRecord:
     """What is kept of an alarm besides whether it lasts: what it has been, who has seen it."""
 
     name: str
@@ -215,22 +215,22 @@ class Note:
     over_ns_utc: int | None = None
     """When it went; None: it lasts, or was not raised."""
 
-    acknowledged: Remark | None = None
-    muted: Remark | None = None
+    acknowledged: OperatorNote | None = None
+    muted: OperatorNote | None = None
 
     @property
-    def attention(self) -> Attention | None:
+    def alarm_state(self) -> AlarmState | None:
         """How far it has come with operators; None: it was not raised."""
         if self.worst is None:
             return None
         if self.acknowledged is not None:
-            return Attention.ACKNOWLEDGED
-        return Attention.ACTIVE if self.over_ns_utc is None else Attention.STALE
+            return AlarmState.ACKNOWLEDGED
+        return AlarmState.ACTIVE if self.over_ns_utc is None else AlarmState.STALE
 
 
-def _read() -> dict[str, Kind]:
+def _read() -> dict[str, AlarmDefinition]:
     text = files(__package__).joinpath("alarms.toml").read_text(encoding="utf-8")
-    return msgspec.convert(tomllib.loads(text), dict[str, Kind])
+    return msgspec.convert(tomllib.loads(text), dict[str, AlarmDefinition])
 
 
 ALARMS: Final = _read()
@@ -245,11 +245,11 @@ class Alarmed(Protocol):
         """Those."""
 
 
-def forbidding(state: Alarmed, act: Act) -> Alarm | None:
+def blocking_alarm(state: Alarmed, interlock: Interlock) -> Alarm | None:
     """Return an alarm that forbids this now, or None."""
-    return next((alarm for alarm in state.alarms if forbids(alarm, act)), None)
+    return next((alarm for alarm in state.alarms if alarm_blocks(alarm, interlock)), None)
 
 
-def forbids(alarm: Alarm, act: Act) -> bool:
+def alarm_blocks(alarm: Alarm, interlock: Interlock) -> bool:
     """Return whether this alarm forbids this."""
-    return act in alarm.kind.forbids
+    return interlock in alarm.definition.blocks

@@ -19,12 +19,12 @@ from service.tracking.products import ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind, Pattern, Pointing
 
-MOST_SINES = 64
-MOST_MODES = 100_000
-MOST_GROUPS = 1000
+MAX_SINES = 64
+MAX_MODES = 100_000
+MAX_GROUPS = 1000
 LONGEST_NOISY_S = 3600.0
 LONGEST_MUTE_S = 43_200.0
-LONGEST_TOLD_S = 86_400.0
+LONGEST_VALUE_S = 86_400.0
 LONGEST_TEXT = 200
 
 Value = bool | float | str
@@ -33,8 +33,8 @@ Value = bool | float | str
 Positive = Annotated[float, Gt(0.0)]
 Count = Annotated[int, Ge(1)]
 BasisMode = Annotated[int, Ge(0)]
-BasisModes = Annotated[tuple[BasisMode, ...], Len(1, MOST_MODES)]
-Lines = Annotated[tuple[Positive, ...], Len(1, MOST_MODES)]
+BasisModes = Annotated[tuple[BasisMode, ...], Len(1, MAX_MODES)]
+Lines = Annotated[tuple[Positive, ...], Len(1, MAX_MODES)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ class Instruction:
         why = f" ({self.reason})" if self.reason else ""
         return f"by {self.by or 'an operator'}{why}"
 
-    def said(self) -> dict[str, Any]:
+    def as_fields(self) -> dict[str, Any]:
         """Return the fields by name, for a command that says the same and more."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
@@ -133,8 +133,8 @@ class StartDither(RandomSigns):
                     "no amplitude_m and no frequency_hz with binary: total_amplitude_m"
                 )
             return
-        if isinstance(self.modes, ModeSet) or n_modes > MOST_SINES:
-            raise ValueError(f"at most {MOST_SINES} modes with sine")
+        if isinstance(self.modes, ModeSet) or n_modes > MAX_SINES:
+            raise ValueError(f"at most {MAX_SINES} modes with sine")
         if self.total_amplitude_m is not None:
             raise ValueError("no total_amplitude_m with sine: amplitude_m of each mode")
         _a_line_each(self.frequency_hz, n_modes)
@@ -273,13 +273,13 @@ class SetPointing(Instruction):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ToldValue(Instruction):
+class ReportedValue(Instruction):
     """What the observatory tells of something that operators' own rules ask for."""
 
     value: Value
     """A number, a text, or true or false, as the rule compares it."""
 
-    for_s: Annotated[float, Gt(0.0), Le(LONGEST_TOLD_S)] = 60.0
+    for_s: Annotated[float, Gt(0.0), Le(LONGEST_VALUE_S)] = 60.0
     """How long it counts, seconds: then it is not known, until it is told again."""
 
     @override
@@ -290,7 +290,7 @@ class ToldValue(Instruction):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SetValue(ToldValue):
+class SetValue(ReportedValue):
     """Tell a value."""
 
     name: str
@@ -325,7 +325,7 @@ class GainGroup(ModeGroup):
 class Gains(Instruction):
     """Loop gains: of groups of modes, or such that they act alike on all."""
 
-    gains: Annotated[tuple[GainGroup, ...], Len(1, MOST_GROUPS)] | None = None
+    gains: Annotated[tuple[GainGroup, ...], Len(1, MAX_GROUPS)] | None = None
     """Groups of modes, none twice; modes in no group keep their gain."""
 
     effective_gain: Annotated[float, Gt(0.0), Le(2.0)] | None = None
@@ -364,7 +364,7 @@ class Ramp(Instruction):
     What is left out, the service chooses.
     """
 
-    groups: Annotated[tuple[ModeGroup, ...], Len(1, MOST_GROUPS)] | None = None
+    groups: Annotated[tuple[ModeGroup, ...], Len(1, MAX_GROUPS)] | None = None
     """In the order they are tried; None: tip and tilt, to mode 99, the other controlled ones."""
 
     gains: Annotated[tuple[Positive, ...], Len(1, 100)] | None = None

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from service.control.dither import SPAN, most_telling
+from service.control.dither import SPAN, most_informative
 from service.control.loop import amplification
 from service.tracking.policy import Policy
 from service.wire import DitherRequest, Status
@@ -111,7 +111,7 @@ def _telling(policy: Policy, first: int, stop: int, shunned: frozenset[int]) -> 
     if policy.mode_information is None:
         return ()
     among = [mode for mode in range(first, stop) if mode not in shunned]
-    return most_telling(policy.mode_information, among, N_LINES, policy.dither_sigma)
+    return most_informative(policy.mode_information, among, N_LINES, policy.dither_sigma)
 
 
 def _first_free(rtc: Status, policy: Policy) -> int:

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from service.control import dither
 from service.control.dither import (
-    Demand,
+    DitherRequirement,
     Schedule,
     schedule,
     tabulated,
 )
 from service.tracking import mode_proof
-from service.tracking.alarms import Act
+from service.tracking.alarms import Interlock
 from service.tracking.dither_modes import (
     chosen_modes,
     controlled,
@@ -27,8 +27,8 @@ from service.tracking.dither_request import (
     OWN_DITHER,
     SETTLING_S,
     SPARE_S,
-    Choice,
     Dither,
+    DitherParameters,
     DitherPhase,
     DitherPlan,
     n_lines,
@@ -40,7 +40,7 @@ from service.tracking.loop import why_open
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import Status
 
 MIN_WINDOWS = 3
@@ -52,7 +52,7 @@ LASTING_S = 30.0
 SHORTEST_PAUSE_S = 3.0
 """A shorter one is not worth the settling of the next dither."""
 
-WATCHED_WITHIN_S = 25.0
+PASSIVE_WITHIN_S = 25.0
 """A passive estimate younger than this is watching: two of its looks, and some."""
 
 FAINT_MAGNITUDE = 11.5
@@ -89,81 +89,91 @@ _SLOWEST = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
+class WantedDither:
     """The dither that is wanted."""
 
     phase: DitherPhase
     reason: str
-    choice: Choice
+    parameters: DitherParameters
     next_ns_utc: int
     """When; now or earlier: at once."""
 
 
-def wanted(turn: Turn, rtc: Status) -> tuple[Wish, DitherPlan]:
+def wanted(context: StepContext, rtc: Status) -> tuple[WantedDither, DitherPlan]:
     """Return the dither that is wanted in this state, and the plan behind it."""
-    state, policy, kappa = turn.state, turn.policy, precision(turn.state, rtc)
-    demand = _demand(turn, rtc, kappa)
-    window_s = demand.window_s
+    state, policy, kappa = context.state, context.policy, precision(context.state, rtc)
+    requirement = _requirement(context, rtc, kappa)
+    window_s = requirement.window_s
     sittings = tuple(n * window_s for n in SITTING_LADDER)
-    sparse = replace(demand, window_s=dither.burst_s(kappa, demand, sittings))
-    phase, reason, next_ns = _paced(turn, sparse)
-    demand = sparse if phase is DitherPhase.SPARSE else demand
-    found = schedule(kappa, demand)
-    plan = _plan(state, found, demand, window_s, phase)
+    sparse = replace(requirement, window_s=dither.burst_s(kappa, requirement, sittings))
+    phase, reason, next_ns = _paced(context, sparse)
+    requirement = sparse if phase is DitherPhase.SPARSE else requirement
+    found = schedule(kappa, requirement)
+    plan = _plan(state, found, requirement, window_s, phase)
     shown: tuple[int, ...] = ()
     early = state.dither_due_since_ns_utc is None and mode_proof.unknown_loop(state, rtc)
     if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE} or early:
-        shown = mode_proof.modes_to_show(turn, rtc, window_s)
+        shown = mode_proof.modes_to_show(context, rtc, window_s)
     if shown:
-        return _to_show(turn, rtc, shown, window_s), plan
+        return _to_show(context, rtc, shown, window_s), plan
     fixed = policy.dither_amplitude_m is not None
-    total_m = demand.budget_m if fixed else plan.total_m
-    choice = _choice(turn, total_m, window_s, max(demand.window_s, _lasting_s(phase)))
-    return Wish(phase=phase, reason=reason, choice=choice, next_ns_utc=next_ns), plan
+    total_m = requirement.budget_m if fixed else plan.total_m
+    choice = _parameters(context, total_m, window_s, max(requirement.window_s, _lasting_s(phase)))
+    return WantedDither(phase=phase, reason=reason, parameters=choice, next_ns_utc=next_ns), plan
 
 
-def _to_show(turn: Turn, rtc: Status, modes: tuple[int, ...], window_s: float) -> Wish:
+def _to_show(
+    context: StepContext, rtc: Status, modes: tuple[int, ...], window_s: float
+) -> WantedDither:
     """Return the dither that shows how modes answer, before a matrix controls them."""
-    lines = mode_proof.lines_clear(turn, rtc, window_s)
+    lines = mode_proof.lines_clear(context, rtc, window_s)
     spread = np.linspace(0, len(lines) - 1, len(modes)).round().astype(int)
     choice = replace(
-        _choice(turn, quiet_budget_m(rtc, turn.policy, modes), window_s, window_s),
+        _parameters(context, quiet_budget_m(rtc, context.policy, modes), window_s, window_s),
         modes=modes,
         lines_hz=tuple(lines[k] for k in spread),
     )
     reason = f"modes up to {max(modes)} are shown before they are controlled"
-    return Wish(phase=DitherPhase.PROVE, reason=reason, choice=choice, next_ns_utc=turn.now_ns)
+    return WantedDither(
+        phase=DitherPhase.PROVE, reason=reason, parameters=choice, next_ns_utc=context.now_ns
+    )
 
 
-def by_hand(turn: Turn, rtc: Status) -> Choice:
+def by_hand(context: StepContext, rtc: Status) -> DitherParameters:
     """Return what an operator's dither is like where the operator does not say."""
-    policy, plan = turn.policy, turn.dithering.plan
+    policy, plan = context.policy, context.dither_policy.plan
     window_s = policy.window_s if plan is None else plan.window_s
     lasting_s = policy.dither_duration_s - SETTLING_S - SPARE_S
-    return _choice(turn, quiet_budget_m(rtc, policy), window_s, lasting_s)
+    return _parameters(context, quiet_budget_m(rtc, policy), window_s, lasting_s)
 
 
-def _choice(turn: Turn, total_m: float, window_s: float, lasting_s: float) -> Choice:
-    return Choice(
+def _parameters(
+    context: StepContext, total_m: float, window_s: float, lasting_s: float
+) -> DitherParameters:
+    return DitherParameters(
         total_m=total_m,
         window_s=window_s,
         n_windows=max(int(lasting_s / window_s + 1e-6), 1),
-        avoid_hz=(*turn.policy.dither_avoid_hz, *turn.state.vibrations_hz),
-        last_hz=turn.dithering.lines_hz,
-        shunned=mode_proof.shunned_modes(turn.state),
+        avoid_hz=(*context.policy.dither_avoid_hz, *context.state.vibrations_hz),
+        last_hz=context.dither_policy.lines_hz,
+        shunned=mode_proof.shunned_modes(context.state),
     )
 
 
 def _plan(
-    state: TrackerState, found: Schedule, demand: Demand, window_s: float, phase: DitherPhase
+    state: TrackerState,
+    found: Schedule,
+    requirement: DitherRequirement,
+    window_s: float,
+    phase: DitherPhase,
 ) -> DitherPlan:
     """Return the schedule as it is carried out."""
-    total_m, interval_s = _steady(state, found, demand), found.interval_s
+    total_m, interval_s = _steady(state, found, requirement), found.interval_s
     if phase is DitherPhase.ACQUIRE:
-        total_m = demand.budget_m
+        total_m = requirement.budget_m
     if phase is not DitherPhase.SPARSE:
         interval_s = window_s
-    on_s = min(demand.window_s + SETTLING_S, interval_s)
+    on_s = min(requirement.window_s + SETTLING_S, interval_s)
     return DitherPlan(
         total_m=total_m,
         window_s=window_s,
@@ -176,7 +186,7 @@ def _plan(
 
 def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
     """Return κ ``(4,)`` of ``σ = κ / (A sqrt(T))`` as far as it has been learnt."""
-    table, known = tabulated(rtc.magnitude), state.dithering.precision
+    table, known = tabulated(rtc.magnitude), state.dither_policy.precision
     return table if known is None else table * known.ratio
 
 
@@ -221,11 +231,13 @@ def window_lengths_s(policy: Policy) -> tuple[float, ...]:
     return tuple(s for s in lengths if s <= policy.longest_window_s) or (policy.window_s,)
 
 
-def _demand(turn: Turn, rtc: Status, kappa: NDArray[np.float64]) -> Demand:
-    policy = turn.policy
-    demand = Demand(
+def _requirement(
+    context: StepContext, rtc: Status, kappa: NDArray[np.float64]
+) -> DitherRequirement:
+    policy = context.policy
+    requirement = DitherRequirement(
         sigma=policy.dither_sigma,
-        drift_rate=np.sqrt(np.maximum(_walk_rate(turn), _SLOWEST**2)),
+        drift_rate=np.sqrt(np.maximum(_walk_rate(context), _SLOWEST**2)),
         budget_m=quiet_budget_m(rtc, policy),
         window_s=policy.window_s,
         window_sigma=JUMP / STANDS_OUT,
@@ -234,7 +246,7 @@ def _demand(turn: Turn, rtc: Status, kappa: NDArray[np.float64]) -> Demand:
     lengths = window_lengths_s(policy)
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
-    return replace(demand, window_s=dither.window_s(kappa, demand, USABLE, lengths))
+    return replace(requirement, window_s=dither.window_s(kappa, requirement, USABLE, lengths))
 
 
 def _lasting_s(phase: DitherPhase) -> float:
@@ -242,58 +254,63 @@ def _lasting_s(phase: DitherPhase) -> float:
     return 0.0 if phase is DitherPhase.SPARSE else LASTING_S - SETTLING_S - SPARE_S
 
 
-def _walk_rate(turn: Turn) -> NDArray[np.float64]:
+def _walk_rate(context: StepContext) -> NDArray[np.float64]:
     """Return ``(4,)`` variance that α gains in a second: the drift, or the flexure of a slew."""
-    known, base = turn.known, turn.policy.drift_rate**2
-    if known is None:
+    registration, base = context.registration, context.policy.drift_rate**2
+    if registration is None:
         return base
-    age_s = (turn.now_ns - known.arrived_ns_utc) / SECOND_NS
-    return np.maximum(base, known.grown / age_s) if age_s >= 1.0 else base
+    age_s = (context.now_ns - registration.arrived_ns_utc) / SECOND_NS
+    return np.maximum(base, registration.grown / age_s) if age_s >= 1.0 else base
 
 
-def _paced(turn: Turn, demand: Demand) -> tuple[DitherPhase, str, int]:
+def _paced(context: StepContext, requirement: DitherRequirement) -> tuple[DitherPhase, str, int]:
     """Return how to dither, why, and when the next window is due."""
-    state, known, policy, now_ns = turn.state, turn.known, turn.policy, turn.now_ns
-    if known is None:
+    state, registration, policy, now_ns = (
+        context.state,
+        context.registration,
+        context.policy,
+        context.now_ns,
+    )
+    if registration is None:
         return DitherPhase.ACQUIRE, "α is not known", now_ns
     if state.dither_due_since_ns_utc is not None:
         return DitherPhase.ACQUIRE, state.dither_due_reason or "α is in doubt", now_ns
-    if known.n_windows < MIN_WINDOWS:
-        text = f"{known.n_windows} of {MIN_WINDOWS} windows agree"
+    if registration.n_windows < MIN_WINDOWS:
+        text = f"{registration.n_windows} of {MIN_WINDOWS} windows agree"
         return DitherPhase.ACQUIRE, text, now_ns
     if policy.longest_pause_s == 0.0:
         return DitherPhase.FOLLOW, "the settings allow no pause", now_ns
-    window_ns = known.window_ns_utc or known.arrived_ns_utc
+    window_ns = registration.window_ns_utc or registration.arrived_ns_utc
     longest_ns = window_ns + round(policy.longest_pause_s * SECOND_NS)
-    passive_ns = state.dithering.passive_ns_utc
-    if passive_ns is not None and now_ns - passive_ns < WATCHED_WITHIN_S * SECOND_NS:
-        return _watched(known, demand, longest_ns, now_ns)
-    return _unwatched(known, demand, longest_ns)
+    passive_ns = state.dither_policy.passive_ns_utc
+    if passive_ns is not None and now_ns - passive_ns < PASSIVE_WITHIN_S * SECOND_NS:
+        return _pace_with_passive(registration, requirement, longest_ns, now_ns)
+    return _pace_without_passive(registration, requirement, longest_ns)
 
 
-def _watched(
-    known: Registration, demand: Demand, longest_ns: int, now_ns: int
+def _pace_with_passive(
+    registration: Registration, requirement: DitherRequirement, longest_ns: int, now_ns: int
 ) -> tuple[DitherPhase, str, int]:
     """Pace by what the filter makes of dithered windows and ordinary telemetry together."""
-    enough = bool(np.all(np.diag(known.covariance) <= demand.sigma**2))
+    enough = bool(np.all(np.diag(registration.covariance) <= requirement.sigma**2))
     if enough:
         return DitherPhase.SPARSE, "ordinary telemetry keeps σ between windows", longest_ns
-    if known.arrived_ns_utc > known.window_ns_utc:
+    if registration.arrived_ns_utc > registration.window_ns_utc:
         return DitherPhase.SPARSE, "ordinary telemetry alone keeps σ no longer", now_ns
     return DitherPhase.FOLLOW, "a window alone does not bring σ to what is asked", now_ns
 
 
-def _unwatched(
-    known: Registration, demand: Demand, longest_ns: int
+def _pace_without_passive(
+    registration: Registration, requirement: DitherRequirement, longest_ns: int
 ) -> tuple[DitherPhase, str, int]:
     """Pace by how far α may have walked since the last window."""
-    room = demand.sigma**2 - np.diag(known.covariance)
-    on_s = SETTLING_S + demand.window_s + SPARE_S
-    pause_s = float(np.min(room / demand.drift_rate**2)) - on_s
+    room = requirement.sigma**2 - np.diag(registration.covariance)
+    on_s = SETTLING_S + requirement.window_s + SPARE_S
+    pause_s = float(np.min(room / requirement.drift_rate**2)) - on_s
     if pause_s < SHORTEST_PAUSE_S:
         text = "α walks too fast for a pause, or no window brings σ to what is asked"
-        return DitherPhase.FOLLOW, text, known.arrived_ns_utc
-    due_ns = known.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
+        return DitherPhase.FOLLOW, text, registration.arrived_ns_utc
+    due_ns = registration.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
     return (
         DitherPhase.SPARSE,
         "α cannot have walked far since the last window",
@@ -301,54 +318,54 @@ def _unwatched(
     )
 
 
-def _steady(state: TrackerState, found: Schedule, demand: Demand) -> float:
+def _steady(state: TrackerState, found: Schedule, requirement: DitherRequirement) -> float:
     """Return the amplitude, left as it is while the best one is near."""
-    before = state.dithering.plan
-    settled = state.dithering.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
-    if before is None or not settled or before.total_m > demand.budget_m:
+    before = state.dither_policy.plan
+    settled = state.dither_policy.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
+    if before is None or not settled or before.total_m > requirement.budget_m:
         return found.total_m
     ratio = found.total_m / before.total_m
     return before.total_m if 1.0 / CHANGE <= ratio <= CHANGE else found.total_m
 
 
-def why_none(turn: Turn, rtc: Status) -> str | None:
+def why_none(context: StepContext, rtc: Status) -> str | None:
     """Return why the service asks for no dither of its own, or None."""
-    state = turn.state
-    still = state.dithering.unwanted_id
+    state = context.state
+    still = state.dither_policy.unwanted_id
     left = "" if still is None else f"; the RTC still plays {still}"
     if state.dither_stopped:
         return f"stopped by the operator{left}"
-    if not turn.policy.dither_enabled and state.dither is None:
+    if not context.policy.dither_enabled and state.dither is None:
         return f"the settings forbid it{left}"
     if not rtc.in_loop:
         return why_open(rtc)
-    unnamed = rtc.cm_id is None or state.unfetched
+    unnamed = rtc.cm_id is None or state.read_back_error
     if state.in_use is None and not unnamed and state.dither is None and rtc.dither is None:
         return "the reconstructor in use is not known yet"
-    alarm = turn.forbidden(Act.MEASURE)
+    alarm = context.blocking_alarm(Interlock.MEASURE)
     return None if alarm is None else f"nothing would be measured under {alarm.name}"
 
 
-def awaits_a_result(turn: Turn, wish: Wish) -> bool:
+def awaits_a_result(context: StepContext, wanted_dither: WantedDither) -> bool:
     """Return whether the window of the dither that ended last may still be on its way."""
-    dithering = turn.dithering
-    if wish.phase is DitherPhase.PROVE:
-        return mode_proof.awaits_result(turn, wish.choice.window_s)
-    if wish.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
+    dithering = context.dither_policy
+    if wanted_dither.phase is DitherPhase.PROVE:
+        return mode_proof.awaits_result(context, wanted_dither.parameters.window_s)
+    if wanted_dither.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
         return False
-    late = turn.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
-    return not late and turn.state.windows_accepted < dithering.results_due
+    late = context.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
+    return not late and context.state.windows_accepted < dithering.results_due
 
 
-def too_strong(turn: Turn, rtc: Status) -> str | None:
+def too_strong(context: StepContext, rtc: Status) -> str | None:
     """Return why a dither that is played costs more than it may, or None.
 
     An operator's own may cost more than the budget, but not more than was asked for.
     """
     if rtc.dither is None:
         return None
-    running, dithering = rtc.dither.request, turn.dithering
-    found_m, most_m = total_m(running), budget_m(rtc, turn.policy)
+    running, dithering = rtc.dither.request, context.dither_policy
+    found_m, most_m = total_m(running), budget_m(rtc, context.policy)
     over = own_sine(running) and found_m > ROUNDING * most_m
     if not over and running.id != dithering.loud_id:
         return None
@@ -360,9 +377,9 @@ def too_strong(turn: Turn, rtc: Status) -> str | None:
     )
 
 
-def why_unwanted(turn: Turn, rtc: Status) -> str | None:
+def why_unwanted(context: StepContext, rtc: Status) -> str | None:
     """Return why the dither that the RTC plays must go though it is not too strong, or None."""
-    state, running = turn.state, rtc.dither_id
+    state, running = context.state, rtc.dither_id
     if running is None or not running.startswith(OUR_DITHERS):
         return None
     if state.stopped_because:
@@ -370,7 +387,7 @@ def why_unwanted(turn: Turn, rtc: Status) -> str | None:
     followed = state.dither is not None and state.dither.id == running
     if state.dither_stopped and not followed:
         return "the operator wants no dither"
-    forbidden = not turn.policy.dither_enabled
+    forbidden = not context.policy.dither_enabled
     if forbidden and state.dither is None and running.startswith(OWN_DITHER):
         return "the settings forbid a dither"
     return None

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from service.control.dither import Schedule, clear_of
 from service.errors import CommandError, ModelError
-from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.demodulation import SIDE_OFFSETS_HZ
+from service.estimation.dither_monitor import ExpectedDither
 from service.estimation.lockin import LockInPlan
-from service.estimation.played import Asked
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
 from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
@@ -72,7 +72,7 @@ class Dither:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
+class DitherParameters:
     """What a dither is to be like, besides what settings or an operator fix."""
 
     total_m: float
@@ -117,7 +117,7 @@ def plan_dither(
     policy: Policy,
     now_ns: int,
     *,
-    choice: Choice,
+    choice: DitherParameters,
     modes: tuple[int, ...] | None = None,
     amplitude_m: float | None = None,
     frequency_hz: tuple[float, ...] | None = None,
@@ -186,7 +186,9 @@ def lock_in_plan(dither: Dither, rtc: Status, window_s: float) -> LockInPlan:
     )
 
 
-def asked_of(dither: Dither, rtc: Status, products: NDArray[np.float32] | None = None) -> Asked:
+def expected_dither(
+    dither: Dither, rtc: Status, products: NDArray[np.float32] | None = None
+) -> ExpectedDither:
     """Return a dither as the frames should hold it.
 
     ``products`` is what ``Description`` has; None: nobody knows what the slopes should show.
@@ -196,7 +198,7 @@ def asked_of(dither: Dither, rtc: Status, products: NDArray[np.float32] | None =
     response: tuple[float, ...] = ()
     if products is not None and max(modes) < len(products):
         response = tuple(products[modes, modes].tolist())
-    return Asked(
+    return ExpectedDither(
         modes=request.modes,
         amplitude_m=request.amplitude_m,
         frequency_hz=dither.frequency_hz,
@@ -208,7 +210,7 @@ def asked_of(dither: Dither, rtc: Status, products: NDArray[np.float32] | None =
     )
 
 
-def clear_lines(rtc: Status, n_lines: int, choice: Choice) -> tuple[float, ...]:
+def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[float, ...]:
     """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
 
     Those of the last dither stay while none of them is on a vibration.
@@ -413,7 +415,7 @@ class DitherPlan(Schedule):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Dithering:
+class DitherPolicyState:
     """The dither policy's memory, and its account to the operator."""
 
     phase: DitherPhase = DitherPhase.OFF
@@ -457,7 +459,7 @@ class Dithering:
     unwanted_id: str | None = None
     """A dither the RTC plays and should not; None: none."""
 
-    told_ns_utc: int = 0
+    stop_asked_ns_utc: int = 0
     """When the RTC was last told to stop one that nobody wants."""
 
     loud_id: str | None = None

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.estimation.comparison import ProbationFinding
-from service.estimation.lockin import WindowEstimate
-from service.estimation.openloop import FarEstimate
+from service.estimation.lockin import LockInEstimate
+from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.passive import PassiveEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import WindowRefused
@@ -38,7 +38,7 @@ class MakeMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CopyMatrix:
+class RepublishMatrix:
     """Judge an earlier reconstructor at the current α and offer it under a new id."""
 
     source: str
@@ -105,7 +105,7 @@ class FinishNoisy:
 
 Effect = (
     MakeMatrix
-    | CopyMatrix
+    | RepublishMatrix
     | JudgeMatrix
     | JudgeProposal
     | SendMatrix
@@ -144,7 +144,7 @@ class ServicesMet:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Trouble:
+class ConditionChanged:
     """A condition that must be seen while it lasts."""
 
     name: str
@@ -156,9 +156,9 @@ class Trouble:
     """End of the telemetry that told, the RTC's clock; 0: it was not telemetry."""
 
     @classmethod
-    def news(
+    def detect(
         cls, state: TrackerState, name: str, text: str | None, over: str, t_ns_utc: int = 0
-    ) -> list[Trouble]:
+    ) -> list[ConditionChanged]:
         """Return the trouble that has come or gone, if it has; no text: there is none now."""
         known = state.alarm(name) is not None
         if bool(text) is known:
@@ -167,7 +167,7 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Noted:
+class LogEvent:
     """Something happened that changes nothing but should be on record."""
 
     name: str
@@ -179,16 +179,16 @@ class Noted:
 class WindowFitted:
     """The worker estimated α from one window."""
 
-    estimate: WindowEstimate | RandomEstimate
+    estimate: LockInEstimate | RandomEstimate
     began_ns_utc: int = 0
     """Begin of the window, the RTC's clock; 0: not told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FarFitted:
+class WideCaptureFitted:
     """The worker found α from afar, in a window with the loop open."""
 
-    found: FarEstimate
+    found: WideCaptureEstimate
     began_ns_utc: int = 0
     """Begin of the window, the RTC's clock; 0: not told."""
 
@@ -201,7 +201,7 @@ class WindowLost:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Watched:
+class PassiveFitted:
     """The watchdog estimated α from ordinary telemetry."""
 
     estimate: PassiveEstimate
@@ -216,7 +216,7 @@ class Watched:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Unwatched:
+class PassiveUnavailable:
     """The watchdog cannot estimate α from ordinary telemetry as it is."""
 
     text: str
@@ -367,13 +367,13 @@ Event = (
     | SessionStarted
     | RtcVanished
     | ServicesMet
-    | Trouble
-    | Noted
+    | ConditionChanged
+    | LogEvent
     | WindowFitted
-    | FarFitted
+    | WideCaptureFitted
     | WindowLost
-    | Watched
-    | Unwatched
+    | PassiveFitted
+    | PassiveUnavailable
     | MatrixMade
     | MatrixFetched
     | ModesRecognised

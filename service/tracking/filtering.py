@@ -16,20 +16,20 @@ from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, Why
 from service.model.misregistration import Misregistration
 from service.tracking import mode_proof, validity
-from service.tracking.alarms import DISAGREES, SUSPECTED, Act, forbidding
-from service.tracking.jumps import last_of
+from service.tracking.alarms import DISAGREES, SUSPECTED, Interlock, blocking_alarm
+from service.tracking.jumps import as_previous
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
-    Earlier,
     HistoryEntry,
     PassiveBias,
-    Reading,
+    PointedEstimate,
+    PreviousEstimate,
     Registration,
     Source,
 )
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
-from service.tracking.validity import Taken
+from service.tracking.step_context import StepContext
+from service.tracking.validity import TelemetrySpan
 
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""
@@ -63,7 +63,7 @@ MISFIT_WINDOWS = 10
 
 
 def followed_gains(
-    known: tuple[ModeGain, ...],
+    before: tuple[ModeGain, ...],
     modes: tuple[int, ...],
     gains: Array,
     sigma: Array | None,
@@ -74,7 +74,7 @@ def followed_gains(
     ``gains`` and ``sigma`` ``(n_lines,)`` are modulus and 1 σ from the window's own data; None:
     nothing but the scatter from window to window tells how precise they are.
     """
-    table = {gain.mode: gain for gain in known}
+    table = {gain.mode: gain for gain in before}
     own = np.zeros(len(gains)) if sigma is None else sigma
     for mode, gain, noise in zip(modes, gains, own, strict=True):
         table[mode] = _followed(table.get(mode), mode, float(gain), float(noise), t_ns)
@@ -83,25 +83,25 @@ def followed_gains(
 
 
 def _followed(
-    known: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int
+    gain: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int
 ) -> ModeGain:
     """Return one gain as a scalar random walk; its windows' scatter is learnt as it goes.
 
     A window's own σ knows the noise beside the lines, not that the gain itself swings.
     """
-    if known is None:
+    if gain is None:
         scatter = max(noise, FIRST_SCATTER * measured)
         return ModeGain(mode=mode, gain=measured, sigma=scatter, scatter=scatter, t_ns_utc=t_ns)
-    elapsed_s = max((t_ns - known.t_ns_utc) / SECOND_NS, 0.0)
-    prior = known.sigma**2 + (GAIN_RATE * known.gain) ** 2 * elapsed_s
-    farthest = _FARTHEST * float(np.sqrt(prior + known.scatter**2))
-    innovation = float(np.clip(measured - known.gain, -farthest, farthest))
+    elapsed_s = max((t_ns - gain.t_ns_utc) / SECOND_NS, 0.0)
+    prior = gain.sigma**2 + (GAIN_RATE * gain.gain) ** 2 * elapsed_s
+    farthest = _FARTHEST * float(np.sqrt(prior + gain.scatter**2))
+    innovation = float(np.clip(measured - gain.gain, -farthest, farthest))
     learnt = max(innovation**2 - prior, noise**2)
-    scatter = float(np.sqrt((1 - LEARNING) * known.scatter**2 + LEARNING * learnt))
+    scatter = float(np.sqrt((1 - LEARNING) * gain.scatter**2 + LEARNING * learnt))
     weight = prior / (prior + scatter**2)
     return ModeGain(
         mode=mode,
-        gain=known.gain + weight * innovation,
+        gain=gain.gain + weight * innovation,
         sigma=float(np.sqrt((1 - weight) * prior)),
         scatter=scatter,
         t_ns_utc=t_ns,
@@ -112,7 +112,7 @@ HISTORY_LENGTH = 5000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured(Reading):
+class WindowEstimate(PointedEstimate):
     """What one dithered window says of α, and of what it was made."""
 
     source: Source
@@ -129,13 +129,13 @@ class Measured(Reading):
     """Residual power over what noise explains; 1: the model explains the window."""
 
     @property
-    def when(self) -> Taken:
+    def when(self) -> TelemetrySpan:
         """The telemetry it is of."""
-        return Taken(began_ns_utc=self.began_ns_utc, ended_ns_utc=self.t_ns_utc)
+        return TelemetrySpan(began_ns_utc=self.began_ns_utc, ended_ns_utc=self.t_ns_utc)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Folded:
+class FilterUpdate:
     """What the filter makes of a window."""
 
     joint: Joint
@@ -152,28 +152,28 @@ class Folded:
     """Whether it is of a new place, to which what was known before says nothing."""
 
 
-def brought_forward(turn: Turn, known: Registration, t_ns_utc: int) -> Joint:
+def brought_forward(context: StepContext, registration: Registration, t_ns_utc: int) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
-    elapsed_ns = t_ns_utc - known.t_ns_utc
+    elapsed_ns = t_ns_utc - registration.t_ns_utc
     if elapsed_ns < -validity.CLOCK_SET_BACK_S * SECOND_NS:
         # a clock that was set back, or another night played again: the service's own must do
-        elapsed_ns = turn.now_ns - known.arrived_ns_utc
-    policy = turn.policy
+        elapsed_ns = context.now_ns - registration.arrived_ns_utc
+    policy = context.policy
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
-    bent = validity.flexure(known.pointing, turn.state.pointing, policy)
-    return predicted(joint_of(known), drift, elapsed_ns / SECOND_NS, bent)
+    bent = validity.flexure(registration.pointing, context.state.pointing, policy)
+    return predicted(joint_of(registration), drift, elapsed_ns / SECOND_NS, bent)
 
 
-def joint_of(known: Registration) -> Joint:
+def joint_of(registration: Registration) -> Joint:
     """Return the filter's state that a registration holds."""
-    fresh = begin_joint(known.alpha.vector, known.covariance)
-    bias = known.bias
+    fresh = begin_joint(registration.alpha.vector, registration.covariance)
+    bias = registration.bias
     if bias is None:
         return fresh
     covariance = fresh.covariance.copy()
     covariance[4:, 4:] = bias.covariance
     covariance[4:, :4], covariance[:4, 4:] = bias.shared, bias.shared.T
-    mean = np.concatenate([known.alpha.vector, bias.offset])
+    mean = np.concatenate([registration.alpha.vector, bias.offset])
     return Joint(mean=mean, covariance=covariance, excess=bias.excess, scatter=bias.scatter)
 
 
@@ -181,12 +181,12 @@ def bias_of(
     joint: Joint,
     looked_ns_utc: int,
     loop: tuple[float, ...],
-    earlier: Earlier | None = None,
+    previous_estimate: PreviousEstimate | None = None,
 ) -> PassiveBias:
     """Return what the filter knows of the passive estimate's bias, in the loop of its last look."""
     return PassiveBias(
         loop=loop,
-        earlier=earlier,
+        previous_estimate=previous_estimate,
         offset=joint.bias,
         covariance=joint.covariance[4:, 4:],
         shared=joint.covariance[4:, :4],
@@ -196,36 +196,38 @@ def bias_of(
     )
 
 
-def remember(turn: Turn, entry: HistoryEntry) -> None:
+def remember(context: StepContext, entry: HistoryEntry) -> None:
     """Keep one more line of history."""
-    entry = replace(entry, in_use=turn.state.in_use)
-    history = (*turn.state.history, entry)[-HISTORY_LENGTH:]
-    turn.state = replace(turn.state, history=history)
+    entry = replace(entry, in_use=context.state.in_use)
+    history = (*context.state.history, entry)[-HISTORY_LENGTH:]
+    context.state = replace(context.state, history=history)
 
 
-def counted(turn: Turn, known: Registration, prior: Joint) -> int:
+def counted(context: StepContext, registration: Registration, prior: Joint) -> int:
     """Return how many windows agree after this one: it stands alone where α had gone stale."""
-    policy = turn.policy
-    sigma = np.sqrt(np.diag(prior.alpha_covariance) + known.floor**2)
-    slewed = validity.slewed_deg(turn.state, known) > policy.slew_limit_deg
-    return 1 if slewed or np.any(sigma > policy.stale_sigma) else known.n_windows + 1
+    policy = context.policy
+    sigma = np.sqrt(np.diag(prior.alpha_covariance) + registration.floor**2)
+    slewed = validity.slewed_deg(context.state, registration) > policy.slew_limit_deg
+    return 1 if slewed or np.any(sigma > policy.stale_sigma) else registration.n_windows + 1
 
 
-def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 1) -> None:
+def accept(
+    context: StepContext, update: FilterUpdate, measured: WindowEstimate, *, n_accepted: int = 1
+) -> None:
     """Take what the filter says after a window for what is known; it may be the second accepted."""
-    joint, when, known = folded.joint, measured.when, turn.known
-    bias = None if known is None else known.bias
-    doubted = _still_doubted(turn.state, folded, when)
-    anew = folded.jumped or (known is not None and known.candidate is not None)
+    joint, when, previous = update.joint, measured.when, context.registration
+    bias = None if previous is None else previous.bias
+    doubted = _still_doubted(context.state, update, when)
+    anew = update.jumped or (previous is not None and previous.suspected_jump is not None)
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
         floor=measured.floor,
         t_ns_utc=when.ended_ns_utc,
-        arrived_ns_utc=turn.now_ns,
-        n_windows=folded.n_windows,
-        scatter=folded.scatter,
-        window_ns_utc=turn.now_ns,
+        arrived_ns_utc=context.now_ns,
+        n_windows=update.n_windows,
+        scatter=update.scatter,
+        window_ns_utc=context.now_ns,
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
@@ -233,64 +235,72 @@ def accept(turn: Turn, folded: Folded, measured: Measured, *, n_accepted: int = 
             joint,
             0 if bias is None else bias.looked_ns_utc,
             () if bias is None else bias.loop,
-            None if bias is None or anew else bias.earlier,
+            None if bias is None or anew else bias.previous_estimate,
         ),
-        passive_after_ns_utc=known.passive_after_ns_utc if known is not None else 0,
-        earlier=None if anew else _earlier(known, folded, measured),
-        jumped_ns_utc=_jumped_ns_utc(known, folded, turn.now_ns),
-        doubt=known.doubt if known is not None and doubted else "",
-        doubted_ns_utc=known.doubted_ns_utc if known is not None and doubted else 0,
-        doubt_voids=known is None or known.doubt_voids,
+        passive_after_ns_utc=previous.passive_after_ns_utc if previous is not None else 0,
+        previous_estimate=None if anew else _previous_estimate(previous, update, measured),
+        jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),
+        doubt=previous.doubt if previous is not None and doubted else "",
+        doubted_ns_utc=previous.doubted_ns_utc if previous is not None and doubted else 0,
+        doubt_voids=previous is None or previous.doubt_voids,
         pointing=measured.pointing,
-        window_pointing=validity.pointing_at(turn.state, when.began_ns_utc),
-        restored_ns_utc=known.restored_ns_utc if known is not None else None,
-        basis_id=turn.state.basis_id,
-        config_id=turn.state.config_id,
+        window_pointing=validity.pointing_at(context.state, when.began_ns_utc),
+        restored_ns_utc=previous.restored_ns_utc if previous is not None else None,
+        basis_id=context.state.basis_id,
+        config_id=context.state.config_id,
     )
-    validity.hold(turn, registration)
-    turn.state = replace(turn.state, windows_accepted=turn.state.windows_accepted + n_accepted)
+    validity.store_registration(context, registration)
+    context.state = replace(
+        context.state, windows_accepted=context.state.windows_accepted + n_accepted
+    )
     if not doubted:
-        validity.have_window(turn)
-        turn.calm(SUSPECTED)
-        turn.calm(DISAGREES)
-    remember(turn, entry_of(measured, registration, folded.innovation))
-    validity.age(turn)
+        validity.have_window(context)
+        context.clear_alarm(SUSPECTED)
+        context.clear_alarm(DISAGREES)
+    remember(context, entry_of(measured, registration, update.innovation))
+    validity.age(context)
 
 
-def _still_doubted(state: TrackerState, folded: Folded, when: Taken) -> bool:
+def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpan) -> bool:
     """Return whether α stays in doubt: the window is of before.
 
     One that confirms where the mirror has jumped to need not have begun since, for it tells no
     other place than the window before it.
     """
-    known = state.registration
-    if known is None or not known.doubt:
+    registration = state.registration
+    if registration is None or not registration.doubt:
         return False
-    if folded.jumped:
+    if update.jumped:
         when = replace(when, began_ns_utc=when.ended_ns_utc)
-    return validity.precedes(state, when, known.doubted_ns_utc)
+    return validity.precedes(state, when, registration.doubted_ns_utc)
 
 
-def _jumped_ns_utc(known: Registration | None, folded: Folded, now_ns: int) -> int | None:
-    if folded.jumped:
+def _jumped_ns_utc(
+    registration: Registration | None, update: FilterUpdate, now_ns: int
+) -> int | None:
+    if update.jumped:
         return now_ns
-    return None if known is None else known.jumped_ns_utc
+    return None if registration is None else registration.jumped_ns_utc
 
 
-def _earlier(known: Registration | None, folded: Folded, measured: Measured) -> Earlier | None:
+def _previous_estimate(
+    registration: Registration | None, update: FilterUpdate, measured: WindowEstimate
+) -> PreviousEstimate | None:
     """Return what was known before a window, and before the one that came before it."""
-    if known is None or folded.n_windows == 1:
+    if registration is None or update.n_windows == 1:
         return None
-    before = known.earlier
+    before = registration.previous_estimate
     return replace(
-        last_of(known),
-        then=measured,
-        earlier=None if before is None else replace(before, then=None, earlier=None),
+        as_previous(registration),
+        next_window=measured,
+        previous_estimate=None
+        if before is None
+        else replace(before, next_window=None, previous_estimate=None),
     )
 
 
 def entry_of(
-    measured: Measured, registration: Registration, innovation: float, *, entered: bool = True
+    measured: WindowEstimate, registration: Registration, innovation: float, *, entered: bool = True
 ) -> HistoryEntry:
     """Return the line of the history that a window leaves."""
     return HistoryEntry(
@@ -306,17 +316,19 @@ def entry_of(
     )
 
 
-def model_error_of(known: Registration | None, estimate: DitheredEstimate, policy: Policy) -> Array:
+def model_error_of(
+    registration: Registration | None, estimate: DitheredEstimate, policy: Policy
+) -> Array:
     """Return the model error by all windows so far: what is set, and what they do not explain.
 
     A window weaker than what is asked of α cannot tell: the chance in its misfit, times its own σ,
     would be more than any model error.
     """
-    before = policy.floor if known is None else known.floor
+    before = policy.floor if registration is None else registration.floor
     if np.any(np.diag(estimate.covariance) > policy.dither_sigma**2):
         return before
     squared = policy.floor**2 + model_error(estimate.covariance, estimate.misfit) ** 2
-    share = 1.0 if known is None else 1.0 / min(known.n_windows + 1, MISFIT_WINDOWS)
+    share = 1.0 if registration is None else 1.0 / min(registration.n_windows + 1, MISFIT_WINDOWS)
     return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
 
 
@@ -327,14 +339,16 @@ def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
-def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | None:
+def why_no_window(
+    context: StepContext, estimate: DitheredEstimate, when: TelemetrySpan
+) -> Why | None:
     """Return why a window's estimate must not be used, or None."""
-    if turn.rtc is None or estimate.session != turn.rtc.session:
+    if context.rtc is None or estimate.session != context.rtc.session:
         return RefusalKind.VOID, "the RTC has restarted since"
-    reason = why_no_measurement(turn.state, when)
+    reason = why_no_measurement(context.state, when)
     if reason is not None:
         return RefusalKind.VOID, reason
-    odd = mode_proof.why_void(turn, estimate)
+    odd = mode_proof.why_void(context, estimate)
     if odd is not None:
         return RefusalKind.VOID, odd
     lag = float(np.median(estimate.lag_frames))
@@ -352,7 +366,7 @@ def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | 
             RefusalKind.OTHER,
             "too uncertain: raise the dither's amplitude or the window's length",
         )
-    near = turn.policy.start if turn.known is None else turn.known.alpha
+    near = context.policy.start if context.registration is None else context.registration.alpha
     distance = np.abs(estimate.alpha.vector - near.vector)
     if np.any(distance > CAPTURE_RANGE):
         return RefusalKind.OUT_OF_REACH, (
@@ -362,9 +376,9 @@ def why_no_window(turn: Turn, estimate: DitheredEstimate, when: Taken) -> Why | 
     return None
 
 
-def why_no_measurement(state: TrackerState, when: Taken) -> str | None:
+def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:
     """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
-    alarm = forbidding(state, Act.MEASURE)
+    alarm = blocking_alarm(state, Interlock.MEASURE)
     if alarm is None:
-        return validity.why_void(state, when)
-    return f"{alarm.kind.because}: its telemetry is no measurement"
+        return validity.why_telemetry_invalid(state, when)
+    return f"{alarm.definition.because}: its telemetry is no measurement"

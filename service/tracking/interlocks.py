@@ -15,17 +15,17 @@ from typing import Final, get_args
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking.acquisition_stages import why_not_now
-from service.tracking.activity import Activity, Running, under_way
+from service.tracking.alarm_records import PREFIX
 from service.tracking.alarms import ALARMS
-from service.tracking.attention import PREFIX
 from service.tracking.commands import Command
 from service.tracking.loop import NO_RTC
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import known_record
+from service.tracking.running_operations import OperationKind, RunningOperation, under_way
 from service.tracking.sending import beyond_judging, why_refused
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
-from service.tracking.worth import left_behind
+from service.tracking.update_policy import left_behind
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Moment:
     now_ns: int
     """The service's clock, nanoseconds."""
 
-    running: tuple[Running, ...]
+    running: tuple[RunningOperation, ...]
     """What runs, what is exclusive first."""
 
 
@@ -72,19 +72,19 @@ _ALWAYS = _SEEN | frozenset[type](
 )
 """What ends something, and what disturbs nothing."""
 
-ALLOWS: Final[dict[Activity, frozenset[type]]] = {
-    Activity.STOPPED: _ALWAYS,
-    Activity.MEASURING: _ALWAYS,
+ALLOWS: Final[dict[OperationKind, frozenset[type]]] = {
+    OperationKind.STOPPED: _ALWAYS,
+    OperationKind.MEASURING: _ALWAYS,
     # a swap costs it a window, and must not wait for minutes
-    Activity.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
-    Activity.RAMPING: _ALWAYS,
-    Activity.ACQUIRING: _ALWAYS,
+    OperationKind.GATHERING: _ALWAYS | {cmd.Refit, cmd.Approve, cmd.Publish, cmd.Rollback},
+    OperationKind.RAMPING: _ALWAYS,
+    OperationKind.ACQUIRING: _ALWAYS,
     # it makes way for what needs the loop, and an RTC measures under no dither
-    Activity.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
-    Activity.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
-    Activity.STANDING_BY: _ALWAYS - {cmd.AbortAcquisition, cmd.GiveUp, cmd.StopDither},
-    Activity.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish},
-    Activity.SENDING: _ALL - {cmd.Measure},
+    OperationKind.OWN_DITHER: _ALL - {cmd.Measure, cmd.StartDither},
+    OperationKind.OTHER_DITHER: _ALL - {cmd.Measure, cmd.StartDither, cmd.MeasureNoisy},
+    OperationKind.STANDING_BY: _ALWAYS - {cmd.AbortAcquisition, cmd.GiveUp, cmd.StopDither},
+    OperationKind.MAKING: _ALL - {cmd.Measure, cmd.Refit, cmd.Publish},
+    OperationKind.SENDING: _ALL - {cmd.Measure},
 }
 """Orders that are carried out while it runs; a gain ramp also lets the loop be opened."""
 
@@ -142,8 +142,8 @@ def _decided(moment: Moment, order: Order) -> Permission:
     kind = order if isinstance(order, type) else type(order)
     opens = isinstance(order, cmd.SetLoop) and order.loop == "open"
     for running in moment.running:
-        ends_it = opens and running.activity is Activity.RAMPING
-        if kind not in ALLOWS[running.activity] and not ends_it:
+        ends_it = opens and running.kind is OperationKind.RAMPING
+        if kind not in ALLOWS[running.kind] and not ends_it:
             return Permission(allowed=False, reason=running.text)
     interlock = INTERLOCKS.get(kind)
     reason = None if interlock is None else interlock(moment, _named(order))
@@ -212,15 +212,15 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
     record = _meant(state, matrix_id)
     if record is None or record.state is not MatrixState.PROPOSED:
         return _not_proposed(record)
-    known = state.registration
-    if known is not None and not known.usable:
-        return f"{record.id} cannot be judged: α is invalid ({known.standing.reason})"
+    registration = state.registration
+    if registration is not None and not registration.usable:
+        return f"{record.id} cannot be judged: α is invalid ({registration.validity.reason})"
     if left_behind(state, record, moment.policy):
         return f"{record.id} was made for another α than the present one: refit"
     reason = why_refused(state, record)
     if reason is not None:
         return f"{record.id} cannot be sent: {reason}"
-    if known is not None and beyond_judging(state, record):
+    if registration is not None and beyond_judging(state, record):
         return f"{record.id}: an open loop does not tell its gains: close it first"
     return None
 
@@ -264,7 +264,7 @@ def _rollback(moment: Moment, _: str) -> str | None:
 def _give_up(moment: Moment, measurement_id: str) -> str | None:
     state = moment.state
     if not measurement_id:
-        going_on = state.measuring or state.gathering
+        going_on = state.measuring or state.noisy_measurement
         return "nothing is being measured" if going_on is None else None
     record = state.measurement(measurement_id)
     if record is None:
@@ -274,21 +274,21 @@ def _give_up(moment: Moment, measurement_id: str) -> str | None:
 
 
 def _acknowledge(moment: Moment, alarm: str) -> str | None:
-    notes = moment.state.notes
+    notes = moment.state.alarm_records
     if not alarm:
-        unseen = any(note.worst is not None and note.acknowledged is None for note in notes)
+        unseen = any(record.worst is not None and record.acknowledged is None for record in notes)
         return None if unseen else "every alarm is acknowledged"
-    note = next((note for note in notes if note.name == alarm), None)
-    if note is None and not _is_known(alarm):
+    record = next((record for record in notes if record.name == alarm), None)
+    if record is None and not _is_known(alarm):
         return None  # nobody can know of it: it is looked up where that is done
-    if note is None or note.worst is None:
+    if record is None or record.worst is None:
         return f"{alarm} neither lasts nor is stale: nothing to acknowledge"
-    seen = note.acknowledged
+    seen = record.acknowledged
     return f"{alarm} was acknowledged by {seen.by}: nothing is left to do" if seen else None
 
 
 def _unmute(moment: Moment, alarm: str) -> str | None:
-    muted = any(note.muted for note in moment.state.notes if alarm in {"", note.name})
+    muted = any(record.muted for record in moment.state.alarm_records if alarm in {"", record.name})
     if muted or not _is_known(alarm):
         return None
     return f"{alarm} is not muted" if alarm else "no alarm is muted"

@@ -16,7 +16,12 @@ from service.estimation.kalman import JUMP_THRESHOLD, Joint
 from service.estimation.passive import BIAS_FLOOR
 from service.model.misregistration import Misregistration
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Earlier, Reading, Registration, Seen
+from service.tracking.registration import (
+    PointedEstimate,
+    PreviousEstimate,
+    Registration,
+    TimedEstimate,
+)
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure
 
 STEADY_S = 60.0
@@ -34,12 +39,12 @@ tenth of a subaperture is 20 σ and needs no such help."""
 ROTATION_LIMIT_OF_TWO = 12.2
 """The same for two windows together, once in 2000: they must also agree."""
 
-LOOK_LIMIT = 26.9
+PASSIVE_LIMIT = 26.9
 """What a passive look's innovation exceeds once in 10 000: it is the larger of two, and the scatter
 that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
 half of that)."""
 
-LOOK_BIAS = np.array([0.0, 0.0, 2.0, 4.0])
+PASSIVE_BIAS_SHARE = np.array([0.0, 0.0, 2.0, 4.0])
 """By how many times its own scatter a look may be off, beside what is known of its bias: where 60
 modes look through bad seeing its magnification is 2 to 5 times that too large, every time, and on
 a bright star its rotation up to 2.5 times off."""
@@ -66,14 +71,14 @@ LITTLE = 0.3
 _ROTATION = 2
 
 Array = NDArray[np.float64]
-SeenT = TypeVar("SeenT", bound=Seen)
+EstimateT = TypeVar("EstimateT", bound=TimedEstimate)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Distance:
+class Innovation:
     """How far a reading lies from what was known."""
 
-    innovation: float
+    mahalanobis_squared: float
     """Squared, normalised, of all four parameters: 4 is expected."""
 
     rotation: float
@@ -84,173 +89,191 @@ class Distance:
     @property
     def excess(self) -> float:
         """What is least likely of it, over what chance hardly ever exceeds."""
-        return max(self.innovation / JUMP_THRESHOLD, self.rotation / self.rotation_limit)
+        return max(self.mahalanobis_squared / JUMP_THRESHOLD, self.rotation / self.rotation_limit)
 
     @property
-    def far(self) -> bool:
+    def is_outlier(self) -> bool:
         """Whether it is no chance."""
         return self.excess > 1.0
 
 
-NEAR = Distance(innovation=0.0, rotation=0.0)
+NEAR = Innovation(mahalanobis_squared=0.0, rotation=0.0)
 """Where nothing can be told."""
 
 
-def distance(difference: Array, covariance: Array) -> Distance:
+def innovation_of(difference: Array, covariance: Array) -> Innovation:
     """Return how far ``(4,)`` lies from zero by its covariance ``(4, 4)``."""
     weight = np.linalg.inv(covariance)
     score = weight @ difference
-    return Distance(
-        innovation=float(score @ difference),
+    return Innovation(
+        mahalanobis_squared=float(score @ difference),
         rotation=float(score[_ROTATION] ** 2 / weight[_ROTATION, _ROTATION]),
     )
 
 
-def window_surprise(known: Registration, reading: Reading, policy: Policy) -> Distance:
+def window_innovation(
+    registration: Registration, window: PointedEstimate, policy: Policy
+) -> Innovation:
     """Return how far a window lies from α.
 
     It is seen from after the last window and from before it: a jump in the middle of a window
     moves that one by half of it and the next by the other half, and neither half need be far out.
     """
-    return _farthest((last_of(known), known.earlier), _scattering(known, reading), policy)
+    return _farthest(
+        (as_previous(registration), registration.previous_estimate),
+        _scattering(registration, window),
+        policy,
+    )
 
 
-def pair_surprise(known: Registration, reading: Reading, policy: Policy) -> Distance:
+def pair_innovation(
+    registration: Registration, window: PointedEstimate, policy: Policy
+) -> Innovation:
     """Return how far a window and the one before it lie from what was known, both together.
 
     Half the noise of one: a jump that no window alone can tell. The one before was held, or has
     entered. They are seen from before both and from before the window before, in whose middle the
     jump may have been; and they are no jump unless each lies nearer to the other than to α.
     """
-    first, before = window_before(known), known.earlier
+    first, before = previous_window(registration), registration.previous_estimate
     if first is None:
         return NEAR
-    seen_from = (last_of(known), before)
-    if known.candidate is None and before is not None:
-        seen_from = (before, before.earlier)
-    reading = _scattering(known, reading)
-    first = _scattering(known, first)
-    alone = replace(
-        reading, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc
-    )
-    nearest = min(_farthest(seen_from, one, policy).innovation for one in (alone, reading))
-    if _apart(first.alpha, first, reading, policy) >= min(nearest, JUMP_THRESHOLD):
-        return _jump_inside_first(known, first, reading, policy)
-    found = _farthest(seen_from, _together(first, reading), policy)
+    seen_from = (as_previous(registration), before)
+    if registration.suspected_jump is None and before is not None:
+        seen_from = (before, before.previous_estimate)
+    window = _scattering(registration, window)
+    first = _scattering(registration, first)
+    alone = replace(window, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc)
+    nearest = min(_farthest(seen_from, one, policy).mahalanobis_squared for one in (alone, window))
+    if _squared_distance(first.alpha, first, window, policy) >= min(nearest, JUMP_THRESHOLD):
+        return _jump_inside_first(registration, first, window, policy)
+    found = _farthest(seen_from, _together(first, window), policy)
     return replace(found, rotation_limit=ROTATION_LIMIT_OF_TWO)
 
 
 def _jump_inside_first(
-    known: Registration, first: Seen, reading: Reading, policy: Policy
-) -> Distance:
+    registration: Registration, first: TimedEstimate, window: PointedEstimate, policy: Policy
+) -> Innovation:
     """Return how far a window lies if the mirror jumped there inside the one before it.
 
     That one lies between α and the new place: it is far out by itself, on the same way, and not
     beyond. Only a jump beyond all turbulence is told like this.
     """
-    if known.candidate is None:
+    if registration.suspected_jump is None:
         return NEAR
-    found = _farthest((last_of(known),), reading, policy)
+    found = _farthest((as_previous(registration),), window, policy)
     if found.excess <= FARTHEST:
         return NEAR
-    total = _noise_of_two(first, reading, policy)
-    part, whole = (one.alpha.vector - known.alpha.vector for one in (first, reading))
+    total = _noise_of_two(first, window, policy)
+    part, whole = (one.alpha.vector - registration.alpha.vector for one in (first, window))
     along = float(part @ np.linalg.solve(total, whole))
     part_sq, whole_sq = (float(step @ np.linalg.solve(total, step)) for step in (part, whole))
     same_way = along >= SAME_WAY * np.sqrt(part_sq * whole_sq) and part_sq <= whole_sq
     return found if same_way else NEAR
 
 
-def window_before(known: Registration) -> Seen | None:
+def previous_window(registration: Registration) -> TimedEstimate | None:
     """Return the window before the present one: held, or the last that entered."""
-    if known.candidate is not None:
-        return known.candidate
-    return None if known.earlier is None else known.earlier.then
+    if registration.suspected_jump is not None:
+        return registration.suspected_jump
+    return (
+        None
+        if registration.previous_estimate is None
+        else registration.previous_estimate.next_window
+    )
 
 
-def lasts(known: Registration, first: Seen, reading: Reading, both: Distance) -> bool:
+def jump_lasts(
+    registration: Registration, first: TimedEstimate, window: PointedEstimate, both: Innovation
+) -> bool:
     """Return whether windows have told of a new place, ``both`` so far, for long enough.
 
     Two suffice where windows scatter by what they say and are independent. Where they scatter by
     more, neighbours are wrong together, and they must agree for longer than that lasts.
     """
-    if known.scatter < SCATTERED or both.excess > FARTHEST:
+    if registration.scatter < SCATTERED or both.excess > FARTHEST:
         return True
-    return (reading.t_ns_utc - first.began_ns_utc) / SECOND_NS >= ALIKE_S
+    return (window.t_ns_utc - first.began_ns_utc) / SECOND_NS >= ALIKE_S
 
 
-def wholly_after(first: Seen, reading: Reading, old: Misregistration, policy: Policy) -> bool:
+def wholly_after(
+    first: TimedEstimate, window: PointedEstimate, old: Misregistration, policy: Policy
+) -> bool:
     """Return whether a window is of the new place ``reading`` tells, and not partly of the ``old``.
 
     The first window after a jump began before it. What it may lack of the way (2 σ of the
     difference allowed for) must be little.
     """
-    apart = _apart(first.alpha, first, reading, policy)
+    apart = _squared_distance(first.alpha, first, window, policy)
     lacks = np.sqrt(apart) + 2.0
     return apart < JUMP_THRESHOLD and bool(
-        lacks <= LITTLE * np.sqrt(_apart(old, first, reading, policy))
+        lacks <= LITTLE * np.sqrt(_squared_distance(old, first, window, policy))
     )
 
 
-def look_surprise(known: Registration, joint: Joint, reading: Reading, policy: Policy) -> float:
+def passive_innovation(
+    registration: Registration, joint: Joint, window: PointedEstimate, policy: Policy
+) -> float:
     """Return the same of a passive look, its bias allowed for; ``joint`` is at ``known``'s time."""
-    before = known.bias.earlier if known.bias is not None else None
-    found, off = [], LOOK_BIAS**2 * np.diag(reading.covariance)
-    for earlier in (sum_of(known, joint), before):
+    before = registration.bias.previous_estimate if registration.bias is not None else None
+    found, off = [], PASSIVE_BIAS_SHARE**2 * np.diag(window.covariance)
+    for earlier in (sum_of(registration, joint), before):
         if earlier is not None:
-            elapsed_s = max(reading.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
+            elapsed_s = max(window.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
             forgot = BIAS_FLOOR**2 * fading + off
-            found.append(_surprise(earlier, reading, policy, forgot).innovation)
+            found.append(_innovation_from(earlier, window, policy, forgot).mahalanobis_squared)
     return max(found)
 
 
-def last_of(known: Registration) -> Earlier:
+def as_previous(registration: Registration) -> PreviousEstimate:
     """Return what is known, for when it will have been before."""
-    return Earlier(
-        alpha=known.alpha,
-        covariance=known.covariance,
-        t_ns_utc=known.t_ns_utc,
-        pointing=known.pointing,
+    return PreviousEstimate(
+        alpha=registration.alpha,
+        covariance=registration.covariance,
+        t_ns_utc=registration.t_ns_utc,
+        pointing=registration.pointing,
     )
 
 
-def sum_of(known: Registration, joint: Joint) -> Earlier:
+def sum_of(registration: Registration, joint: Joint) -> PreviousEstimate:
     """Return what a passive look should read: α and its bias together, the filter as it stands."""
     covariance = joint.covariance
     shared = covariance[4:, :4]
-    return Earlier(
+    return PreviousEstimate(
         alpha=Misregistration.from_vector(joint.alpha + joint.bias),
         covariance=covariance[:4, :4] + covariance[4:, 4:] + shared + shared.T,
-        t_ns_utc=known.t_ns_utc,
-        pointing=known.pointing,
+        t_ns_utc=registration.t_ns_utc,
+        pointing=registration.pointing,
     )
 
 
-def _scattering(known: Registration, window: SeenT) -> SeenT:
+def _scattering(registration: Registration, window: EstimateT) -> EstimateT:
     """Return a window that says of itself how much windows have scattered lately."""
-    return replace(window, covariance=known.scatter * window.covariance)
+    return replace(window, covariance=registration.scatter * window.covariance)
 
 
-def _together(first: Seen, reading: Reading) -> Reading:
+def _together(first: TimedEstimate, window: PointedEstimate) -> PointedEstimate:
     """Return the mean of two windows, each by its precision, at the time of the second."""
-    weights = [np.linalg.inv(noise) for noise in (first.covariance, reading.covariance)]
+    weights = [np.linalg.inv(noise) for noise in (first.covariance, window.covariance)]
     noise = np.linalg.inv(weights[0] + weights[1])
-    value = noise @ (weights[0] @ first.alpha.vector + weights[1] @ reading.alpha.vector)
-    return replace(reading, alpha=Misregistration.from_vector(value), covariance=noise)
+    value = noise @ (weights[0] @ first.alpha.vector + weights[1] @ window.alpha.vector)
+    return replace(window, alpha=Misregistration.from_vector(value), covariance=noise)
 
 
-def _apart(place: Misregistration, first: Seen, reading: Reading, policy: Policy) -> float:
+def _squared_distance(
+    place: Misregistration, first: TimedEstimate, window: PointedEstimate, policy: Policy
+) -> float:
     """Return how far a window lies from a place by the noise of two: squared, 4 is expected."""
-    difference = reading.alpha.vector - place.vector
-    return float(difference @ np.linalg.solve(_noise_of_two(first, reading, policy), difference))
+    difference = window.alpha.vector - place.vector
+    return float(difference @ np.linalg.solve(_noise_of_two(first, window, policy), difference))
 
 
-def _noise_of_two(first: Seen, reading: Reading, policy: Policy) -> Array:
+def _noise_of_two(first: TimedEstimate, window: PointedEstimate, policy: Policy) -> Array:
     """Return ``(4, 4)`` covariance of the difference of two windows of one place."""
-    elapsed_s = max(reading.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
+    elapsed_s = max(window.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
     added = _drifted(elapsed_s, policy) + 2.0 * (VARYING * policy.floor) ** 2
-    return np.asarray(first.covariance + reading.covariance + np.diag(added))
+    return np.asarray(first.covariance + window.covariance + np.diag(added))
 
 
 def _drifted(elapsed_s: float, policy: Policy) -> Array:
@@ -258,17 +281,23 @@ def _drifted(elapsed_s: float, policy: Policy) -> Array:
     return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / STEADY_S, 1.0))
 
 
-def _farthest(seen_from: tuple[Earlier | None, ...], reading: Reading, policy: Policy) -> Distance:
-    found = [_surprise(earlier, reading, policy, np.zeros(4)) for earlier in seen_from if earlier]
+def _farthest(
+    seen_from: tuple[PreviousEstimate | None, ...], window: PointedEstimate, policy: Policy
+) -> Innovation:
+    found = [
+        _innovation_from(earlier, window, policy, np.zeros(4)) for earlier in seen_from if earlier
+    ]
     return max(found, key=lambda one: one.excess)
 
 
-def _surprise(earlier: Earlier, reading: Reading, policy: Policy, forgot: Array) -> Distance:
-    elapsed_s = (reading.t_ns_utc - earlier.t_ns_utc) / SECOND_NS
+def _innovation_from(
+    previous: PreviousEstimate, window: PointedEstimate, policy: Policy, forgot: Array
+) -> Innovation:
+    elapsed_s = (window.t_ns_utc - previous.t_ns_utc) / SECOND_NS
     if elapsed_s < -CLOCK_SET_BACK_S:
         return NEAR
     elapsed_s = max(elapsed_s, 0.0)
-    bent = flexure(earlier.pointing, reading.pointing, policy)
+    bent = flexure(previous.pointing, window.pointing, policy)
     added = _drifted(elapsed_s, policy) + bent**2 + (VARYING * policy.floor) ** 2 + forgot
-    total = earlier.covariance + reading.covariance + np.diag(added)
-    return distance(reading.alpha.vector - earlier.alpha.vector, total)
+    total = previous.covariance + window.covariance + np.diag(added)
+    return innovation_of(window.alpha.vector - previous.alpha.vector, total)

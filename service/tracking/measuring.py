@@ -19,7 +19,7 @@ from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 DURATION_S = 30.0
@@ -57,7 +57,7 @@ LONGEST_S = 3600.0
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
 
 
-def measure(turn: Turn, command: cmd.Measure) -> None:
+def measure(context: StepContext, command: cmd.Measure) -> None:
     """Ask the RTC to measure an interaction matrix.
 
     Raises
@@ -65,72 +65,72 @@ def measure(turn: Turn, command: cmd.Measure) -> None:
     CommandError
         If it names a mode that the basis does not have, or an id that was used before.
     """
-    rtc = present(turn.rtc)
-    if turn.state.measurement(command.id) is not None:
+    rtc = present(context.rtc)
+    if context.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
-    record = _planned(command, rtc, turn.policy, turn.now_ns)
+    record = _planned(command, rtc, context.policy, context.now_ns)
     check_modes(record.modes, rtc)
-    _keep(turn, record)
-    turn.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
+    _keep(context, record)
+    context.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
     strokes = {field.name: getattr(record, field.name) for field in fields(MatrixStrokes)}
-    turn.ask(
+    context.ask(
         ev.Ask(
             request=MeasureRequest(pattern=command.pattern, n_average=record.n_average, **strokes)
         )
     )
 
 
-def give_up(turn: Turn, measurement_id: str) -> None:
+def give_up(context: StepContext, measurement_id: str) -> None:
     """Wait no longer for a matrix; its random signs end, a loop that it has opened is closed again.
 
     The wire has no way to end a measurement by the RTC: it may go on, and until it is done refuse.
     """
-    record = turn.state.measurement(measurement_id)
+    record = context.state.measurement(measurement_id)
     if record is None:
         return
     given_up = replace(record, state=MeasureState.GIVEN_UP)
     if record.pattern is None:
-        _keep(turn, replace(given_up, reason="by the operator"))
-        turn.log("noisy-matrix.given-up", record.id)
-        if turn.dither is not None and turn.dither.id == record.id:
-            make_way(turn)
+        _keep(context, replace(given_up, reason="by the operator"))
+        context.log("noisy-matrix.given-up", record.id)
+        if context.dither is not None and context.dither.id == record.id:
+            make_way(context)
         return
     text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
-    _keep(turn, replace(given_up, reason=text))
-    turn.log("measurement.given-up", f"{record.id}: {text}")
+    _keep(context, replace(given_up, reason=text))
+    context.log("measurement.given-up", f"{record.id}: {text}")
     if record.opens_loop and record.closed_before:
-        begin_closing(turn)
+        begin_closing(context)
         return
-    since_s = (turn.now_ns - (record.asked_ns_utc or turn.now_ns)) / SECOND_NS
+    since_s = (context.now_ns - (record.asked_ns_utc or context.now_ns)) / SECOND_NS
     left_s = max((record.duration_s or 0.0) - since_s, 0.0)
     # the RTC has no hand free for a dither, nor can windows tell of α
-    turn.put_off(dither_s=left_s, make_s=left_s)
+    context.put_off(dither_s=left_s, make_s=left_s)
 
 
-def watch_measurement(turn: Turn) -> None:
+def watch_measurement(context: StepContext) -> None:
     """Give up a matrix that cannot come any more, before anybody else sees the event."""
-    record, rtc = turn.state.measuring, turn.rtc
+    record, rtc = context.state.measuring, context.rtc
     if record is None:
         return
-    if isinstance(turn.event, ev.RtcVanished):
-        fail(turn, record, "the RTC vanished")
-    elif isinstance(turn.event, ev.Tick):
+    if isinstance(context.event, ev.RtcVanished):
+        fail(context, record, "the RTC vanished")
+    elif isinstance(context.event, ev.Tick):
         closed = rtc is not None and rtc.loop != "open"
-        _give_up_overdue(turn, record, closed=closed)
+        _give_up_overdue(context, record, closed=closed)
 
 
-def on_answer(turn: Turn, request: MeasureRequest, reply: Reply) -> None:
+def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> None:
     """Note that the RTC has begun to measure, or why it would not."""
-    record = turn.state.measurement(request.id)
+    record = context.state.measurement(request.id)
     if record is not None:
         state = MeasureState.RUNNING if reply.accepted else MeasureState.REFUSED
         answered = replace(record, state=state, reason=reply.reason, start_seq=reply.start_seq)
-        on_measured(turn, answered)
+        on_measured(context, answered)
 
 
-def on_measured(turn: Turn, record: MeasurementRecord) -> None:
+def on_measured(context: StepContext, record: MeasurementRecord) -> None:
     """Take over how far a measurement is; one that is over does not begin again."""
-    known = turn.state.measurement(record.id)
+    known = context.state.measurement(record.id)
     if known is not None:
         given_up = known.state is MeasureState.GIVEN_UP
         if given_up or (record.under_way and not known.under_way):
@@ -144,31 +144,31 @@ def on_measured(turn: Turn, record: MeasurementRecord) -> None:
             start_seq=known.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
-        fail(turn, record, record.reason)
+        fail(context, record, record.reason)
         return
-    _keep(turn, record)
+    _keep(context, record)
     name, found = f"{_kind(record)}.{record.state}", record.finding
     match record.state:
         case MeasureState.RUNNING:
-            turn.log(name, f"{record.id} starts at frame {record.start_seq}")
+            context.log(name, f"{record.id} starts at frame {record.start_seq}")
         case MeasureState.REFUSED:
-            turn.warn(name, f"{record.id}: the RTC refused: {record.reason}")
+            context.warn(name, f"{record.id}: the RTC refused: {record.reason}")
         case MeasureState.STORED if found is not None:
             text = f"{found.n_frames} frames, signal / noise of an element {found.snr:.2f}"
-            turn.log(name, f"{record.id}: {text}")
+            context.log(name, f"{record.id}: {text}")
         case MeasureState.STORED:
             n_slopes, n_modes = record.n_slopes, len(record.modes)
-            turn.log(name, f"{record.id}: {n_slopes} slopes, {n_modes} modes")
+            context.log(name, f"{record.id}: {n_slopes} slopes, {n_modes} modes")
         case _:
-            turn.log(name, record.id)
+            context.log(name, record.id)
 
 
-def fail(turn: Turn, record: MeasurementRecord | None, text: str) -> None:
+def fail(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
     """Note why there is no matrix, unless nobody waits for it any more."""
-    known = None if record is None else turn.state.measurement(record.id)
+    known = None if record is None else context.state.measurement(record.id)
     if record is not None and (known is None or known.state is not MeasureState.GIVEN_UP):
-        _keep(turn, replace(record, state=MeasureState.FAILED, reason=text))
-        turn.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
+        _keep(context, replace(record, state=MeasureState.FAILED, reason=text))
+        context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
 
 
 def _kind(record: MeasurementRecord) -> str:
@@ -176,20 +176,20 @@ def _kind(record: MeasurementRecord) -> str:
     return "noisy-matrix" if record.pattern is None else "measurement"
 
 
-def _give_up_overdue(turn: Turn, record: MeasurementRecord, *, closed: bool) -> None:
+def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed: bool) -> None:
     """Give up a matrix that does not come although everything looks as if it were over."""
-    asked_ns = record.asked_ns_utc or turn.now_ns
-    if turn.now_ns - asked_ns > LONGEST_S * SECOND_NS:
-        fail(turn, record, f"no matrix came within {LONGEST_S:.0f} s")
+    asked_ns = record.asked_ns_utc or context.now_ns
+    if context.now_ns - asked_ns > LONGEST_S * SECOND_NS:
+        fail(context, record, f"no matrix came within {LONGEST_S:.0f} s")
     elif not (record.opens_loop and closed and record.start_seq is not None):
-        _keep(turn, replace(record, overdue_since_ns_utc=None))
+        _keep(context, replace(record, overdue_since_ns_utc=None))
     else:
-        since_ns = record.overdue_since_ns_utc or turn.now_ns
-        if turn.now_ns - since_ns > OVERDUE_S * SECOND_NS:
+        since_ns = record.overdue_since_ns_utc or context.now_ns
+        if context.now_ns - since_ns > OVERDUE_S * SECOND_NS:
             text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
-            fail(turn, record, text)
+            fail(context, record, text)
         else:
-            _keep(turn, replace(record, overdue_since_ns_utc=since_ns))
+            _keep(context, replace(record, overdue_since_ns_utc=since_ns))
 
 
 def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
@@ -218,12 +218,12 @@ def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> 
     )
 
 
-def _keep(turn: Turn, record: MeasurementRecord) -> None:
-    others = tuple(r for r in turn.state.measurements if r.id != record.id)
-    turn.state = replace(turn.state, measurements=(*others, record)[-MEASUREMENTS_KEPT:])
+def _keep(context: StepContext, record: MeasurementRecord) -> None:
+    others = tuple(r for r in context.state.measurements if r.id != record.id)
+    context.state = replace(context.state, measurements=(*others, record)[-MEASUREMENTS_KEPT:])
 
 
-def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
+def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
     """Measure a noisy interaction matrix: first the dither that runs has to end.
 
     Raises
@@ -231,16 +231,16 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
     CommandError
         If it costs more than the budget, or names an id that was used before.
     """
-    rtc = present(turn.rtc)
-    if turn.state.measurement(command.id) is not None:
+    rtc = present(context.rtc)
+    if context.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
     duration_s = command.duration_s or DURATION_S
-    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, turn.policy.dither_budget_m)
-    cost_of(total, turn.policy, over_budget=command.over_budget)
+    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, context.policy.dither_budget_m)
+    cost_of(total, context.policy, over_budget=command.over_budget)
     dither = plan_random(
         rtc,
-        turn.policy,
-        turn.now_ns,
+        context.policy,
+        context.now_ns,
         dither_id=command.id,
         modes=command.modes,
         total_m=total,
@@ -255,92 +255,92 @@ def measure_noisy(turn: Turn, command: cmd.MeasureNoisy) -> None:
         duration_s=duration_s,
         window_s=dither.window_s,
         seed=dither.request.seed,
-        asked_ns_utc=turn.now_ns,
+        asked_ns_utc=context.now_ns,
         basis_id=rtc.basis_id,
         config_id=rtc.config_id,
     )
-    _keep(turn, record)
+    _keep(context, record)
     text = (
         f"{record.id}: {len(record.modes)} modes, {1e9 * record.total_m:.3g} nm RMS in all, "
         f"{duration_s:g} s"
     )
-    turn.log("noisy-matrix.asked", text)
-    make_way(turn)
+    context.log("noisy-matrix.asked", text)
+    make_way(context)
 
 
-def follow_noisy(turn: Turn) -> None:
+def follow_noisy(context: StepContext) -> None:
     """Go on with the one under way: start its dither, note that it plays, or that it is over."""
-    record, rtc = turn.state.gathering, turn.rtc
+    record, rtc = context.state.noisy_measurement, context.rtc
     if record is None:
         return
-    waited_s = (turn.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
+    waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
     match record.state:
-        case MeasureState.WAITING if isinstance(turn.event, cmd.StopDither):
-            cut_off(turn, "the operator stopped the dither")
+        case MeasureState.WAITING if isinstance(context.event, cmd.StopDither):
+            cut_off(context, "the operator stopped the dither")
         case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
-                _begin_noisy(turn, record, rtc)
+                _begin_noisy(context, record, rtc)
             elif waited_s > FREE_WITHIN_S:
-                cut_off(turn, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
+                cut_off(context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
         case MeasureState.ASKED | MeasureState.RUNNING:
-            _follow_playing(turn, record)
+            _follow_playing(context, record)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
             if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
-                cut_off(turn, "the worker did not answer")
+                cut_off(context, "the worker did not answer")
 
 
-def cut_off(turn: Turn, why: str) -> None:
+def cut_off(context: StepContext, why: str) -> None:
     """End the one under way, if there is one, without a matrix."""
-    record = turn.state.gathering
+    record = context.state.noisy_measurement
     if record is not None:
-        fail(turn, record, why)
+        fail(context, record, why)
 
 
 def awaits_its_dither(state: TrackerState) -> bool:
     """Return whether another dither has to end first: until then the service begins none."""
-    record = state.gathering
+    record = state.noisy_measurement
     return record is not None and record.state is MeasureState.WAITING
 
 
-def _begin_noisy(turn: Turn, record: MeasurementRecord, rtc: Status) -> None:
+def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -> None:
     try:
         dither = plan_random(
             rtc,
-            turn.policy,
-            turn.now_ns,
+            context.policy,
+            context.now_ns,
             dither_id=record.id,
             modes=record.modes,
             total_m=record.total_m,
             duration_s=record.duration_s or DURATION_S,
         )
     except CommandError as error:  # the RTC is another than when it was asked for
-        fail(turn, record, str(error))
+        fail(context, record, str(error))
         return
     window_s, seed = dither.window_s, dither.request.seed
-    _keep(turn, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed))
-    ask_for(turn, dither)
+    _keep(context, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed))
+    ask_for(context, dither)
 
 
-def _follow_playing(turn: Turn, record: MeasurementRecord) -> None:
-    match turn.event:
+def _follow_playing(context: StepContext, record: MeasurementRecord) -> None:
+    match context.event:
         case ev.Answered(
             request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
         ):
-            fail(turn, record, f"the RTC refused the dither: {reason}")
+            fail(context, record, f"the RTC refused the dither: {reason}")
             return
         case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
-            fail(turn, record, text)
+            fail(context, record, text)
             return
         case _:
             pass
-    dither, asked = turn.dither, record.state is MeasureState.ASKED
+    dither, asked = context.dither, record.state is MeasureState.ASKED
     if dither is not None and dither.id == record.id:
         if asked and dither.start_seq is not None:
-            _keep(turn, replace(record, state=MeasureState.RUNNING))
+            _keep(context, replace(record, state=MeasureState.RUNNING))
     elif asked:
-        fail(turn, record, "its dither never began")
+        fail(context, record, "its dither never began")
     else:
         record = replace(record, state=MeasureState.FINISHING)
-        _keep(turn, record)
-        turn.ask(ev.FinishNoisy(record=record))
+        _keep(context, record)
+        context.ask(ev.FinishNoisy(record=record))

@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.estimate import DitheredEstimate
-from service.estimation.lockin import WindowEstimate
+from service.estimation.lockin import LockInEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms
 from service.tracking import events as ev
@@ -27,8 +27,8 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import Turn
-from service.tracking.worth import limit_modes, settled
+from service.tracking.step_context import StepContext
+from service.tracking.update_policy import limit_modes, settled
 from service.wire import Status
 
 SIZE_RANGE = (0.4, 2.0)
@@ -44,13 +44,13 @@ CERTAIN = 3.0
 NEIGHBOURS = 10
 """Modes that one is compared with; a window of no more tells nothing of it."""
 
-LEAST_RESPONSE = 0.1
+MIN_RESPONSE = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
 
 SIGNIFICANT = 4.0
 """1 σ of a response by which it must lie on one side of a limit to be told."""
 
-MOST_AT_ONCE = 100
+MAX_AT_ONCE = 100
 """Modes that are shown together: each has a line of its own, and shares the budget."""
 
 FEWER = 4
@@ -87,22 +87,22 @@ def shunned_modes(state: TrackerState) -> frozenset[int]:
     return state.mode_proof.contrary - proven_modes(state)
 
 
-def why_void(turn: Turn, estimate: DitheredEstimate) -> str | None:
+def why_void(context: StepContext, estimate: DitheredEstimate) -> str | None:
     """Return why a window of these modes does not tell of α, or None.
 
     What the loop makes of a line is fitted with the gain of the line's own mode.
     """
-    if turn.policy.dither_modes or turn.policy.mode_information is None:
+    if context.policy.dither_modes or context.policy.mode_information is None:
         return None  # there is no choice of others
-    proof = turn.state.mode_proof
+    proof = context.state.mode_proof
     odd = (proof.contrary | proof.suspected).intersection(estimate.modes)
-    odd -= proven_modes(turn.state)
+    odd -= proven_modes(context.state)
     if not odd:
         return None
     return f"{_named(odd)} not answered as the instrument file says: such a window tells no α"
 
 
-def most_modes(state: TrackerState, n_modes: int) -> int:
+def n_proven_modes(state: TrackerState, n_modes: int) -> int:
     """Return how many modes, from the first on and at most ``n_modes``, are proven."""
     proven = proven_modes(state)
     return next((mode for mode in range(n_modes) if mode not in proven), n_modes)
@@ -125,31 +125,31 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
     )
 
 
-def awaits_proof(turn: Turn, rtc: Status) -> bool:
+def awaits_proof(context: StepContext, rtc: Status) -> bool:
     """Return whether modes that are wanted are still to be shown by a dither."""
-    allowed = turn.policy.dither_enabled and not turn.state.dither_stopped
-    return allowed and not turn.policy.dither_modes and bool(_missing(turn, rtc))
+    allowed = context.policy.dither_enabled and not context.state.dither_stopped
+    return allowed and not context.policy.dither_modes and bool(_missing(context, rtc))
 
 
-def modes_to_show(turn: Turn, rtc: Status, window_s: float) -> tuple[int, ...]:
+def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[int, ...]:
     """Return the modes that the next window should show; empty: none, or not now.
 
     Where few are missing, modes that tell of α are added: a window must still measure it.
     """
-    state, known = turn.state, turn.known
+    state, registration = context.state, context.registration
     busy = state.on_probation or state.making_since_ns_utc is not None
     on_way = any(record.on_its_way for record in state.reconstructors)
-    if known is None or busy or on_way or state.mode is Mode.HOLD:
+    if registration is None or busy or on_way or state.mode is Mode.HOLD:
         return ()
-    if not awaits_proof(turn, rtc):
+    if not awaits_proof(context, rtc):
         return ()
-    missing = _missing(turn, rtc)
-    if not (settled(known) or (unknown_loop(state, rtc) and _plausible(known))):
+    missing = _missing(context, rtc)
+    if not (settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
         return ()
-    at_once = max(MOST_AT_ONCE // FEWER**state.mode_proof.n_tries, N_LINES)
-    most = min(len(lines_clear(turn, rtc, window_s)), at_once, rtc.max_dither_modes)
+    at_once = max(MAX_AT_ONCE // FEWER**state.mode_proof.n_tries, N_LINES)
+    most = min(len(lines_clear(context, rtc, window_s)), at_once, rtc.max_dither_modes)
     shown = missing[:most]
-    telling = chosen_modes(rtc, turn.policy, shunned_modes(state))
+    telling = chosen_modes(rtc, context.policy, shunned_modes(state))
     spare = [mode for mode in telling if mode not in shown]
     return tuple(sorted([*shown, *spare[: max(min(N_LINES, most) - len(shown), 0)]]))
 
@@ -159,52 +159,54 @@ def unknown_loop(state: TrackerState, rtc: Status) -> bool:
 
     No matrix can be sent before that is known: one window is enough to begin with.
     """
-    return most_modes(state, rtc.n_controlled) < rtc.n_controlled
+    return n_proven_modes(state, rtc.n_controlled) < rtc.n_controlled
 
 
-def _plausible(known: Registration) -> bool:
+def _plausible(registration: Registration) -> bool:
     """Return whether no window contradicts α, though there may be one only."""
-    return known.candidate is None and not known.doubt and known.usable
+    return registration.suspected_jump is None and not registration.doubt and registration.usable
 
 
-def lines_clear(turn: Turn, rtc: Status, window_s: float) -> tuple[float, ...]:
+def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[float, ...]:
     """Return lines for many modes at once: evenly spaced, none on a vibration, lowest first."""
     step, edge_hz = step_of(rtc, window_s), float(SIDE_OFFSETS_HZ.max()) + 1.0
     low = max(PROVING_RANGE[0] * rtc.frame_rate_hz, edge_hz)
     high = min(PROVING_RANGE[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
     # whole hertz apart: what is played is looked at second by second, and lines must not mix there
-    spacing = np.ceil(max(CLOSEST_STEPS * step, (high - low) / MOST_AT_ONCE))
-    avoid = (*turn.policy.dither_avoid_hz, *turn.state.vibrations_hz)
+    spacing = np.ceil(max(CLOSEST_STEPS * step, (high - low) / MAX_AT_ONCE))
+    avoid = (*context.policy.dither_avoid_hz, *context.state.vibrations_hz)
     lines = np.arange(np.ceil(low), high, spacing)
     return tuple(
         float(line) for line in lines if all(abs(line - v) >= CLEARANCES_HZ[-1] for v in avoid)
     )
 
 
-def begin(turn: Turn, modes: tuple[int, ...]) -> None:
+def begin(context: StepContext, modes: tuple[int, ...]) -> None:
     """Note that a dither has been asked for to see these modes."""
-    proof = turn.state.mode_proof
-    if turn.state.alarm(alarms.WORKER_BEHIND) is None:  # which gives windows up: no fault of theirs
+    proof = context.state.mode_proof
+    if (
+        context.state.alarm(alarms.WORKER_BEHIND) is None
+    ):  # which gives windows up: no fault of theirs
         proof = _missed(proof)
-    shown = replace(proof, shown=frozenset(modes), shown_ns_utc=turn.now_ns)
-    turn.state = replace(turn.state, mode_proof=shown)
-    turn.log("modes.shown", f"modes {_listed(modes)} are dithered before they are controlled")
+    shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
+    context.state = replace(context.state, mode_proof=shown)
+    context.log("modes.shown", f"modes {_listed(modes)} are dithered before they are controlled")
 
 
-def awaits_result(turn: Turn, window_s: float) -> bool:
+def awaits_result(context: StepContext, window_s: float) -> bool:
     """Return whether what the last such dither has shown may still be on its way."""
-    proof = turn.state.mode_proof
-    waited_s = (turn.now_ns - proof.shown_ns_utc) / SECOND_NS
+    proof = context.state.mode_proof
+    waited_s = (context.now_ns - proof.shown_ns_utc) / SECOND_NS
     return bool(proof.shown) and waited_s < window_s + TOLD_WITHIN_S
 
 
-def learn(turn: Turn, estimate: WindowEstimate | RandomEstimate) -> None:
+def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
     """Take over which modes of a window answer as they should, whatever it says of α."""
-    rtc, proof = turn.rtc, turn.state.mode_proof
+    rtc, proof = context.rtc, context.state.mode_proof
     if rtc is None or estimate.session != rtc.session or estimate.gain_sigma is None:
         return
     modes, gains = np.array(estimate.modes), np.real(estimate.optical_gain)
-    proven, contrary = _told(gains, np.abs(estimate.optical_gain), estimate.gain_sigma)
+    proven, contrary = _classify(gains, np.abs(estimate.optical_gain), estimate.gain_sigma)
     odd = proven & _uneven(modes, gains, estimate.gain_sigma)
     good, bad, uneven = (frozenset(modes[which].tolist()) for which in (proven, contrary, odd))
     before = proof
@@ -226,14 +228,14 @@ def learn(turn: Turn, estimate: WindowEstimate | RandomEstimate) -> None:
         proof = replace(proof, shown=frozenset())
     if proof == before:
         return
-    turn.state = replace(turn.state, mode_proof=proof)
-    _tell(turn, rtc, bad)
-    _tell_uneven(turn, before)
+    context.state = replace(context.state, mode_proof=proof)
+    _report_answers(context, rtc, bad)
+    _tell_uneven(context, before)
 
 
 def _answers(
     proof: ModeProof,
-    estimate: WindowEstimate | RandomEstimate,
+    estimate: LockInEstimate | RandomEstimate,
     gains: NDArray[np.float64],
     bad: frozenset[int],
     accused: frozenset[int],
@@ -247,24 +249,26 @@ def _answers(
     return tuple(found[mode] for mode in sorted(found))
 
 
-def recognise(turn: Turn, event: ev.ModesRecognised) -> None:
+def recognise(context: StepContext, event: ev.ModesRecognised) -> None:
     """Take over which modes of the matrix in use the model has recognised."""
     proof = replace(
-        turn.state.mode_proof, strange=frozenset(event.strange), own_response_ratio=event.response
+        context.state.mode_proof,
+        strange=frozenset(event.strange),
+        own_response_ratio=event.response,
     )
-    turn.state = replace(turn.state, mode_proof=proof)
-    turn.log("modes.recognised", f"{event.id}: {event.text}")
-    before = turn.state.mode_proof
-    turn.state = replace(turn.state, mode_proof=replace(before, own_uneven=event.uneven))
-    _tell_uneven(turn, before)
+    context.state = replace(context.state, mode_proof=proof)
+    context.log("modes.recognised", f"{event.id}: {event.text}")
+    before = context.state.mode_proof
+    context.state = replace(context.state, mode_proof=replace(before, own_uneven=event.uneven))
+    _tell_uneven(context, before)
 
 
-def _told(
+def _classify(
     gains: NDArray[np.float64], size: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which modes answer as they should, and which certainly do not; the rest may do."""
     typical = float(np.median(size))
-    low, high = max(SIZE_RANGE[0] * typical, LEAST_RESPONSE), SIZE_RANGE[1] * typical
+    low, high = max(SIZE_RANGE[0] * typical, MIN_RESPONSE), SIZE_RANGE[1] * typical
     seen = gains > SIGNIFICANT * sigma
     proven = seen & (gains > low) & (gains < high)
     contrary = (gains + SIGNIFICANT * sigma < low) | (gains - SIGNIFICANT * sigma > high)
@@ -288,21 +292,21 @@ def _uneven(
     return odd
 
 
-def _tell(turn: Turn, rtc: Status, bad: frozenset[int]) -> None:
+def _report_answers(context: StepContext, rtc: Status, bad: frozenset[int]) -> None:
     """Say which modes answer otherwise, and control none of them for a while."""
-    proof = turn.state.mode_proof
-    contrary = shunned_modes(turn.state)
-    in_the_way = sorted(mode for mode in contrary if mode < _target(turn, rtc))
+    proof = context.state.mode_proof
+    contrary = shunned_modes(context.state)
+    in_the_way = sorted(mode for mode in contrary if mode < _target(context, rtc))
     if not in_the_way:
-        turn.calm(alarms.MODES_CONTRARY)
+        context.clear_alarm(alarms.MODES_CONTRARY)
         return
     text = (
         f"{_named(in_the_way)} not answered the dither as the instrument file says"
         f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
-    turn.alarm(alarms.MODES_CONTRARY, text)
+    context.raise_alarm(alarms.MODES_CONTRARY, text)
     if bad & contrary:
-        limit_modes(turn, in_the_way[0], text)
+        limit_modes(context, in_the_way[0], text)
 
 
 def _in_words(proof: ModeProof, modes: list[int]) -> str:
@@ -322,9 +326,9 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
     return f" ({', '.join(said)}{times})" if said else ""
 
 
-def _tell_uneven(turn: Turn, before: ModeProof) -> None:
+def _tell_uneven(context: StepContext, before: ModeProof) -> None:
     """Say which modes answer more or less strongly than their neighbours."""
-    proof = turn.state.mode_proof
+    proof = context.state.mode_proof
     if (proof.uneven, proof.own_uneven) == (before.uneven, before.own_uneven):
         return
     found = [f"{proof.own_uneven}: matrices allow for it"] if proof.own_uneven else []
@@ -336,9 +340,9 @@ def _tell_uneven(turn: Turn, before: ModeProof) -> None:
             "strongly or as weakly as the modes beside"
         )
     if found:
-        turn.alarm(alarms.MODES_UNEVEN, "; ".join(found))
+        context.raise_alarm(alarms.MODES_UNEVEN, "; ".join(found))
     else:
-        turn.calm(alarms.MODES_UNEVEN)
+        context.clear_alarm(alarms.MODES_UNEVEN)
 
 
 def _missed(proof: ModeProof) -> ModeProof:
@@ -346,44 +350,44 @@ def _missed(proof: ModeProof) -> ModeProof:
     return replace(proof, n_tries=proof.n_tries + 1) if proof.shown else proof
 
 
-def give_up(turn: Turn, rtc: Status) -> None:
+def give_up(context: StepContext, rtc: Status) -> None:
     """Leave modes alone for a while that several dithers have not shown."""
-    proof = turn.state.mode_proof
+    proof = context.state.mode_proof
     if proof.n_tries < TRIES:
         return
     suspected = proof.suspected - proof.shown
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
-    turn.state = replace(turn.state, mode_proof=given_up)
+    context.state = replace(context.state, mode_proof=given_up)
     text = (
         f"{_named(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows are "
         "refused, or give the dither more budget"
     )
-    limit_modes(turn, most_modes(turn.state, rtc.n_modes), text)
+    limit_modes(context, n_proven_modes(context.state, rtc.n_modes), text)
 
 
-def _missing(turn: Turn, rtc: Status) -> list[int]:
+def _missing(context: StepContext, rtc: Status) -> list[int]:
     """Return the modes that are wanted now, and that nobody has seen to answer.
 
     Those that one window has accused are shown again whatever is wanted: an accusation is named,
     or it is none.
     """
-    proven, wanted = proven_modes(turn.state), _wanted(turn, rtc)
-    accused = (mode for mode in turn.state.mode_proof.suspected if wanted <= mode < rtc.n_modes)
+    proven, wanted = proven_modes(context.state), _wanted(context, rtc)
+    accused = (mode for mode in context.state.mode_proof.suspected if wanted <= mode < rtc.n_modes)
     return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
 
 
-def _wanted(turn: Turn, rtc: Status) -> int:
+def _wanted(context: StepContext, rtc: Status) -> int:
     """Return up to which mode all should be proven now."""
-    limit, n_modes = turn.state.mode_limit, _target(turn, rtc)
-    if limit is not None and turn.now_ns < limit.until_ns_utc:
+    limit, n_modes = context.state.mode_limit, _target(context, rtc)
+    if limit is not None and context.now_ns < limit.until_ns_utc:
         n_modes = min(n_modes, limit.n_modes)
     return n_modes
 
 
-def _target(turn: Turn, rtc: Status) -> int:
+def _target(context: StepContext, rtc: Status) -> int:
     """Return how many modes are controlled, are to be, or await an operator's word."""
-    proposed = (r.n_modes for r in turn.state.reconstructors if r.state is MatrixState.PROPOSED)
-    return max(rtc.n_controlled, min(turn.policy.n_modes_target, rtc.n_modes), *proposed, 0)
+    proposed = (r.n_modes for r in context.state.reconstructors if r.state is MatrixState.PROPOSED)
+    return max(rtc.n_controlled, min(context.policy.n_modes_target, rtc.n_modes), *proposed, 0)
 
 
 def _named(modes: Collection[int]) -> str:

@@ -28,45 +28,45 @@ from service.tracking.loop import CommandState, LoopCommand, extended_gains, pre
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Level, Mode
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
-def set_mode(turn: Turn, command: cmd.SetMode) -> None:
+def set_mode(context: StepContext, command: cmd.SetMode) -> None:
     """Go on in the mode an operator orders; that of the settings is remembered."""
     mode = command.mode
-    of_settings = turn.state.settings_mode or turn.state.mode
-    order(turn, mode, None if mode is of_settings else of_settings)
-    turn.calm(PROBATION)
-    turn.log("mode", f"mode is {mode}")
+    of_settings = context.state.settings_mode or context.state.mode
+    change_mode(context, mode, None if mode is of_settings else of_settings)
+    context.clear_alarm(PROBATION)
+    context.log("mode", f"mode is {mode}")
 
 
-def approve(turn: Turn, command: cmd.Approve) -> None:
+def approve(context: StepContext, command: cmd.Approve) -> None:
     """Send a proposal, judged anew where need be."""
-    reconstructors.send_once_judged(turn, command.id)
+    reconstructors.send_once_judged(context, command.id)
 
 
-def reject(turn: Turn, command: cmd.Reject) -> None:
+def reject(context: StepContext, command: cmd.Reject) -> None:
     """Discard a proposal."""
     reconstructors.change_state(
-        turn, command.id, MatrixState.DISCARDED, command.reason or "by the operator"
+        context, command.id, MatrixState.DISCARDED, command.reason or "by the operator"
     )
-    turn.log("reconstructor.discarded", command.id)
+    context.log("reconstructor.discarded", command.id)
 
 
-def publish(turn: Turn, command: cmd.Publish) -> None:
+def publish(context: StepContext, command: cmd.Publish) -> None:
     """Offer a reconstructor again; what has never been in use only if the gate can judge it."""
-    _copy(turn, command.id, f"the operator publishes {command.id} again")
+    _republish(context, command.id, f"the operator publishes {command.id} again")
 
 
-def roll_back(turn: Turn, command: cmd.Rollback) -> None:
+def roll_back(context: StepContext, command: cmd.Rollback) -> None:
     """Offer the reconstructor again that was in use before."""
-    earlier = turn.state.previous
+    earlier = context.state.previous
     if earlier is not None:
-        _copy(turn, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
+        _republish(context, earlier, f"the operator goes back to {earlier}", anyway=command.anyway)
 
 
-def refit(turn: Turn, command: cmd.Refit) -> None:
+def refit(context: StepContext, command: cmd.Refit) -> None:
     """Make a reconstructor for the present α.
 
     Raises
@@ -74,14 +74,14 @@ def refit(turn: Turn, command: cmd.Refit) -> None:
     CommandError
         If the RTC has no such number of modes.
     """
-    rtc = present(turn.rtc)
+    rtc = present(context.rtc)
     asked = command.n_modes or rtc.n_controlled
     if not 0 < asked <= rtc.n_modes:
         raise CommandError(f"found {asked} modes; expected 1 to {rtc.n_modes}")
-    reconstructors.make(turn, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
+    reconstructors.make(context, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
 
 
-def start_dither(turn: Turn, command: cmd.StartDither) -> None:
+def start_dither(context: StepContext, command: cmd.StartDither) -> None:
     """Start a dither; what is not said of it is the service's own choice.
 
     Raises
@@ -89,18 +89,18 @@ def start_dither(turn: Turn, command: cmd.StartDither) -> None:
     CommandError
         If it cannot be played or read, or costs more than the budget.
     """
-    rtc = present(turn.rtc)
-    dither = _planned(turn, rtc, command)
+    rtc = present(context.rtc)
+    dither = _planned(context, rtc, command)
     total, over_budget = total_m(dither.request), command.over_budget
-    cost = cost_of(total, turn.policy, over_budget=over_budget)
-    allow(turn)
+    cost = cost_of(total, context.policy, over_budget=over_budget)
+    allow(context)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
-    turn.log("dither.asked", f"{dither.request.kind}, {which}, {cost}")
-    ask_for(turn, dither)
+    context.log("dither.asked", f"{dither.request.kind}, {which}, {cost}")
+    ask_for(context, dither)
 
 
-def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
+def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dither:
     """Return the dither to ask for.
 
     Raises
@@ -108,7 +108,7 @@ def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
     CommandError
         If it could not be played, or not be read.
     """
-    policy, now_ns = turn.policy, turn.now_ns
+    policy, now_ns = context.policy, context.now_ns
     if command.kind is DitherKind.BINARY or isinstance(command.modes, ModeSet):
         return plan_random(
             rtc,
@@ -123,7 +123,7 @@ def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
         rtc,
         policy,
         now_ns,
-        choice=by_hand(turn, rtc),
+        choice=by_hand(context, rtc),
         modes=command.modes,
         amplitude_m=command.amplitude_m,
         frequency_hz=command.frequency_hz,
@@ -136,22 +136,22 @@ def _planned(turn: Turn, rtc: Status, command: cmd.StartDither) -> Dither:
     return dither
 
 
-def _copy(turn: Turn, source: str, why: str, *, anyway: bool = False) -> None:
+def _republish(context: StepContext, source: str, why: str, *, anyway: bool = False) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
-    reconstructors.make(turn, ev.CopyMatrix(source=source, why=why, anyway=anyway))
-    hold(turn, why)
+    reconstructors.make(context, ev.RepublishMatrix(source=source, why=why, anyway=anyway))
+    enter_hold(context, why)
 
 
-def hold(turn: Turn, why: str) -> None:
+def enter_hold(context: StepContext, why: str) -> None:
     """Do nothing unasked until an operator sets another mode."""
-    of_settings = turn.state.settings_mode or turn.state.mode
-    order(turn, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
-    turn.log("mode", f"hold: {why}")
+    of_settings = context.state.settings_mode or context.state.mode
+    change_mode(context, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
+    context.log("mode", f"hold: {why}")
 
 
-def order(turn: Turn, mode: Mode, of_settings: Mode | None) -> None:
+def change_mode(context: StepContext, mode: Mode, of_settings: Mode | None) -> None:
     """Go on in a mode; ``of_settings`` is that of the settings, None: the same."""
-    turn.state = replace(turn.state, mode=mode, settings_mode=of_settings)
+    context.state = replace(context.state, mode=mode, settings_mode=of_settings)
 
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
@@ -168,7 +168,7 @@ CLOSE_AGAIN_FOR_S = 3600.0
 """Then somebody wants the loop open."""
 
 
-def set_loop(turn: Turn, command: cmd.SetLoop) -> None:
+def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop.
 
     Raises
@@ -176,28 +176,28 @@ def set_loop(turn: Turn, command: cmd.SetLoop) -> None:
     CommandError
         If it makes no sense in this state.
     """
-    rtc = present(turn.rtc)
+    rtc = present(context.rtc)
     n_controlled = command.n_controlled
     if n_controlled is not None and not 1 <= n_controlled <= rtc.n_modes:
         raise CommandError(f"found {n_controlled} modes; expected 1 to {rtc.n_modes}")
-    gains = _gains_of(command, turn, rtc, n_controlled or rtc.n_controlled)
+    gains = _gains_of(command, context, rtc, n_controlled or rtc.n_controlled)
     if command.loop is not None:
-        turn.state = replace(turn.state, close_since_ns_utc=None)
+        context.state = replace(context.state, close_since_ns_utc=None)
     _ask_loop(
-        turn,
+        context,
         LoopRequest(
-            id=f"loop-{turn.now_ns}",
+            id=f"loop-{context.now_ns}",
             loop=None if command.loop is None else Loop(command.loop),
             gains=gains,
             leak=command.leak,
             n_controlled=n_controlled,
         ),
-        _said(command),
+        _request_text(command),
         judged=command.effective_gain is not None,
     )
 
 
-def ramp(turn: Turn, command: cmd.Ramp) -> None:
+def ramp(context: StepContext, command: cmd.Ramp) -> None:
     """Ask the RTC to try gains on groups of modes.
 
     Raises
@@ -205,7 +205,7 @@ def ramp(turn: Turn, command: cmd.Ramp) -> None:
     CommandError
         If it names modes that are not controlled.
     """
-    rtc = present(turn.rtc)
+    rtc = present(context.rtc)
     groups = command.groups or _paper_groups(rtc.n_controlled)
     ranges = _ranges(groups, rtc.n_controlled)
     gains = command.gains or RAMP_GAINS
@@ -213,59 +213,61 @@ def ramp(turn: Turn, command: cmd.Ramp) -> None:
     lasts_s = len(ranges) * len(gains) * n_frames / rtc.frame_rate_hz
     spans = ", ".join(f"{first} to {last}" for first, last in ranges)
     text = f"{len(gains)} gains on modes {spans}: {lasts_s:.0f} s"
-    name = f"ramp-{turn.now_ns}"
+    name = f"ramp-{context.now_ns}"
     request = RampRequest(id=name, groups=ranges, gains=gains, frames_per_gain=n_frames)
-    _ask_loop(turn, request, text, lasts_s)
+    _ask_loop(context, request, text, lasts_s)
 
 
-def on_loop_answer(turn: Turn, command: str, outcome: CommandState, reason: str) -> None:
+def on_loop_answer(context: StepContext, command: str, outcome: CommandState, reason: str) -> None:
     """Note what became of a command; one that a later one has replaced is only logged."""
-    asked, text = turn.state.loop_command, command
+    asked, text = context.state.loop_command, command
     if asked is not None and asked.id == command:
-        until_ns = turn.now_ns + round(asked.lasts_s * SECOND_NS)
+        until_ns = context.now_ns + round(asked.lasts_s * SECOND_NS)
         ended = replace(asked, state=outcome, reason=reason, until_ns_utc=until_ns)
-        turn.state = replace(turn.state, loop_command=ended)
+        context.state = replace(context.state, loop_command=ended)
         text = asked.text
     level = Level.INFO if outcome is CommandState.ACCEPTED else Level.WARNING
-    turn.log(f"loop.{outcome}", f"{text}: {reason}" if reason else text, level)
+    context.log(f"loop.{outcome}", f"{text}: {reason}" if reason else text, level)
 
 
-def end_ramp(turn: Turn) -> None:
+def end_ramp(context: StepContext) -> None:
     """Note that no ramp can be under way: the RTC has begun a new session."""
-    asked = turn.state.loop_command
-    turn.state = replace(turn.state, loop_command=asked and replace(asked, lasts_s=0.0))
+    asked = context.state.loop_command
+    context.state = replace(context.state, loop_command=asked and replace(asked, lasts_s=0.0))
 
 
-def begin_closing(turn: Turn) -> None:
+def begin_closing(context: StepContext) -> None:
     """Close the loop again that a measurement has opened which was given up."""
-    turn.state = replace(turn.state, close_since_ns_utc=turn.now_ns)
-    close_again(turn)
+    context.state = replace(context.state, close_since_ns_utc=context.now_ns)
+    close_again(context)
 
 
-def close_again(turn: Turn) -> None:
+def close_again(context: StepContext) -> None:
     """Close the loop that a measurement opened which was then given up, as often as it takes."""
-    since_ns, rtc = turn.state.close_since_ns_utc, turn.rtc
-    if since_ns is None or rtc is None or turn.state.stopped_because:
+    since_ns, rtc = context.state.close_since_ns_utc, context.rtc
+    if since_ns is None or rtc is None or context.state.stopped_because:
         return
-    waited_s = (turn.now_ns - since_ns) / SECOND_NS
+    waited_s = (context.now_ns - since_ns) / SECOND_NS
     # a measurement only just asked for may open it yet
     closed = rtc.loop != "open"
     if waited_s > (CLOSE_AGAIN_EVERY_S if closed else CLOSE_AGAIN_FOR_S):
-        turn.state = replace(turn.state, close_since_ns_utc=None)
+        context.state = replace(context.state, close_since_ns_utc=None)
         return
-    last = turn.state.loop_command
-    recent = last is not None and turn.now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS
+    last = context.state.loop_command
+    recent = (
+        last is not None and context.now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS
+    )
     if not closed and not recent:
-        request = LoopRequest(id=f"loop-{turn.now_ns}", loop=Loop.CLOSED)
-        _ask_loop(turn, request, "close again after a measurement given up")
+        request = LoopRequest(id=f"loop-{context.now_ns}", loop=Loop.CLOSED)
+        _ask_loop(context, request, "close again after a measurement given up")
 
 
 def _gains_of(
-    command: cmd.Gains, turn: Turn, rtc: Status, n_modes: int
+    command: cmd.Gains, context: StepContext, rtc: Status, n_modes: int
 ) -> tuple[float, ...] | None:
     """Return a gain for each mode of the basis as they are asked for; None: they stay."""
     if command.effective_gain is not None:
-        return _compensated(turn, rtc, command.effective_gain, n_modes)
+        return _compensated(context, rtc, command.effective_gain, n_modes)
     return None if command.gains is None else _gains(rtc, command.gains, n_modes)
 
 
@@ -287,15 +289,17 @@ def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[fl
     return tuple(gains)
 
 
-def _compensated(turn: Turn, rtc: Status, in_effect: float, n_modes: int) -> tuple[float, ...]:
+def _compensated(
+    context: StepContext, rtc: Status, in_effect: float, n_modes: int
+) -> tuple[float, ...]:
     """Return the gains that act alike on every controlled mode; the others stay at 0."""
-    known = turn.known
-    if known is None or not known.optical_gains:
+    registration = context.registration
+    if registration is None or not registration.optical_gains:
         raise CommandError(
             "found no measured optical gain; expected a dithered window before gains are "
             "compensated for it"
         )
-    gains = gain_table(known.optical_gains, n_modes).loop_gains(in_effect)
+    gains = gain_table(registration.optical_gains, n_modes).loop_gains(in_effect)
     return (*gains.tolist(), *(0.0,) * (rtc.n_modes - n_modes))
 
 
@@ -319,7 +323,7 @@ def _ranges(groups: tuple[ModeGroup, ...], n_modes: int) -> tuple[tuple[int, int
     return tuple((group.first, group.last) for group in groups)
 
 
-def _said(command: cmd.SetLoop) -> str:
+def _request_text(command: cmd.SetLoop) -> str:
     said = {"closed": ["close"], "open": ["open"], None: []}[command.loop]
     said += [f"gain {g.gain:g} on modes {g.first} to {g.last}" for g in command.gains or ()]
     if command.effective_gain is not None:
@@ -332,7 +336,7 @@ def _said(command: cmd.SetLoop) -> str:
 
 
 def _ask_loop(
-    turn: Turn,
+    context: StepContext,
     request: LoopRequest | RampRequest,
     text: str,
     lasts_s: float = 0.0,
@@ -343,9 +347,9 @@ def _ask_loop(
         id=request.id,
         text=text,
         state=CommandState.ASKED,
-        asked_ns_utc=turn.now_ns,
+        asked_ns_utc=context.now_ns,
         lasts_s=lasts_s,
     )
-    turn.state = replace(turn.state, loop_command=asked)
-    turn.log("loop.asked", text)
-    turn.ask(ev.Ask(request=request, judged=judged))
+    context.state = replace(context.state, loop_command=asked)
+    context.log("loop.asked", text)
+    context.ask(ev.Ask(request=request, judged=judged))

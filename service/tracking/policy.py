@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
-from service.tracking.alarms import Act, Severity
+from service.tracking.alarms import Interlock, Severity
 
 SECOND_NS = 1_000_000_000
 
@@ -25,7 +25,7 @@ class Rule:
     """``==``, ``!=``, ``<``, ``<=``, ``>`` or ``>=``."""
 
     than: bool | float | str
-    blocks: frozenset[Act]
+    blocks: frozenset[Interlock]
     """What is forbidden while it holds."""
 
     severity: Severity
@@ -46,10 +46,10 @@ class Offloading:
     near: NDArray[np.float64]
     """Nearer than this nothing is asked for."""
 
-    most_step: NDArray[np.float64]
+    max_step: NDArray[np.float64]
     """Of one demand."""
 
-    reach: NDArray[np.float64]
+    travel: NDArray[np.float64]
     """Of all demands together, either way; 0: what cannot be moved."""
 
     settle_s: float

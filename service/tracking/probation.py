@@ -19,11 +19,11 @@ from service.tracking.alarms import (
     OFF_LOOP,
     PROBATION,
     WRONG_LOOP,
-    Act,
-    forbids,
+    Interlock,
+    alarm_blocks,
 )
 from service.tracking.loop import CommandState, same_but_for_modes, why_open
-from service.tracking.operator import hold, set_loop
+from service.tracking.operator import enter_hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import (
     MatrixState,
@@ -33,12 +33,12 @@ from service.tracking.products import (
 )
 from service.tracking.sending import why_unsendable
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 
 LATE_S = 1.0
 """For telemetry to come with the verdict: nothing else waits longer."""
 
-COPIED_WITHIN_S = 10.0
+REPUBLISHED_WITHIN_S = 10.0
 """For the matrix before to be ready to be sent again."""
 
 LAW_WITHIN_S = 5.0
@@ -70,55 +70,55 @@ _WORSE = frozenset(
 )
 
 
-def follow(turn: Turn) -> None:
+def follow(context: StepContext) -> None:
     """Begin a probation with every matrix that is applied, and end one that nothing can end."""
-    if turn.state.in_use != turn.before.in_use:
-        _on_swap(turn, turn.before.in_use, turn.state.in_use)
+    if context.state.in_use != context.before.in_use:
+        _on_swap(context, context.before.in_use, context.state.in_use)
         return
-    trial = turn.state.probation
+    trial = context.state.probation
     if trial is None:
         return
-    told = _told_by_alarm(turn, trial)
+    told = _told_by_alarm(context, trial)
     if told:
-        _go_back(turn, trial, told)
+        _go_back(context, trial, told)
     else:
-        _go_on(turn, trial)
+        _go_on(context, trial)
 
 
-def _go_on(turn: Turn, trial: Probation) -> None:
+def _go_on(context: StepContext, trial: Probation) -> None:
     match trial.state:
         case ProbationState.RUNNING | ProbationState.OVERDUE:
-            _await_verdict(turn, trial)
+            _await_verdict(context, trial)
         case ProbationState.ROLLING_BACK:
-            _await_copy(turn, trial)
+            _await_republished(context, trial)
         case ProbationState.WATCHED:
-            _watch(turn, trial)
+            _watch(context, trial)
         case ProbationState.OPENING:
-            _await_opening(turn, trial)
-        case ProbationState.OPENED if turn.rtc is not None and turn.rtc.in_loop:
-            _set(turn, replace(trial, state=ProbationState.ROLLED_BACK))
-            turn.calm(LOOP_OPENED)
+            _await_opening(context, trial)
+        case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
+            _set(context, replace(trial, state=ProbationState.ROLLED_BACK))
+            context.clear_alarm(LOOP_OPENED)
 
 
-def on_compared(turn: Turn, event: ev.Compared) -> None:
+def on_compared(context: StepContext, event: ev.Compared) -> None:
     """Take the verdict of telemetry: a matrix that is worse gives way, and nobody asked does more.
 
     What was said of other matrices than the two on record is not meant.
     """
-    trial, found = turn.state.probation, event.finding
+    trial, found = context.state.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
         return
     if trial.state is ProbationState.WATCHED:
-        _end_watch(turn, trial, found.text, lost=found.lost)
+        _end_watch(context, trial, found.text, lost=found.lost)
         return
     trial = replace(trial, finding=found)
     if found.verdict is Verdict.UNKNOWN:
-        _end(turn, trial, ProbationState.NOT_JUDGED, found.text)
+        _end(context, trial, ProbationState.NOT_JUDGED, found.text)
     elif found.verdict is Verdict.AS_GOOD:
-        _end(turn, trial, ProbationState.PASSED, found.text)
-        turn.calm(PROBATION)
+        _end(context, trial, ProbationState.PASSED, found.text)
+        context.clear_alarm(PROBATION)
     else:
-        _go_back(turn, trial, found.text)
+        _go_back(context, trial, found.text)
 
 
 def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
@@ -133,141 +133,143 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
     return before is not None and made.record.sha256 == before.sha256 != ""
 
 
-def go_back(turn: Turn, made: ev.MatrixMade) -> None:
+def go_back(context: StepContext, made: ev.MatrixMade) -> None:
     """Send the matrix before under its new id, unless something forbids it by now."""
-    trial = turn.state.probation
-    reconstructors.propose(turn, made.record)
+    trial = context.state.probation
+    reconstructors.propose(context, made.record)
     if trial is None:
         return
-    why = _why_no_way_back(turn, trial)
+    why = _why_no_way_back(context, trial)
     if why is not None:
-        _keep(turn, trial, why)
+        _keep(context, trial, why)
         return
-    reconstructors.send(turn, made.record.id, trial.since_ns_utc)
-    _set(turn, replace(trial, rollback=made.record.id))
+    reconstructors.send(context, made.record.id, trial.since_ns_utc)
+    _set(context, replace(trial, rollback=made.record.id))
 
 
-def _go_back(turn: Turn, trial: Probation, found: str) -> None:
+def _go_back(context: StepContext, trial: Probation, found: str) -> None:
     """Have the matrix before sent again; where that cannot be say why."""
-    hold(turn, f"{trial.id} made the loop worse")
+    enter_hold(context, f"{trial.id} made the loop worse")
     trial = replace(trial, worse=f"made the loop worse: {found}")
-    why = _why_no_way_back(turn, trial)
+    why = _why_no_way_back(context, trial)
     if why is not None:
-        _keep(turn, trial, why)
+        _keep(context, trial, why)
         return
     text = f"{trial.worse}: going back to {trial.before}"
-    _set(turn, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
-    turn.alarm(PROBATION, f"{trial.id} {text}")
+    _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
+    context.raise_alarm(PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
-    reconstructors.make(turn, ev.CopyMatrix(source=trial.before, why=why, judged=False))
+    reconstructors.make(context, ev.RepublishMatrix(source=trial.before, why=why, judged=False))
 
 
-def _on_swap(turn: Turn, before: str | None, in_use: str | None) -> None:
-    trial = turn.state.probation
-    record = None if in_use is None else turn.state.reconstructor(in_use)
+def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
+    trial = context.state.probation
+    record = None if in_use is None else context.state.reconstructor(in_use)
     if trial is not None and trial.state in _GOING_BACK and trial.rollback == in_use is not None:
-        _begin_watch(turn, trial, in_use)
+        _begin_watch(context, trial, in_use)
         return
     if record is None or before is None:
         if trial is not None and trial.judges is not None:
             why = "nobody knows what the RTC uses"
-            _set(turn, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+            _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
         return
-    why = _why_none(turn, record, trial)
+    why = _why_none(context, record, trial)
     worse = trial is not None and trial.id == before and trial.state in _WORSE
-    asked = turn.policy.opens_lost_loop
+    asked = context.policy.opens_lost_loop
     _set(
-        turn,
+        context,
         Probation(
             id=record.id,
             before=before,
             reference=trial.reference if trial is not None and worse else before,
             state=ProbationState.NOT_JUDGED if why else ProbationState.RUNNING,
             text=why or f"compared with {before}",
-            since_ns_utc=turn.now_ns,
-            until_ns_utc=turn.now_ns + round(WITHIN_S * SECOND_NS),
-            loop=turn.before.rtc,
-            opens=turn.before.mode is Mode.AUTO if asked is None else asked,
+            since_ns_utc=context.now_ns,
+            until_ns_utc=context.now_ns + round(WITHIN_S * SECOND_NS),
+            loop=context.before.rtc,
+            opens=context.before.mode is Mode.AUTO if asked is None else asked,
         ),
     )
 
 
-def _await_verdict(turn: Turn, trial: Probation) -> None:
-    why = _why_not_comparable(turn)
+def _await_verdict(context: StepContext, trial: Probation) -> None:
+    why = _why_not_comparable(context)
     if why:
-        _set(turn, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
-    elif trial.under_way and turn.now_ns > trial.until_ns_utc + LATE_S * SECOND_NS:
-        _set(turn, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
+        _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
+    elif trial.under_way and context.now_ns > trial.until_ns_utc + LATE_S * SECOND_NS:
+        _set(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
 
 
-def _await_copy(turn: Turn, trial: Probation) -> None:
-    why = _why_stuck(turn, trial)
+def _await_republished(context: StepContext, trial: Probation) -> None:
+    why = _why_stuck(context, trial)
     if why:
-        _keep(turn, trial, why)
+        _keep(context, trial, why)
 
 
-def _begin_watch(turn: Turn, trial: Probation, in_use: str) -> None:
+def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     """Look whether the loop is as it was, now that the matrix before is in use again."""
     text = f"{trial.worse}: the service went back to {trial.before}, as {in_use}"
     # an operator's rollback would go back to it
     reconstructors.change_state(
-        turn, trial.id, MatrixState.FAILED, f"rolled back, it {trial.worse}"
+        context, trial.id, MatrixState.FAILED, f"rolled back, it {trial.worse}"
     )
     watched = replace(
         trial,
-        since_ns_utc=turn.now_ns,
-        until_ns_utc=turn.now_ns + round(WITHIN_S * SECOND_NS),
+        since_ns_utc=context.now_ns,
+        until_ns_utc=context.now_ns + round(WITHIN_S * SECOND_NS),
     )
-    _end(turn, watched, ProbationState.WATCHED, text)
-    turn.alarm(PROBATION, f"{trial.id} {text}; the mode is hold until an operator sets another")
+    _end(context, watched, ProbationState.WATCHED, text)
+    context.raise_alarm(
+        PROBATION, f"{trial.id} {text}; the mode is hold until an operator sets another"
+    )
 
 
-def _watch(turn: Turn, trial: Probation) -> None:
+def _watch(context: StepContext, trial: Probation) -> None:
     """End the look at a loop with the matrix before: it is lost, opened, or nothing tells."""
-    waited_s = (turn.now_ns - trial.since_ns_utc) / SECOND_NS
-    lost = next((a for a in turn.state.alarms if forbids(a, Act.HOLD)), None)
-    if turn.rtc is None or not turn.rtc.in_loop:
-        why = "the RTC is gone" if turn.rtc is None else why_open(turn.rtc)
-        _end_watch(turn, trial, why, lost=False)
+    waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
+    lost = next((a for a in context.state.alarms if alarm_blocks(a, Interlock.HOLD)), None)
+    if context.rtc is None or not context.rtc.in_loop:
+        why = "the RTC is gone" if context.rtc is None else why_open(context.rtc)
+        _end_watch(context, trial, why, lost=False)
     elif lost is not None and waited_s > CALM_WITHIN_S:
-        _end_watch(turn, trial, lost.text, lost=True)
+        _end_watch(context, trial, lost.text, lost=True)
     elif waited_s > WITHIN_S + LATE_S:
-        _end_watch(turn, trial, "telemetry does not tell how the loop is since", lost=False)
+        _end_watch(context, trial, "telemetry does not tell how the loop is since", lost=False)
 
 
-def _end_watch(turn: Turn, trial: Probation, found: str, *, lost: bool) -> None:
+def _end_watch(context: StepContext, trial: Probation, found: str, *, lost: bool) -> None:
     trial = replace(trial, text=f"{trial.text}; since then: {found}")
     if lost and trial.opens:
-        _open(turn, trial)
+        _open(context, trial)
         return
-    _end(turn, trial, ProbationState.ROLLED_BACK, trial.text)
+    _end(context, trial, ProbationState.ROLLED_BACK, trial.text)
     do = "; open the loop" if lost else ""
     text = f"{trial.id} {trial.text}; the mode is hold until an operator sets another{do}"
-    turn.alarm(PROBATION, text, critical=lost)
+    context.raise_alarm(PROBATION, text, critical=lost)
 
 
-def _open(turn: Turn, trial: Probation) -> None:
+def _open(context: StepContext, trial: Probation) -> None:
     """Ask the RTC to open a loop that is lost, and say so."""
-    _end(turn, trial, ProbationState.OPENING, trial.text)
-    turn.alarm(LOOP_OPENED, _opening(trial, "the RTC is asked to open the loop"))
-    set_loop(turn, cmd.SetLoop(loop="open"))
+    _end(context, trial, ProbationState.OPENING, trial.text)
+    context.raise_alarm(LOOP_OPENED, _opening(trial, "the RTC is asked to open the loop"))
+    set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def _await_opening(turn: Turn, trial: Probation) -> None:
+def _await_opening(context: StepContext, trial: Probation) -> None:
     """Ask again until the loop is open, or an operator says how to go on."""
-    rtc, asked = turn.rtc, turn.state.loop_command
-    if isinstance(turn.event, cmd.SetMode):
-        _set(turn, replace(trial, state=ProbationState.KEPT))
-        turn.calm(LOOP_OPENED)
+    rtc, asked = context.rtc, context.state.loop_command
+    if isinstance(context.event, cmd.SetMode):
+        _set(context, replace(trial, state=ProbationState.KEPT))
+        context.clear_alarm(LOOP_OPENED)
     elif rtc is not None and not rtc.in_loop:
-        _set(turn, replace(trial, state=ProbationState.OPENED))
-        turn.alarm(LOOP_OPENED, _opening(trial, "the loop was asked to open, and is open"))
-    elif rtc is not None and asked is not None and not turn.state.stopped_because:
+        _set(context, replace(trial, state=ProbationState.OPENED))
+        context.raise_alarm(LOOP_OPENED, _opening(trial, "the loop was asked to open, and is open"))
+    elif rtc is not None and asked is not None and not context.state.stopped_because:
         if asked.state in {CommandState.REFUSED, CommandState.FAILED}:
             why = f"the RTC was asked to open the loop and has not ({asked.reason}): open it there"
-            turn.alarm(LOOP_OPENED, _opening(trial, why))
-        if turn.now_ns - asked.asked_ns_utc > OPEN_AGAIN_S * SECOND_NS:
-            set_loop(turn, cmd.SetLoop(loop="open"))
+            context.raise_alarm(LOOP_OPENED, _opening(trial, why))
+        if context.now_ns - asked.asked_ns_utc > OPEN_AGAIN_S * SECOND_NS:
+            set_loop(context, cmd.SetLoop(loop="open"))
 
 
 def _opening(trial: Probation, does: str) -> str:
@@ -277,60 +279,60 @@ def _opening(trial: Probation, does: str) -> str:
     )
 
 
-def _told_by_alarm(turn: Turn, trial: Probation) -> str:
+def _told_by_alarm(context: StepContext, trial: Probation) -> str:
     """Return what an alarm says of a matrix just applied; empty: none has come with it."""
     judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
-    late = turn.now_ns > trial.since_ns_utc + LAW_WITHIN_S * SECOND_NS
-    if trial.state not in judged or late or _why_not_comparable(turn):
+    late = context.now_ns > trial.since_ns_utc + LAW_WITHIN_S * SECOND_NS
+    if trial.state not in judged or late or _why_not_comparable(context):
         return ""
-    since = (a for a in turn.state.alarms if a.since_ns_utc >= trial.since_ns_utc)
+    since = (a for a in context.state.alarms if a.since_ns_utc >= trial.since_ns_utc)
     return next((alarm.text for alarm in since if alarm.name in _TELLING), "")
 
 
-def _why_none(turn: Turn, record: ReconstructorRecord, last: Probation | None) -> str:
+def _why_none(context: StepContext, record: ReconstructorRecord, last: Probation | None) -> str:
     """Return why a matrix just applied is not put on probation; empty: it is."""
     if record.published_ns_utc is None:
         return "the RTC took it by itself"
     if last is not None and last.state in _WORSE:
-        worse = turn.state.reconstructor(last.id)
+        worse = context.state.reconstructor(last.id)
         if worse is not None and worse.sha256 == record.sha256 != "":
             return "it was found worse before, and somebody wants it all the same"
-    return _why_not_comparable(turn)
+    return _why_not_comparable(context)
 
 
-def _why_not_comparable(turn: Turn) -> str:
+def _why_not_comparable(context: StepContext) -> str:
     """Return why telemetry cannot be compared now; empty: it can."""
-    if turn.rtc is None:
+    if context.rtc is None:
         return "the RTC is gone"
-    if not turn.rtc.in_loop:
-        return why_open(turn.rtc)
-    if turn.acquisition.under_way:
+    if not context.rtc.in_loop:
+        return why_open(context.rtc)
+    if context.acquisition.under_way:
         return "an acquisition watches its matrices itself"
     return ""
 
 
-def _why_stuck(turn: Turn, trial: Probation) -> str:
+def _why_stuck(context: StepContext, trial: Probation) -> str:
     """Return why the matrix before does not come into use again; empty: it is on its way."""
-    failed = turn.event
-    if isinstance(failed, ev.JobFailed) and isinstance(failed.effect, ev.CopyMatrix):
+    failed = context.event
+    if isinstance(failed, ev.JobFailed) and isinstance(failed.effect, ev.RepublishMatrix):
         return failed.text
-    sent = None if trial.rollback is None else turn.state.reconstructor(trial.rollback)
+    sent = None if trial.rollback is None else context.state.reconstructor(trial.rollback)
     if sent is None:
-        late = turn.now_ns > trial.until_ns_utc + COPIED_WITHIN_S * SECOND_NS
+        late = context.now_ns > trial.until_ns_utc + REPUBLISHED_WITHIN_S * SECOND_NS
         return "its copy did not come" if late else ""
     return sent.reason or sent.state if sent.state in _OVER else ""
 
 
-def _why_no_way_back(turn: Turn, trial: Probation) -> str | None:
+def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:
     """Return why the matrix before may not be sent by itself now, or None.
 
     The RTC has shown its numbers in this session, and the loop is as it was then. The gate is not
     asked: the loop ran with it, and α may be what is wrong.
     """
-    state, rtc, record = turn.state, turn.rtc, turn.state.reconstructor(trial.before)
+    state, rtc, record = context.state, context.rtc, context.state.reconstructor(trial.before)
     if rtc is None or record is None:
         return "it is no longer known, or the RTC is gone"
-    if record.id not in state.proven:
+    if record.id not in state.verified_ids:
         return "the RTC has not shown its numbers in this session"
     if trial.loop is None or not same_but_for_modes(trial.loop, rtc):
         return "the loop has been changed since"
@@ -340,23 +342,23 @@ def _why_no_way_back(turn: Turn, trial: Probation) -> str | None:
     return why_unsendable(state, record, trial.since_ns_utc)
 
 
-def _keep(turn: Turn, trial: Probation, why: str) -> None:
+def _keep(context: StepContext, trial: Probation, why: str) -> None:
     """Say that a matrix that is worse stays in use; open the loop that is lost with it."""
     text = f"{trial.worse}; the service did not go back to {trial.before}: {why}"
-    out_of_hand = turn.forbidden(Act.HOLD) is not None
+    out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
     lost = out_of_hand or (trial.finding is not None and trial.finding.lost)
-    if lost and trial.opens and turn.rtc is not None and not turn.state.stopped_because:
-        _open(turn, replace(trial, text=text))
+    if lost and trial.opens and context.rtc is not None and not context.state.stopped_because:
+        _open(context, replace(trial, text=text))
         return
-    _end(turn, trial, ProbationState.KEPT, text)
+    _end(context, trial, ProbationState.KEPT, text)
     do = "open the loop if it suffers, or roll back by hand"
-    turn.alarm(PROBATION, f"{trial.id} {text}; {do}", critical=lost)
+    context.raise_alarm(PROBATION, f"{trial.id} {text}; {do}", critical=lost)
 
 
-def _end(turn: Turn, trial: Probation, state: ProbationState, text: str) -> None:
-    _set(turn, replace(trial, state=state, text=text))
-    turn.log(f"probation.{state}", f"{trial.id}: {text}")
+def _end(context: StepContext, trial: Probation, state: ProbationState, text: str) -> None:
+    _set(context, replace(trial, state=state, text=text))
+    context.log(f"probation.{state}", f"{trial.id}: {text}")
 
 
-def _set(turn: Turn, trial: Probation) -> None:
-    turn.state = replace(turn.state, probation=trial)
+def _set(context: StepContext, trial: Probation) -> None:
+    context.state = replace(context.state, probation=trial)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
-from service.tracking import worth
-from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Act
+from service.tracking import update_policy
+from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Interlock
 from service.tracking.loop import commanded_gains, extended_gains
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.sending import (
@@ -19,7 +19,7 @@ from service.tracking.sending import (
     why_unsendable,
 )
 from service.tracking.state import Level, Mode, TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import Acknowledgement, AckState, Status
 
 RECONSTRUCTORS_KEPT = 200
@@ -48,136 +48,138 @@ def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
     return record
 
 
-def keep(turn: Turn, record: ReconstructorRecord) -> None:
+def keep(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep one more reconstructor; what is needed least gives way."""
-    records = [*(r for r in turn.state.reconstructors if r.id != record.id), record]
-    kept = thinned(records, turn.state.in_use)
-    turn.state = replace(turn.state, reconstructors=kept)
+    records = [*(r for r in context.state.reconstructors if r.id != record.id), record]
+    kept = prune(records, context.state.in_use)
+    context.state = replace(context.state, reconstructors=kept)
 
 
-def change(turn: Turn, record: ReconstructorRecord) -> None:
+def change(context: StepContext, record: ReconstructorRecord) -> None:
     """Replace the record of the same id."""
-    records = tuple(record if r.id == record.id else r for r in turn.state.reconstructors)
-    turn.state = replace(turn.state, reconstructors=records)
+    records = tuple(record if r.id == record.id else r for r in context.state.reconstructors)
+    context.state = replace(context.state, reconstructors=records)
 
 
-def change_state(turn: Turn, matrix_id: str, to: MatrixState, reason: str) -> None:
+def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:
     """Take one reconstructor further on its way."""
-    change(turn, replace(known_record(turn.state, matrix_id), state=to, reason=reason))
+    change(context, replace(known_record(context.state, matrix_id), state=to, reason=reason))
 
 
-def use(turn: Turn, matrix_id: str) -> None:
+def use(context: StepContext, matrix_id: str) -> None:
     """Mark one reconstructor as applied; whichever was, has been superseded."""
-    record = known_record(turn.state, matrix_id)
-    if turn.state.in_use == matrix_id and record.state is MatrixState.APPLIED:
+    record = known_record(context.state, matrix_id)
+    if context.state.in_use == matrix_id and record.state is MatrixState.APPLIED:
         return
-    for other in turn.state.reconstructors:
+    for other in context.state.reconstructors:
         if other.id != matrix_id and other.state is MatrixState.APPLIED:
-            change_state(turn, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
-    change(turn, replace(record, state=MatrixState.APPLIED))
-    forget_verdict(turn)
-    turn.state = replace(turn.state, in_use=matrix_id, assessment=None, judged_ns_utc=None)
+            change_state(context, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
+    change(context, replace(record, state=MatrixState.APPLIED))
+    forget_verdict(context)
+    context.state = replace(context.state, in_use=matrix_id, assessment=None, judged_ns_utc=None)
 
 
-def forget_verdict(turn: Turn) -> None:
+def forget_verdict(context: StepContext) -> None:
     """Forget the margin of the matrix in use: what it was judged at is not so any more."""
-    turn.state = replace(turn.state, margin=None)
+    context.state = replace(context.state, margin=None)
 
 
-def judge_again(turn: Turn) -> None:
+def judge_again(context: StepContext) -> None:
     """Have the matrix in use judged again, whenever that was done last."""
-    turn.state = replace(turn.state, judged_ns_utc=None)
+    context.state = replace(context.state, judged_ns_utc=None)
 
 
-def forget_session(turn: Turn) -> None:
+def forget_session(context: StepContext) -> None:
     """Note that the RTC has begun a new session: nobody knows what it multiplies with."""
-    for record in turn.state.reconstructors:
+    for record in context.state.reconstructors:
         if record.on_its_way:
-            change_state(turn, record.id, MatrixState.FAILED, "the RTC restarted")
-    turn.state = replace(
-        turn.state,
+            change_state(context, record.id, MatrixState.FAILED, "the RTC restarted")
+    context.state = replace(
+        context.state,
         in_use=None,
-        proven=frozenset(),
-        wrong_matrix=None,
+        verified_ids=frozenset(),
+        mismatched_id=None,
         applied_asked_ns_utc=0,
-        unfetched="",
+        read_back_error="",
         margin=None,
         assessment=None,
         judged_ns_utc=None,
     )
 
 
-def fetch(turn: Turn, rtc: Status) -> None:
+def fetch(context: StepContext, rtc: Status) -> None:
     """Ask the RTC for the matrix it uses."""
-    turn.state = replace(turn.state, applied_asked_ns_utc=turn.now_ns)
-    turn.ask(ev.FetchMatrix(id=rtc.cm_id))
+    context.state = replace(context.state, applied_asked_ns_utc=context.now_ns)
+    context.ask(ev.FetchMatrix(id=rtc.cm_id))
 
 
-def not_fetched(turn: Turn, why: str) -> None:
+def not_fetched(context: StepContext, why: str) -> None:
     """Note why the matrix in use is not to be had."""
-    turn.state = replace(turn.state, unfetched=why)
+    context.state = replace(context.state, read_back_error=why)
 
 
-def make(turn: Turn, effect: ev.MakeMatrix | ev.CopyMatrix) -> None:
+def make(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMatrix) -> None:
     """Have a reconstructor computed, or copied."""
-    turn.state = replace(turn.state, making_since_ns_utc=turn.now_ns)
-    turn.ask(effect)
+    context.state = replace(context.state, making_since_ns_utc=context.now_ns)
+    context.ask(effect)
 
 
-def made_none(turn: Turn) -> None:
+def made_none(context: StepContext) -> None:
     """Note that no reconstructor is being computed."""
-    turn.state = replace(turn.state, making_since_ns_utc=None)
+    context.state = replace(context.state, making_since_ns_utc=None)
 
 
-def judge(turn: Turn, matrix_id: str) -> None:
+def judge(context: StepContext, matrix_id: str) -> None:
     """Have the matrix in use judged."""
-    turn.state = replace(turn.state, judged_ns_utc=turn.now_ns)
-    turn.ask(ev.JudgeMatrix(id=matrix_id))
+    context.state = replace(context.state, judged_ns_utc=context.now_ns)
+    context.ask(ev.JudgeMatrix(id=matrix_id))
 
 
-def on_matrix(turn: Turn, made: ev.MatrixMade) -> None:
+def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
     """Keep a new reconstructor; send it if it passed the gate and nobody need approve.
 
     What an operator wants is sent whatever else is known; what nobody asked for only to a closed
     loop that behaves, and if α may be believed.
     """
     record, wanted = made.record, made.wanted
-    overtaken = not wanted and _jumped_since(turn.state, record)
-    propose(turn, record)
+    overtaken = not wanted and _jumped_since(context.state, record)
+    propose(context, record)
     if made.asked_modes is not None:
-        worth.note_limit(turn, record, made.asked_modes, made.why_fewer)
+        update_policy.note_limit(context, record, made.asked_modes, made.why_fewer)
     if record.state is MatrixState.REFUSED:
         return
     if overtaken:
         text = f"{record.id}: the mirror jumped while it was made"
-        change_state(turn, record.id, MatrixState.DISCARDED, text)
-        turn.log("reconstructor.discarded", text)
+        change_state(context, record.id, MatrixState.DISCARDED, text)
+        context.log("reconstructor.discarded", text)
         return
-    held = why_unsendable(turn.state, record) or beyond_judging(turn.state, record)
-    no_return = None if wanted or turn.state.mode is not Mode.AUTO else why_no_return(turn.state)
+    held = why_unsendable(context.state, record) or beyond_judging(context.state, record)
+    no_return = (
+        None if wanted or context.state.mode is not Mode.AUTO else why_no_return(context.state)
+    )
     if not held and no_return is not None:
-        turn.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
+        context.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
     elif not held and made.anyway:
-        send(turn, record.id)
-    elif not held and (wanted or may_follow(turn.state)):
-        send_once_judged(turn, record.id, wanted=wanted)
+        send(context, record.id)
+    elif not held and (wanted or may_follow(context.state)):
+        send_once_judged(context, record.id, wanted=wanted)
 
 
-def propose(turn: Turn, record: ReconstructorRecord) -> None:
+def propose(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep a new reconstructor in place of any proposal."""
-    made_none(turn)
-    for older in turn.state.reconstructors:
+    made_none(context)
+    for older in context.state.reconstructors:
         if older.state is MatrixState.PROPOSED:
-            change_state(turn, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
-    keep(turn, record)
+            change_state(context, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
+    keep(context, record)
     verdict = record.gate.reason if record.gate is not None else record.reason
     if record.state is MatrixState.REFUSED:
-        turn.warn("reconstructor.refused", f"{record.id}: {verdict}")
+        context.warn("reconstructor.refused", f"{record.id}: {verdict}")
     else:
-        turn.log("reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}")
+        context.log("reconstructor.made", f"{record.id}, {record.n_modes} modes, {verdict}")
 
 
-def send_once_judged(turn: Turn, matrix_id: str, *, wanted: bool = True) -> None:
+def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = True) -> None:
     """Send a reconstructor; where its verdict is not of the present loop and α, judge it first.
 
     Raises
@@ -185,45 +187,47 @@ def send_once_judged(turn: Turn, matrix_id: str, *, wanted: bool = True) -> None
     CommandError
         If it cannot be sent now, whatever the gate would say.
     """
-    record, rtc = _sendable(turn, matrix_id)
+    record, rtc = _sendable(context, matrix_id)
     gains = commanded_gains(rtc, record.n_modes)
-    stale = worth.why_stale(turn.state, record.judged, gains)
+    stale = update_policy.verdict_invalid_reason(context.state, record.judged, gains)
     if stale is None or (rtc.loop == "open" and record.gate is None):
-        send(turn, matrix_id)
+        send(context, matrix_id)
         return
     if rtc.loop == "open" and record.judged is not None:
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
-    turn.log("reconstructor.judged-again", text)
-    turn.ask(ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted))
+    context.log("reconstructor.judged-again", text)
+    context.ask(ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted))
 
 
-def on_proposal_judged(turn: Turn, event: ev.ProposalJudged) -> None:
+def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
     """Send a reconstructor that has passed the gate anew; what has changed meanwhile ends it."""
-    record, rtc = turn.state.reconstructor(event.id), turn.rtc
+    record, rtc = context.state.reconstructor(event.id), context.rtc
     if record is None or record.state is not MatrixState.PROPOSED:
         return
     verdict = event.verdict
     record = replace(record, gate=verdict, judged=event.judged)
     if not verdict.accepted:
-        change(turn, replace(record, state=MatrixState.REFUSED, reason=verdict.reason))
-        turn.warn("reconstructor.refused", f"{record.id}: {verdict.reason}")
+        change(context, replace(record, state=MatrixState.REFUSED, reason=verdict.reason))
+        context.warn("reconstructor.refused", f"{record.id}: {verdict.reason}")
         return
-    change(turn, record)
-    reason = why_unsendable(turn.state, record)
-    if reason is None and not event.wanted and not may_follow(turn.state):
-        alarm = turn.forbidden(Act.DECIDE)
+    change(context, record)
+    reason = why_unsendable(context.state, record)
+    if reason is None and not event.wanted and not may_follow(context.state):
+        alarm = context.blocking_alarm(Interlock.DECIDE)
         reason = f"{alarm.name}: {alarm.text}" if alarm else "the mode, the loop or α has changed"
     if rtc is not None and reason is None:
-        reason = worth.why_stale(turn.state, record.judged, commanded_gains(rtc, record.n_modes))
+        reason = update_policy.verdict_invalid_reason(
+            context.state, record.judged, commanded_gains(rtc, record.n_modes)
+        )
     if reason is None:
-        send(turn, record.id)
+        send(context, record.id)
         return
     text = f"{record.id} was not sent: while it was judged, {reason}; approve it again"
-    turn.warn("reconstructor.not-sent", text)
+    context.warn("reconstructor.not-sent", text)
 
 
-def send(turn: Turn, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
+def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
     """Mark a reconstructor as published and ask for it to be sent, with the gains in force.
 
     ``swapped_ns_utc``: to go back behind the swap of then, as :func:`why_unsendable` has it.
@@ -233,12 +237,12 @@ def send(turn: Turn, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
     CommandError
         If no RTC is there, it may be the wrong one, or the gate's latest verdict is no.
     """
-    record, rtc = _sendable(turn, matrix_id, swapped_ns_utc)
+    record, rtc = _sendable(context, matrix_id, swapped_ns_utc)
     same = record.n_modes == rtc.n_controlled
-    _send(turn, record, None if same else extended_gains(rtc, record.n_modes))
+    _send(context, record, None if same else extended_gains(rtc, record.n_modes))
 
 
-def send_with(turn: Turn, matrix_id: str, gains: tuple[float, ...] | None) -> None:
+def send_with(context: StepContext, matrix_id: str, gains: tuple[float, ...] | None) -> None:
     """Do the same with these gains.
 
     Raises
@@ -246,123 +250,132 @@ def send_with(turn: Turn, matrix_id: str, gains: tuple[float, ...] | None) -> No
     CommandError
         As above.
     """
-    record, _ = _sendable(turn, matrix_id)
-    _send(turn, record, gains)
+    record, _ = _sendable(context, matrix_id)
+    _send(context, record, gains)
 
 
-def _send(turn: Turn, record: ReconstructorRecord, gains: tuple[float, ...] | None) -> None:
+def _send(
+    context: StepContext, record: ReconstructorRecord, gains: tuple[float, ...] | None
+) -> None:
     unjudged = _why_unjudged(record)
     change(
-        turn,
-        replace(record, state=MatrixState.PUBLISHED, published_ns_utc=turn.now_ns, reason=unjudged),
+        context,
+        replace(
+            record, state=MatrixState.PUBLISHED, published_ns_utc=context.now_ns, reason=unjudged
+        ),
     )
     text = f"{record.id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
-    turn.log("reconstructor.published", text, Level.WARNING if unjudged else Level.INFO)
-    turn.ask(ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains))
+    context.log("reconstructor.published", text, Level.WARNING if unjudged else Level.INFO)
+    context.ask(ev.SendMatrix(id=record.id, n_modes=record.n_modes, gains=gains))
 
 
-def on_acknowledgement(turn: Turn, event: Acknowledgement) -> None:
+def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
     """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
-    record = _meant(turn.state, event)
+    record = _meant(context.state, event)
     if record is None:
         text = f"an acknowledgement for {event.id}, which this service never sent"
-        turn.warn("acknowledgement.unknown", text)
+        context.warn("acknowledgement.unknown", text)
         return
-    if _is_old(turn.state, record, event):
+    if _is_old(context.state, record, event):
         return
     if record.sha256 and event.sha256 not in {None, record.sha256}:
-        _distrust(turn, record, MatrixState(event.state.value), event.sha256)
+        _distrust(context, record, MatrixState(event.state.value), event.sha256)
         return
     reason, state = event.reason, MatrixState(event.state.value)
     if state in {MatrixState.APPLIED, MatrixState.STAGED}:
         reason = reason or _why_unjudged(record)
     if state is MatrixState.APPLIED:
-        _trust(turn, record.id)
+        _trust(context, record.id)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
-        change(turn, record)
-        use(turn, record.id)
-        turn.calm(NOT_ACKNOWLEDGED)
-        turn.calm(SHORT_MARGIN)
-        gains = () if turn.rtc is None else commanded_gains(turn.rtc, record.n_modes)
-        of_other = worth.why_worthless(turn.state, record.judged, gains)
-        turn.state = replace(
-            turn.state,
+        change(context, record)
+        use(context, record.id)
+        context.clear_alarm(NOT_ACKNOWLEDGED)
+        context.clear_alarm(SHORT_MARGIN)
+        gains = () if context.rtc is None else commanded_gains(context.rtc, record.n_modes)
+        of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
+        context.state = replace(
+            context.state,
             margin=None if of_other else record.gate,
-            judged_ns_utc=None if of_other else turn.now_ns,
+            judged_ns_utc=None if of_other else context.now_ns,
         )
-        turn.log("reconstructor.applied", f"{record.id} applied from frame {event.frame_seq}")
+        context.log("reconstructor.applied", f"{record.id} applied from frame {event.frame_seq}")
         return
-    change_state(turn, record.id, state, reason)
+    change_state(context, record.id, state, reason)
     if state is MatrixState.REJECTED:
-        turn.warn("reconstructor.rejected", f"the RTC rejected {record.id}: {event.reason}")
+        context.warn("reconstructor.rejected", f"the RTC rejected {record.id}: {event.reason}")
 
 
-def on_fetched(turn: Turn, fetched: ev.MatrixFetched) -> None:
+def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
     """Keep the matrix the RTC uses, which the service did not make, or find its own again.
 
     Ids are not enough: an RTC that starts anew may list its slopes otherwise, and hold the matrix
     of an id that is known as it needs it then.
     """
-    not_fetched(turn, "")
+    not_fetched(context, "")
     record = fetched.record
-    known = turn.state.reconstructor(record.id)
+    known = context.state.reconstructor(record.id)
     if known is not None and known.sha256 not in {"", record.sha256}:
-        _distrust(turn, known, MatrixState.APPLIED, record.sha256)
+        _distrust(context, known, MatrixState.APPLIED, record.sha256)
         return
-    _trust(turn, record.id)
-    if turn.state.in_use == record.id:
+    _trust(context, record.id)
+    if context.state.in_use == record.id:
         return
     if known is None:
-        keep(turn, record)
-    turn.log("reconstructor.adopted", f"the RTC uses {record.id}, {record.n_modes} modes")
-    use_named(turn, record.id)
+        keep(context, record)
+    context.log("reconstructor.adopted", f"the RTC uses {record.id}, {record.n_modes} modes")
+    use_named(context, record.id)
 
 
-def use_named(turn: Turn, matrix_id: str) -> None:
+def use_named(context: StepContext, matrix_id: str) -> None:
     """Take the reconstructor that the RTC's status names for applied, acknowledged or not.
 
     Only once its numbers are known to be the RTC's, or are not to be had.
     """
-    record = turn.state.reconstructor(matrix_id)
-    if record is None or why_unread(turn.state, matrix_id):
+    record = context.state.reconstructor(matrix_id)
+    if record is None or why_unread(context.state, matrix_id):
         return
-    use(turn, matrix_id)
+    use(context, matrix_id)
     if record.on_its_way or record.state is MatrixState.FAILED:
-        turn.calm(NOT_ACKNOWLEDGED)
+        context.clear_alarm(NOT_ACKNOWLEDGED)
     if record.state is MatrixState.FAILED:
         text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
-        change_state(turn, matrix_id, MatrixState.APPLIED, text)
-        turn.log("reconstructor.applied", text)
+        change_state(context, matrix_id, MatrixState.APPLIED, text)
+        context.log("reconstructor.applied", text)
 
 
-def on_margin(turn: Turn, event: ev.MarginJudged) -> None:
+def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
     """Note margin and loss of the matrix in use; raise an alarm when the margin is short."""
-    record, verdict, judged = turn.state.reconstructor(event.id), event.verdict, event.judged
+    record, verdict, judged = context.state.reconstructor(event.id), event.verdict, event.judged
     if record is None:
         return
-    used = event.id == turn.state.in_use
-    gains = () if turn.rtc is None else turn.rtc.gains[: record.n_modes]
-    if judged is not None and worth.why_worthless(turn.state, judged, gains) is not None:
+    used = event.id == context.state.in_use
+    gains = () if context.rtc is None else context.rtc.gains[: record.n_modes]
+    if (
+        judged is not None
+        and update_policy.verdict_doubtful_reason(context.state, judged, gains) is not None
+    ):
         if used:
-            judge_again(turn)
+            judge_again(context)
         return
-    change(turn, replace(record, gate=verdict, judged=judged))
+    change(context, replace(record, gate=verdict, judged=judged))
     if not used:
         return
     assessment = None
     if event.alpha is not None and event.expected is not None:
         assessment = Assessment(
-            id=event.id, alpha=event.alpha, expected=event.expected, t_ns_utc=turn.now_ns
+            id=event.id, alpha=event.alpha, expected=event.expected, t_ns_utc=context.now_ns
         )
-    turn.state = replace(turn.state, margin=verdict, assessment=assessment)
+    context.state = replace(context.state, margin=verdict, assessment=assessment)
     if verdict.accepted:
-        turn.calm(SHORT_MARGIN)
+        context.clear_alarm(SHORT_MARGIN)
     else:
-        turn.alarm(SHORT_MARGIN, f"{event.id}: {verdict.reason}", critical=verdict.unstable)
+        context.raise_alarm(
+            SHORT_MARGIN, f"{event.id}: {verdict.reason}", critical=verdict.unstable
+        )
 
 
 def _sendable(
-    turn: Turn, matrix_id: str, swapped_ns_utc: int | None = None
+    context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None
 ) -> tuple[ReconstructorRecord, Status]:
     """Return a reconstructor that may be sent, and to whom.
 
@@ -371,15 +384,15 @@ def _sendable(
     CommandError
         If it cannot be sent now.
     """
-    record, rtc = known_record(turn.state, matrix_id), turn.rtc
-    reason = why_refused(turn.state, record, swapped_ns_utc)
+    record, rtc = known_record(context.state, matrix_id), context.rtc
+    reason = why_refused(context.state, record, swapped_ns_utc)
     if rtc is None or reason is not None:
         raise CommandError(f"{matrix_id} cannot be sent: {reason}")
     return record, rtc
 
 
 def _distrust(
-    turn: Turn, record: ReconstructorRecord, state: MatrixState, sha256: str | None
+    context: StepContext, record: ReconstructorRecord, state: MatrixState, sha256: str | None
 ) -> None:
     """Believe that the RTC holds other numbers under an id than are known: nothing goes out."""
     before = "sent were" if record.parent is not None else "it was, when it was read before,"
@@ -388,34 +401,34 @@ def _distrust(
         f"{record.sha256}; nothing is published until it holds those (rtc/cm/applied), or another "
         "matrix under an id of its own: open the loop if it suffers, look at the RTC's log"
     )
-    change_state(turn, record.id, MatrixState.FAILED, text)
+    change_state(context, record.id, MatrixState.FAILED, text)
     if state is MatrixState.APPLIED:
-        turn.state = replace(turn.state, in_use=None, margin=None, assessment=None)
-    turn.state = replace(
-        turn.state,
-        proven=turn.state.proven - {record.id},
-        wrong_matrix=record.id,
-        applied_asked_ns_utc=turn.now_ns,
+        context.state = replace(context.state, in_use=None, margin=None, assessment=None)
+    context.state = replace(
+        context.state,
+        verified_ids=context.state.verified_ids - {record.id},
+        mismatched_id=record.id,
+        applied_asked_ns_utc=context.now_ns,
     )
-    turn.alarm(OTHER_SUM, text)
+    context.raise_alarm(OTHER_SUM, text)
 
 
-def _trust(turn: Turn, matrix_id: str) -> None:
+def _trust(context: StepContext, matrix_id: str) -> None:
     """Note that the RTC holds the numbers that it should."""
-    kept = {record.id for record in turn.state.reconstructors} & turn.state.proven
-    turn.state = replace(turn.state, proven=frozenset({*kept, matrix_id}))
-    if turn.state.wrong_matrix is not None:
-        turn.state = replace(turn.state, wrong_matrix=None)
-        turn.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
-        turn.calm(OTHER_SUM)
+    kept = {record.id for record in context.state.reconstructors} & context.state.verified_ids
+    context.state = replace(context.state, verified_ids=frozenset({*kept, matrix_id}))
+    if context.state.mismatched_id is not None:
+        context.state = replace(context.state, mismatched_id=None)
+        context.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
+        context.clear_alarm(OTHER_SUM)
 
 
 def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether a jump has been named since it was asked for, beyond the gate's verdict."""
-    known, began_ns = state.registration, state.making_since_ns_utc
-    if known is None or known.jumped_ns_utc is None or began_ns is None:
+    registration, began_ns = state.registration, state.making_since_ns_utc
+    if registration is None or registration.jumped_ns_utc is None or began_ns is None:
         return False
-    return known.jumped_ns_utc >= began_ns and worth.outdated(state, record)
+    return registration.jumped_ns_utc >= began_ns and update_policy.outdated(state, record)
 
 
 def _why_unjudged(record: ReconstructorRecord) -> str:
@@ -441,9 +454,7 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledge
     return record.state is MatrixState.SUPERSEDED and repeated
 
 
-def thinned(
-    shelf: list[ReconstructorRecord], in_use: str | None
-) -> tuple[ReconstructorRecord, ...]:
+def prune(shelf: list[ReconstructorRecord], in_use: str | None) -> tuple[ReconstructorRecord, ...]:
     """Return as many as are kept, oldest first.
 
     First to go is what was never sent, however new what is worth going back to: a flood of

@@ -45,10 +45,10 @@ class Validity(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class ValidityState:
     """Whether α may be relied on, why, and until when."""
 
-    validity: Validity = Validity.FRESH
+    level: Validity = Validity.FRESH
     reason: str = ""
     """Why it is not fresh."""
 
@@ -58,7 +58,7 @@ class Standing:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seen(Determination):
+class TimedEstimate(Determination):
     """A dithered window as it was measured, whatever the filter made of it."""
 
     t_ns_utc: int
@@ -69,7 +69,7 @@ class Seen(Determination):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reading(Seen):
+class PointedEstimate(TimedEstimate):
     """What was measured, or known, and where the telescope looked."""
 
     pointing: Pointing | None
@@ -77,13 +77,13 @@ class Reading(Seen):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Earlier(Reading):
+class PreviousEstimate(PointedEstimate):
     """What was known before the last measurement: a jump inside that one is seen from here."""
 
-    then: Seen | None = None
+    next_window: TimedEstimate | None = None
     """The window that entered next; None: it is not kept."""
 
-    earlier: Earlier | None = None
+    previous_estimate: PreviousEstimate | None = None
     """Before the window before that; None: that was the first, or it is not kept."""
 
 
@@ -112,12 +112,12 @@ class PassiveBias:
     loop: tuple[float, ...] = ()
     """``tracking.loop.loop_numbers`` of the loop it is the bias of; empty: not known."""
 
-    earlier: Earlier | None = None
+    previous_estimate: PreviousEstimate | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Candidate(Seen):
+class SuspectedJump(TimedEstimate):
     """A window far from all before, held until the next one says which of them was right.
 
     Where those before it have told the same place, it began with the first of them.
@@ -183,13 +183,13 @@ class Registration:
     window_pointing: Pointing | None = None
     """Of the telescope at the last dithered window; None: not known."""
 
-    earlier: Earlier | None = None
+    previous_estimate: PreviousEstimate | None = None
     """Before the last window; None: that was the first, or it was the first after a jump."""
 
     jumped_ns_utc: int | None = None
     """When it was last found to have jumped, by the service's clock; None: it has not."""
 
-    candidate: Candidate | None = None
+    suspected_jump: SuspectedJump | None = None
     """A jump that the next window confirms or denies; None: there is none."""
 
     doubt: str = ""
@@ -202,7 +202,7 @@ class Registration:
     """End of the telemetry that cast the doubt, the RTC's clock: a window that began before it
     cannot end it."""
 
-    standing: Standing = Standing()
+    validity: ValidityState = ValidityState()
     """How much it is worth now."""
 
     restored_ns_utc: int | None = None
@@ -227,7 +227,7 @@ class Registration:
     @property
     def usable(self) -> bool:
         """Whether anything may be made or published from it without being asked for."""
-        return self.standing.validity is not Validity.INVALID
+        return self.validity.level is not Validity.INVALID
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -265,7 +265,7 @@ class HistoryEntry:
     """Id of the matrix in use when it was looked at; None: unknown."""
 
 
-class MoveState(StrEnum):
+class OffloadState(StrEnum):
     """What became of a demand to move the mirror's image."""
 
     ASKED = "asked"
@@ -280,11 +280,11 @@ class MoveState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Move:
+class Offload:
     """The last demand to move the mirror's image, with a lens or a stage."""
 
     id: str
-    state: MoveState = MoveState.ASKED
+    state: OffloadState = OffloadState.ASKED
     text: str = ""
     """The device's reason, or what it is waited for."""
 
@@ -304,7 +304,7 @@ class Move:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Watchdog:
+class PassiveState:
     """The passive estimate, from ordinary telemetry, beside the dithered one."""
 
     alpha: Misregistration

@@ -8,17 +8,17 @@ from service.tracking import commands as cmd
 from service.tracking import dither, offload
 from service.tracking.acquisition import inherit, left_behind
 from service.tracking.acquisition_stages import abort
-from service.tracking.activity import ramping
-from service.tracking.alarms import STOPPED, Act
-from service.tracking.attention import take_over
+from service.tracking.alarm_records import take_over
+from service.tracking.alarms import STOPPED, Interlock
 from service.tracking.events import Tick
 from service.tracking.measuring import give_up
-from service.tracking.operator import order
+from service.tracking.operator import change_mode
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import thinned
+from service.tracking.reconstructors import prune
+from service.tracking.running_operations import ramping
 from service.tracking.state import Orders, Saved, TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.tracking.validity import age, restore
 
 CLOCKS_AGREE_S = 60.0
@@ -31,44 +31,46 @@ _RESTARTED = {
 }
 
 
-def stop(turn: Turn, command: cmd.StopEverything) -> None:
+def stop(context: StepContext, command: cmd.StopEverything) -> None:
     """End what runs as its own command would; from then on ask only for dithers to end.
 
     An acquisition gives back the loop as it was found, now. One that a measurement has opened is
     closed again when all is released: the RTC is busy until then. A gain ramp is the RTC's, and
     ends by itself; only opening the loop would end it sooner.
     """
-    if not turn.state.stopped_because:
-        ramp = ramping(turn.state, turn.now_ns)
+    if not context.state.stopped_because:
+        ramp = ramping(context.state, context.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
-        _stay(turn, f"everything was stopped {command.signed}{left}")
-    if turn.acquisition.under_way:
-        abort(turn, "by the operator", held_off=True)
-    for record in (turn.state.measuring, turn.state.gathering):
+        _stay(context, f"everything was stopped {command.signed}{left}")
+    if context.acquisition.under_way:
+        abort(context, "by the operator", held_off=True)
+    for record in (context.state.measuring, context.state.noisy_measurement):
         if record is not None:
-            give_up(turn, record.id)
-    if turn.rtc is None or turn.forbidden(Act.ASK) is not None:
-        dither.drop(turn)
+            give_up(context, record.id)
+    if context.rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
+        dither.drop(context)
     else:
-        dither.make_way(turn)
+        dither.make_way(context)
 
 
-def release(turn: Turn, command: cmd.Resume) -> None:
+def release(context: StepContext, command: cmd.Resume) -> None:
     """Go on in the mode and with the dither that were ordered before, or meanwhile."""
-    turn.state = replace(turn.state, stopped_because="")
-    turn.calm(STOPPED)
-    turn.log("resumed", command.signed)
+    context.state = replace(context.state, stopped_because="")
+    context.clear_alarm(STOPPED)
+    context.log("resumed", command.signed)
 
 
-def keep_stopped(turn: Turn) -> None:
+def keep_stopped(context: StepContext) -> None:
     """Have no dither of the service's own on the mirror while everything is stopped."""
-    if turn.rtc is not None and turn.forbidden(Act.ASK) is None:
-        dither.stop_unwanted(turn, turn.rtc)
+    if context.rtc is not None and context.blocking_alarm(Interlock.ASK) is None:
+        dither.stop_unwanted(context, context.rtc)
 
 
-def _stay(turn: Turn, text: str) -> None:
-    turn.state = replace(turn.state, stopped_because=text)
-    turn.alarm(STOPPED, f"{text}: nothing is dithered, made or sent until the stop is released")
+def _stay(context: StepContext, text: str) -> None:
+    context.state = replace(context.state, stopped_because=text)
+    context.raise_alarm(
+        STOPPED, f"{text}: nothing is dithered, made or sent until the stop is released"
+    )
 
 
 def orders_of(state: TrackerState) -> Orders:
@@ -78,21 +80,21 @@ def orders_of(state: TrackerState) -> Orders:
         settings_mode=state.settings_mode,
         dither_stopped=state.dither_stopped,
         stopped=state.stopped_because,
-        seen=state.notes,
+        seen=state.alarm_records,
     )
 
 
-def obey(turn: Turn, orders: Orders) -> None:
+def obey(context: StepContext, orders: Orders) -> None:
     """Take over what was ordered before a restart, the mode being the settings' so far.
 
     What was said last counts: an order outlives the service, and ends with the next one, or when
     the settings say something else than they did when it was given.
     """
     if orders.dither_stopped:
-        dither.allow(turn, allowed=False)
+        dither.allow(context, allowed=False)
         text = "by an operator before the restart; start the dither to let it dither again"
-        turn.warn("dither.stopped", text)
-    of_settings, ordered = turn.state.mode, orders.mode
+        context.warn("dither.stopped", text)
+    of_settings, ordered = context.state.mode, orders.mode
     if ordered is None or ordered is of_settings:
         return
     if of_settings is not orders.settings_mode:
@@ -105,8 +107,8 @@ def obey(turn: Turn, orders: Orders) -> None:
             f"mode is {ordered}, as an operator set it before the restart, and not {of_settings} "
             "as the settings say; set the mode to change it"
         )
-        order(turn, ordered, of_settings)
-    turn.warn("mode", text)
+        change_mode(context, ordered, of_settings)
+    context.warn("mode", text)
 
 
 def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
@@ -121,16 +123,16 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
         else record
         for record in records
     ]
-    return thinned(taken_over, None)
+    return prune(taken_over, None)
 
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return what is worth keeping of a state; None: nothing is known yet, nor ordered."""
-    known, acquisition, orders = state.registration, left_behind(state), orders_of(state)
-    if known is not None:
-        bias = known.bias and replace(known.bias, earlier=None)
-        known = replace(known, bias=bias, candidate=None, earlier=None)
-    elif acquisition is None and state.move is None and orders == Orders():
+    registration, acquisition, orders = state.registration, left_behind(state), orders_of(state)
+    if registration is not None:
+        bias = registration.bias and replace(registration.bias, previous_estimate=None)
+        registration = replace(registration, bias=bias, suspected_jump=None, previous_estimate=None)
+    elif acquisition is None and state.offload is None and orders == Orders():
         return None
     return Saved(
         system=state.system,
@@ -138,10 +140,10 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         session=state.rtc.session if state.rtc is not None else None,
         in_use=state.in_use,
         pointing=state.pointing,
-        registration=known,
+        registration=registration,
         acquisition=acquisition,
         orders=None if orders == Orders() else orders,
-        move=state.move,
+        offload=state.offload,
     )
 
 
@@ -161,33 +163,33 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     run agree with it nothing is made from it. An acquisition that was under way comes with it, and
     what an operator has ordered stands, whatever becomes of α.
     """
-    turn = Turn(state, Tick(), policy, now_ns)
+    context = StepContext(state, Tick(), policy, now_ns)
     if saved.orders is not None and saved.system == state.system:
-        obey(turn, saved.orders)
+        obey(context, saved.orders)
         if saved.orders.stopped:
-            _stay(turn, saved.orders.stopped)
-        take_over(turn, saved.orders)
-    _take_over_alpha(turn, saved, now_ns)
-    if saved.move is not None and saved.system == state.system:
-        offload.go_on(turn, saved.move)
-    return turn.state
+            _stay(context, saved.orders.stopped)
+        take_over(context, saved.orders)
+    _take_over_alpha(context, saved, now_ns)
+    if saved.offload is not None and saved.system == state.system:
+        offload.go_on(context, saved.offload)
+    return context.state
 
 
-def _take_over_alpha(turn: Turn, saved: Saved, now_ns: int) -> None:
-    reason = _why_not(turn.state, saved, now_ns)
+def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
+    reason = _why_not(context.state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"
-        turn.warn("registration.not-restored", text)
+        context.warn("registration.not-restored", text)
         return
     if saved.acquisition is not None:
-        inherit(turn, saved.acquisition)
-    known = saved.registration
-    if known is not None:
-        away_s = max(now_ns - known.arrived_ns_utc, 0) / SECOND_NS
-        restore(turn, known)
+        inherit(context, saved.acquisition)
+    registration = saved.registration
+    if registration is not None:
+        away_s = max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
+        restore(context, registration)
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
-        turn.log("registration.restored", text)
-        age(turn)
+        context.log("registration.restored", text)
+        age(context)
 
 
 def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:
@@ -196,12 +198,12 @@ def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:
     ahead_s = (saved.saved_ns_utc - now_ns) / SECOND_NS
     if ahead_s > CLOCKS_AGREE_S:
         return f"it was saved {ahead_s:.0f} s in the future: is this machine's clock right?"
-    known = saved.registration
-    if known is None:
+    registration = saved.registration
+    if registration is None:
         return None
     for name, found, expected in (
-        ("basis", known.basis_id, state.basis_id),
-        ("configuration", known.config_id, state.config_id),
+        ("basis", registration.basis_id, state.basis_id),
+        ("configuration", registration.config_id, state.config_id),
     ):
         if expected is not None and found != expected:
             return f"it is of {name} {found}, the instrument file has {expected}"

@@ -12,7 +12,7 @@ from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
 from service.tracking.state import AcquisitionStage
-from service.tracking.turn import Turn, tell_bursts
+from service.tracking.step_context import StepContext, tell_bursts
 from service.wire import DitherRequest, DitherStop, Status
 
 ACKNOWLEDGE_WITHIN_S = 3.0
@@ -29,170 +29,171 @@ COMPUTE_WITHIN_S = 60.0
 """A reconstructor that takes longer was lost with its worker."""
 
 
-def on_tick(turn: Turn) -> None:
+def on_tick(context: StepContext) -> None:
     """Give up what has been waited for too long."""
-    for record in turn.state.reconstructors:
-        sent_ns = record.published_ns_utc or turn.now_ns
-        if record.on_its_way and turn.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
+    for record in context.state.reconstructors:
+        sent_ns = record.published_ns_utc or context.now_ns
+        if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
             text = (
                 f"{record.id} was not applied within {ACKNOWLEDGE_WITHIN_S:.0f} s; the RTC keeps "
                 "the old one: look at the RTC's log, then publish again"
             )
-            reconstructors.change_state(turn, record.id, MatrixState.FAILED, text)
-            turn.alarm(alarms.NOT_ACKNOWLEDGED, text)
-    for alarm in turn.state.alarms:
-        silent_ns = turn.now_ns - alarm.seen_ns_utc
+            reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
+            context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
+    for alarm in context.state.alarms:
+        silent_ns = context.now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
-            validity.end_alarm(turn, alarm.name)
-    since_ns = turn.state.making_since_ns_utc
-    if since_ns is not None and turn.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
-        reconstructors.made_none(turn)
+            validity.end_alarm(context, alarm.name)
+    since_ns = context.state.making_since_ns_utc
+    if since_ns is not None and context.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
+        reconstructors.made_none(context)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
-        turn.warn("reconstructor.lost", text)
-    tell_bursts(turn)
+        context.warn("reconstructor.lost", text)
+    tell_bursts(context)
 
 
-def on_status(turn: Turn, rtc: Status) -> None:
+def on_status(context: StepContext, rtc: Status) -> None:
     """Take over what the RTC says of itself."""
-    before, known = turn.rtc, turn.known
-    turn.calm(alarms.VANISHED)
+    before, registration = context.rtc, context.registration
+    context.clear_alarm(alarms.VANISHED)
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
-        reconstructors.judge_again(turn)
-    bias = None if known is None else known.bias
+        reconstructors.judge_again(context)
+    bias = None if registration is None else registration.bias
     if bias is not None and bias.looked_ns_utc and not same_numbers(bias.loop, loop_numbers(rtc)):
         # it was learnt in another loop, in whichever session
-        validity.forget_bias(turn)
-    turn.state = replace(
-        turn.state,
+        validity.forget_bias(context)
+    context.state = replace(
+        context.state,
         rtc=rtc,
-        basis_id=turn.state.basis_id or rtc.basis_id,
-        config_id=turn.state.config_id or rtc.config_id,
+        basis_id=context.state.basis_id or rtc.basis_id,
+        config_id=context.state.config_id or rtc.config_id,
     )
-    validity.point(turn, rtc.pointing)
-    _drop_other_basis(turn)
-    _tell_of_gains(turn, before, rtc)
+    validity.point(context, rtc.pointing)
+    _drop_other_basis(context)
+    _tell_of_gains(context, before, rtc)
     if rtc.cm_id is not None:
-        reconstructors.use_named(turn, rtc.cm_id)
-    measuring, acquisition = turn.state.measuring, turn.acquisition
+        reconstructors.use_named(context, rtc.cm_id)
+    measuring, acquisition = context.state.measuring, context.acquisition
     opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
     # its alarm tells more, and not to close the loop on any matrix
     opened = opened or acquisition.stage is AcquisitionStage.INTERRUPTED
     if not rtc.in_loop and not opened:
-        turn.alarm(alarms.LOOP_OPEN, f"{why_open(rtc)}: close it to calibrate")
+        context.raise_alarm(alarms.LOOP_OPEN, f"{why_open(rtc)}: close it to calibrate")
     else:
-        turn.calm(alarms.LOOP_OPEN)
-    dither.follow_status(turn, rtc)
+        context.clear_alarm(alarms.LOOP_OPEN)
+    dither.follow_status(context, rtc)
 
 
-def hear_vibrations(turn: Turn, event: ev.Vibrations) -> None:
+def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
     """Note where the slopes vibrate; the next dither keeps clear of it."""
-    before, lines = turn.state.vibrations_hz, event.lines_hz
-    turn.state = replace(turn.state, vibrations_hz=lines)
+    before, lines = context.state.vibrations_hz, event.lines_hz
+    context.state = replace(context.state, vibrations_hz=lines)
     # a line between two bins of the spectrum shows now in one, now in the other
     if not all(any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines):
-        turn.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
+        context.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
 
 
-def hear_loop(turn: Turn, event: ev.LoopHeld) -> None:
+def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     """Note whether the loop holds well."""
-    turn.state = replace(turn.state, loop_holds=event.holds)
+    context.state = replace(context.state, loop_holds=event.holds)
 
 
-def _tell_of_gains(turn: Turn, before: Status | None, rtc: Status) -> None:
+def _tell_of_gains(context: StepContext, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
     n_now = len(rtc.in_loop)
     if rtc.loop != "open" and n_now not in {n_before, rtc.n_controlled}:
         text = f"{n_now} of {rtc.n_controlled} controlled modes have a gain: the others are let be"
-        turn.log("loop.partial", text)
+        context.log("loop.partial", text)
 
 
-def _drop_other_basis(turn: Turn) -> None:
+def _drop_other_basis(context: StepContext) -> None:
     """Drop an α that was restored from a night with another basis or configuration."""
-    known, state = turn.known, turn.state
-    if known is None or known.basis_id is None or known.config_id is None:
+    registration, state = context.registration, context.state
+    if registration is None or registration.basis_id is None or registration.config_id is None:
         return
-    if (known.basis_id, known.config_id) != (state.basis_id, state.config_id):
-        validity.forget(turn)
+    if (registration.basis_id, registration.config_id) != (state.basis_id, state.config_id):
+        validity.forget(context)
         text = (
-            f"α was measured with {known.basis_id}, {known.config_id}; the RTC has "
+            f"α was measured with {registration.basis_id}, {registration.config_id}; the RTC has "
             f"{state.basis_id}, {state.config_id}"
         )
-        turn.log("registration.void", text)
+        context.log("registration.void", text)
 
 
-def on_new_session(turn: Turn, started: ev.SessionStarted) -> None:
+def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
-    reconstructors.forget_session(turn)
-    validity.void(turn, "the RTC was in another session")
-    dither.drop(turn)
-    end_ramp(turn)
-    validity.unconfirm(turn)
-    turn.retry_all()
-    turn.state = replace(turn.state, rtc=None, loop_holds=False)
-    dither.found_again(turn)
-    turn.calm(alarms.MIRROR_SILENT)
-    dither.forget_unwanted(turn)
-    turn.calm(alarms.OTHER_SUM)
-    turn.log("rtc.session", f"the RTC started session {started.session}")
+    reconstructors.forget_session(context)
+    validity.invalidate_telemetry(context, "the RTC was in another session")
+    dither.drop(context)
+    end_ramp(context)
+    validity.require_confirmation(context)
+    context.retry_all()
+    context.state = replace(context.state, rtc=None, loop_holds=False)
+    dither.found_again(context)
+    context.clear_alarm(alarms.MIRROR_SILENT)
+    dither.forget_unwanted(context)
+    context.clear_alarm(alarms.OTHER_SUM)
+    context.log("rtc.session", f"the RTC started session {started.session}")
 
 
-def on_vanished(turn: Turn, _: ev.RtcVanished) -> None:
+def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
     """Forget what belonged to the RTC, and nothing else."""
-    dither.drop(turn)
-    turn.state = replace(turn.state, rtc=None)
-    dither.found_again(turn)
-    dither.forget_unwanted(turn)
+    dither.drop(context)
+    context.state = replace(context.state, rtc=None)
+    dither.found_again(context)
+    dither.forget_unwanted(context)
     text = (
         "the RTC's token is gone: it has ended, stood still for over 2 s or lost the network; α "
         "and every reconstructor are kept; it comes back by itself if it runs, else restart it"
     )
-    turn.alarm(alarms.VANISHED, text)
+    context.raise_alarm(alarms.VANISHED, text)
 
 
-def on_services(turn: Turn, event: ev.ServicesMet) -> None:
+def on_services(context: StepContext, event: ev.ServicesMet) -> None:
     """Stand by while another service drives the RTC, or say that one stands by."""
     who = " and ".join(event.others)
-    stood_by = turn.state.alarm(alarms.STANDING_BY) is not None
+    stood_by = context.state.alarm(alarms.STANDING_BY) is not None
     if not event.others:
-        turn.calm(alarms.SECOND_SERVICE)
+        context.clear_alarm(alarms.SECOND_SERVICE)
     else:
         does = "drives the RTC" if event.drives else "stands by"
         text = (
-            f"more than one service of system {turn.state.system}: beside this one, which {does}, "
+            f"more than one service of system {context.state.system}: beside this one, which "
+            f"{does}, "
             f"{who}: end all but one"
         )
-        turn.alarm(alarms.SECOND_SERVICE, text)
+        context.raise_alarm(alarms.SECOND_SERVICE, text)
     if not event.drives:
-        dither.drop(turn)
+        dither.drop(context)
         text = (
             f"another service drives the RTC: {who}; this one asks and sends nothing until that "
             "one has gone: end one of them"
         )
-        turn.alarm(alarms.STANDING_BY, text)
+        context.raise_alarm(alarms.STANDING_BY, text)
         return
     if stood_by:
         text = "the service that drove the RTC has gone: this one drives it from now on"
-        turn.warn("service.takes-over", text)
-    turn.calm(alarms.STANDING_BY)
+        context.warn("service.takes-over", text)
+    context.clear_alarm(alarms.STANDING_BY)
 
 
-def on_failure(turn: Turn, effect: Effect, text: str) -> None:
+def on_failure(context: StepContext, effect: Effect, text: str) -> None:
     """Undo the memory of having asked, so that it can be asked again later."""
     match effect:
-        case ev.MakeMatrix() | ev.CopyMatrix():
-            turn.put_off(make_s=5.0)
-            reconstructors.made_none(turn)
+        case ev.MakeMatrix() | ev.RepublishMatrix():
+            context.put_off(make_s=5.0)
+            reconstructors.made_none(context)
         case ev.Ask(request=DitherRequest()):
-            turn.put_off(dither_s=5.0)
-            dither.drop(turn)
+            context.put_off(dither_s=5.0)
+            dither.drop(context)
         case ev.Ask(request=DitherStop()):
             pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.FetchMatrix():
-            reconstructors.not_fetched(turn, text)
+            reconstructors.not_fetched(context, text)
         case ev.SendMatrix(id=matrix_id):
-            reconstructors.change_state(turn, matrix_id, MatrixState.FAILED, text)
+            reconstructors.change_state(context, matrix_id, MatrixState.FAILED, text)
         case _:
-            turn.put_off(make_s=5.0)
-    turn.warn("job.failed", text)
+            context.put_off(make_s=5.0)
+    context.warn("job.failed", text)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.tracking import alarms, worth
-from service.tracking.alarms import Act, Alarm, forbidding, forbids
+from service.tracking import alarms, update_policy
+from service.tracking.alarms import Alarm, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.loop import NO_RTC
 from service.tracking.mode_proof import why_unproven
 from service.tracking.products import ReconstructorRecord
@@ -28,14 +28,14 @@ def why_unsendable(
         return NO_RTC
     known, registration = _was_in_use(state, record), state.registration
     if registration is not None and not known:  # one must be able to go back
-        if registration.candidate is not None:
+        if registration.suspected_jump is not None:
             return "a jump is suspected: the next window of telemetry decides"
         if registration.doubt:
             now = "invalid" if registration.doubt_voids else "in question"
             return f"α is {now} ({registration.doubt})"
-    act = Act.SEND_KNOWN if known else Act.SEND_NEW
+    interlock = Interlock.SEND_KNOWN if known else Interlock.SEND_NEW
     before = state.alarms if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
-    alarm = next((alarm for alarm in before if forbids(alarm, act)), None)
+    alarm = next((alarm for alarm in before if alarm_blocks(alarm, interlock)), None)
     if alarm is not None:
         return alarm.text
     unread = why_unread(state, state.rtc.cm_id)
@@ -54,10 +54,10 @@ def why_refused(
 def why_no_return(state: TrackerState) -> str | None:
     """Return why the matrix in use could not be sent back after another one, or None."""
     rtc = state.rtc
-    if rtc is None or (rtc.cm_id or state.in_use) in state.proven:
+    if rtc is None or (rtc.cm_id or state.in_use) in state.verified_ids:
         return None
     name = "its matrix" if rtc.cm_id is None else rtc.cm_id
-    why = state.unfetched or why_unread(state, rtc.cm_id) or "its status does not name it"
+    why = state.read_back_error or why_unread(state, rtc.cm_id) or "its status does not name it"
     return (
         f"there would be no way back: the RTC has not shown {name} on rtc/cm/applied ({why}); "
         "have it offered there, or approve what is proposed and watch the loop"
@@ -75,23 +75,23 @@ def _not_of_swap(state: TrackerState, swapped_ns_utc: int) -> tuple[Alarm, ...]:
 
 def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
     """Return why nobody knows the numbers of this matrix of the RTC's, or None."""
-    if matrix_id is None or matrix_id in state.proven:
+    if matrix_id is None or matrix_id in state.verified_ids:
         return None
-    if matrix_id == state.wrong_matrix:
+    if matrix_id == state.mismatched_id:
         return f"the RTC holds other numbers as {matrix_id}"
-    if state.unfetched:
+    if state.read_back_error:
         return None  # an RTC need not offer its matrix; its id is believed then
     return f"the RTC's matrix {matrix_id} is being read back: wait some seconds"
 
 
 def may_follow(state: TrackerState) -> bool:
     """Return whether a reconstructor that nobody asked for may be sent."""
-    rtc, known = state.rtc, state.registration
+    rtc, registration = state.rtc, state.registration
     if state.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
         return False
-    if forbidding(state, Act.DECIDE) is not None or why_no_return(state) is not None:
+    if blocking_alarm(state, Interlock.DECIDE) is not None or why_no_return(state) is not None:
         return False
-    return known is not None and worth.settled(known)
+    return registration is not None and update_policy.settled(registration)
 
 
 def beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:

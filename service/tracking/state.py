@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
-from service.tracking.alarms import Alarm, Note
-from service.tracking.dither_request import Dither, Dithering
+from service.tracking.alarms import Alarm, AlarmRecord
+from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.loop import LoopCommand
 from service.tracking.mode_limits import ModeLimit, ModeProof
 from service.tracking.products import (
@@ -21,7 +21,7 @@ from service.tracking.products import (
     Probation,
     ReconstructorRecord,
 )
-from service.tracking.registration import HistoryEntry, Move, Registration, Watchdog
+from service.tracking.registration import HistoryEntry, Offload, PassiveState, Registration
 from service.wire import Pointing, Status
 
 
@@ -198,7 +198,7 @@ class Acquisition:
     n_modes: int = 0
     """Modes of the reconstructor that is made, sent or in use."""
 
-    most_modes: int | None = None
+    max_modes: int | None = None
     """More than so many were refused by the gate, or have slipped; None: not yet."""
 
     command: str | None = None
@@ -224,7 +224,7 @@ class Acquisition:
     """How it was left by the service before this one, or at a gap in the link; None: it was not."""
 
     @property
-    def looks_afar(self) -> bool:
+    def uses_wide_capture(self) -> bool:
         """Whether windows are of the open loop, from which α is found."""
         return self.stage in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}
 
@@ -260,16 +260,16 @@ class TrackerState:
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
 
-    proven: frozenset[str] = frozenset()
+    verified_ids: frozenset[str] = frozenset()
     """Ids of matrices whose numbers the RTC has shown or acknowledged in this session."""
 
-    wrong_matrix: str | None = None
+    mismatched_id: str | None = None
     """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
 
     applied_asked_ns_utc: int = 0
     """When the RTC was last asked for the matrix it uses."""
 
-    unfetched: str = ""
+    read_back_error: str = ""
     """Why it could not be had; empty: it could, or was not asked for."""
 
     margin: GateVerdict | None = None
@@ -308,7 +308,7 @@ class TrackerState:
     dither_losses: int = 0
     """Dithers lost since the last window was accepted."""
 
-    dithering: Dithering = field(default_factory=Dithering)
+    dither_policy: DitherPolicyState = field(default_factory=DitherPolicyState)
     """What the dither policy has learnt, and its account of why it dithers or does not."""
 
     vibrations_hz: tuple[float, ...] = ()
@@ -356,23 +356,23 @@ class TrackerState:
     void_because: str = ""
     """What was the matter with it."""
 
-    move: Move | None = None
+    offload: Offload | None = None
     """The last one asked for; None: none was, or α is corrected by the matrix alone."""
 
-    watchdog: Watchdog | None = None
-    unwatched: str = ""
+    passive: PassiveState | None = None
+    passive_unavailable_reason: str = ""
     """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
 
     stopped_because: str = ""
     """Who has stopped everything, and why; empty: nobody, or it was released."""
 
-    told: tuple[ObservatoryValue, ...] = ()
+    observatory_values: tuple[ObservatoryValue, ...] = ()
     """Values that operators' own rules ask for, as they were told last."""
 
     alarms: tuple[Alarm, ...] = ()
     """Those that last."""
 
-    notes: tuple[Note, ...] = ()
+    alarm_records: tuple[AlarmRecord, ...] = ()
     """What is kept of alarms that last, went unseen or are muted."""
 
     log: tuple[LogEntry, ...] = ()
@@ -424,7 +424,7 @@ class TrackerState:
         return self._under_way(noisy=False)
 
     @property
-    def gathering(self) -> MeasurementRecord | None:
+    def noisy_measurement(self) -> MeasurementRecord | None:
         """The noisy interaction matrix under way, or None."""
         return self._under_way(noisy=True)
 
@@ -447,7 +447,7 @@ class Orders:
     stopped: str = ""
     """Who has stopped everything, and why; empty: nobody."""
 
-    seen: tuple[Note, ...] = ()
+    seen: tuple[AlarmRecord, ...] = ()
     """What operators have seen of alarms, and what nobody has seen."""
 
 
@@ -480,7 +480,7 @@ class Saved:
     orders: Orders | None = None
     """None: nothing was ordered that the settings do not say."""
 
-    move: Move | None = None
+    offload: Offload | None = None
     """The last demand to move the mirror's image, with all before it; None: there was none."""
 
     @property

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from service.tracking.activity import ramping
-from service.tracking.alarms import Act
+from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
-from service.tracking.mode_proof import awaits_proof, most_modes
+from service.tracking.mode_proof import awaits_proof, n_proven_modes
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make
+from service.tracking.running_operations import ramping
 from service.tracking.sending import why_no_return, why_unsendable
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import Turn
-from service.tracking.worth import (
+from service.tracking.step_context import StepContext
+from service.tracking.update_policy import (
     PROPOSAL_STANDS_S,
+    assessment_is_old,
     fewer_than,
     left_behind,
-    look_is_old,
     more_to_try,
     outdated,
     settled,
-    why_worthwhile,
+    update_reason,
 )
 from service.wire import Status
 
@@ -42,47 +42,52 @@ JUDGE_AGAIN_S = 2.0
 """Least time between two looks when the last one holds no longer."""
 
 
-def fetch_in_use(turn: Turn) -> None:
+def fetch_in_use(context: StepContext) -> None:
     """Ask for the matrix in use until it was had once in this session."""
-    rtc, state = turn.rtc, turn.state
-    if rtc is None or turn.forbidden(Act.ASK) is not None:
+    rtc, state = context.rtc, context.state
+    if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
-    if rtc.cm_id in state.proven:
+    if rtc.cm_id in state.verified_ids:
         return
-    anew = rtc.cm_id is not None and not state.unfetched and state.wrong_matrix is None
+    anew = rtc.cm_id is not None and not state.read_back_error and state.mismatched_id is None
     every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
-    if turn.now_ns - state.applied_asked_ns_utc >= every_s * SECOND_NS:
-        fetch(turn, rtc)
+    if context.now_ns - state.applied_asked_ns_utc >= every_s * SECOND_NS:
+        fetch(context, rtc)
 
 
-def decide(turn: Turn) -> None:
+def decide(context: StepContext) -> None:
     """Ask for what is wanted now."""
-    rtc = turn.rtc
-    if rtc is None or turn.forbidden(Act.ASK) is not None:
+    rtc = context.rtc
+    if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
-    idle = turn.forbidden(Act.DECIDE) is not None or ramping(turn.state, turn.now_ns) is not None
+    idle = (
+        context.blocking_alarm(Interlock.DECIDE) is not None
+        or ramping(context.state, context.now_ns) is not None
+    )
     if idle:
-        stop_unwanted(turn, rtc)
+        stop_unwanted(context, rtc)
         return
-    choose_dither(turn, rtc)
-    unjudged = _unjudged_in_use(turn)
+    choose_dither(context, rtc)
+    unjudged = _unjudged_in_use(context)
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
-    _choose_update(turn, rtc)
+    _choose_update(context, rtc)
     if unjudged is not None:
-        judge(turn, unjudged)
+        judge(context, unjudged)
 
 
-def _unjudged_in_use(turn: Turn) -> str | None:
+def _unjudged_in_use(context: StepContext) -> str | None:
     """Return the matrix in use if its margin is not known or was judged too long ago, else None.
 
     Nothing is sent on such an answer: what is made, approved, copied or asked of the loop is judged
     there and then.
     """
-    state, known = turn.state, turn.known
-    if known is None or state.in_use is None or not settled(known):
+    state, registration = context.state, context.registration
+    if registration is None or state.in_use is None or not settled(registration):
         return None
     making = state.making_since_ns_utc is not None
-    return None if making or not _judgement_due(state, state.in_use, turn.now_ns) else state.in_use
+    return (
+        None if making or not _judgement_due(state, state.in_use, context.now_ns) else state.in_use
+    )
 
 
 def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
@@ -93,56 +98,63 @@ def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
     if state.margin is None or record is None or record.judged is None:
         return waited_s > JUDGE_REFUSED_S
     every_s = JUDGE_INTERVAL_S if state.margin.accepted else JUDGE_REFUSED_S
-    return waited_s > every_s or (waited_s > JUDGE_AGAIN_S and look_is_old(state, record))
+    return waited_s > every_s or (waited_s > JUDGE_AGAIN_S and assessment_is_old(state, record))
 
 
-def _choose_update(turn: Turn, rtc: Status) -> None:
+def _choose_update(context: StepContext, rtc: Status) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
-    state, known, now_ns = turn.state, turn.known, turn.now_ns
-    if state.mode is Mode.HOLD or state.on_probation or known is None or not settled(known):
+    state, registration, now_ns = context.state, context.registration, context.now_ns
+    if (
+        state.mode is Mode.HOLD
+        or state.on_probation
+        or registration is None
+        or not settled(registration)
+    ):
         return
     if not rtc.in_loop or state.making_since_ns_utc is not None:
         return
-    if turn.forbidden(Act.SEND_NEW) is not None:
+    if context.blocking_alarm(Interlock.SEND_NEW) is not None:
         return
-    first_ns = max(_next_attempt_ns(state, rtc, turn.policy), state.no_making_before_ns_utc)
+    first_ns = max(_next_attempt_ns(state, rtc, context.policy), state.no_making_before_ns_utc)
     in_use = state.reconstructor(state.in_use) if state.in_use else None
-    if _busy(turn) or now_ns < first_ns or in_use is None:
+    if _busy(context) or now_ns < first_ns or in_use is None:
         return
-    why, n_now = why_worthwhile(state, in_use, turn.policy, now_ns), rtc.n_controlled
-    n_safe = most_modes(state, rtc.n_modes)
+    why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
+    n_safe = n_proven_modes(state, rtc.n_modes)
     if n_safe < n_now:
         return
     if why is not None:
-        make(turn, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now)))
+        make(context, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now)))
         return
-    more = tuple(n for n in more_to_try(state, rtc, turn.policy, now_ns) if n <= n_safe)
-    if more and not awaits_proof(turn, rtc):
+    more = tuple(n for n in more_to_try(state, rtc, context.policy, now_ns) if n <= n_safe)
+    if more and not awaits_proof(context, rtc):
         why = f"{n_now} of {more[0]} modes controlled"
-        make(turn, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
+        make(context, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
 
 
-def _busy(turn: Turn) -> bool:
+def _busy(context: StepContext) -> bool:
     """Return whether a reconstructor is on its way, or one awaits an operator.
 
     In auto nobody is going to decide on a proposal left from another mode or an absent RTC, but
     where there would be no way back.
     """
-    state = turn.state
+    state = context.state
     awaited = state.mode is not Mode.AUTO or why_no_return(state) is not None
     return any(
-        r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and _stands(turn, r))
+        r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and _stands(context, r))
         for r in state.reconstructors
     )
 
 
-def _stands(turn: Turn, record: ReconstructorRecord) -> bool:
+def _stands(context: StepContext, record: ReconstructorRecord) -> bool:
     """Return whether a proposal is left for an operator to decide on: it fits α, or is new."""
-    state = turn.state
+    state = context.state
     if not outdated(state, record):
         return True
-    age_s = (turn.now_ns - record.created_ns_utc) / SECOND_NS
-    usable = not left_behind(state, record, turn.policy) and why_unsendable(state, record) is None
+    age_s = (context.now_ns - record.created_ns_utc) / SECOND_NS
+    usable = (
+        not left_behind(state, record, context.policy) and why_unsendable(state, record) is None
+    )
     return usable and age_s < PROPOSAL_STANDS_S
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.tracking.alarms import STALE, Act, forbids
+from service.tracking.alarms import STALE, Interlock, alarm_blocks
 from service.tracking.loop import separation_deg
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Registration, Standing, Validity
+from service.tracking.registration import Registration, Validity, ValidityState
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import Pointing
 
 CLOCK_SET_BACK_S = 60.0
@@ -47,7 +47,7 @@ FIRST_WINDOWS = 5
 FIRST_WINDOWS_S = 10.0
 """as long as they follow one another within this: σ shrinks then, and is no alarm."""
 
-CANDIDATE_FOR_S = 60.0
+SUSPECTED_FOR_S = 60.0
 """A jump that nothing has confirmed or denied for so long is no longer waited for."""
 
 MOVING = "the mirror's image was being moved"
@@ -58,70 +58,70 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Taken:
+class TelemetrySpan:
     """A stretch of telemetry, by the RTC's clock."""
 
     began_ns_utc: int
     ended_ns_utc: int
 
 
-def taken(began_ns_utc: int, ended_ns_utc: int) -> Taken:
+def telemetry_span(began_ns_utc: int, ended_ns_utc: int) -> TelemetrySpan:
     """Return the stretch that ended then; 0: nobody says when it began, it is taken for short."""
-    return Taken(began_ns_utc=began_ns_utc or ended_ns_utc, ended_ns_utc=ended_ns_utc)
+    return TelemetrySpan(began_ns_utc=began_ns_utc or ended_ns_utc, ended_ns_utc=ended_ns_utc)
 
 
-def precedes(state: TrackerState, when: Taken, since_ns_utc: int) -> bool:
+def precedes(state: TrackerState, when: TelemetrySpan, since_ns_utc: int) -> bool:
     """Return whether telemetry began before a time, and so cannot tell of what is since then."""
     if state.rtc is not None and since_ns_utc - state.rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS:
         return False
     return when.began_ns_utc < since_ns_utc - _ROUNDING_NS
 
 
-def why_void(state: TrackerState, when: Taken) -> str | None:
+def why_telemetry_invalid(state: TrackerState, when: TelemetrySpan) -> str | None:
     """Return why telemetry taken then measures nothing, whatever is the matter now; None: it may.
 
     What is the matter now is asked of the alarms.
     """
     voids = [(state.void_before_ns_utc, state.void_because)]
-    if state.move is not None:
-        voids.append((state.move.still_ns_utc, MOVING))
+    if state.offload is not None:
+        voids.append((state.offload.still_ns_utc, MOVING))
     because = next((why for before_ns, why in voids if precedes(state, when, before_ns)), None)
     if because is None:
         return None
     return f"{because} when it was taken: its telemetry is no measurement"
 
 
-def void(turn: Turn, because: str, t_ns_utc: int = 0) -> None:
+def invalidate_telemetry(context: StepContext, because: str, t_ns_utc: int = 0) -> None:
     """Note that nothing taken until now is a measurement any more.
 
     ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
     """
-    before_ns = max(t_ns_utc, 0 if turn.rtc is None else turn.rtc.t_ns)
-    turn.state = replace(turn.state, void_before_ns_utc=before_ns, void_because=because)
+    before_ns = max(t_ns_utc, 0 if context.rtc is None else context.rtc.t_ns)
+    context.state = replace(context.state, void_before_ns_utc=before_ns, void_because=because)
 
 
-def end_alarm(turn: Turn, name: str, t_ns_utc: int = 0) -> None:
+def end_alarm(context: StepContext, name: str, t_ns_utc: int = 0) -> None:
     """End an alarm; telemetry that it was of stays what it was."""
-    alarm = turn.state.alarm(name)
-    turn.calm(name)
-    if alarm is not None and forbids(alarm, Act.MEASURE):
-        void(turn, alarm.kind.because, t_ns_utc)
+    alarm = context.state.alarm(name)
+    context.clear_alarm(name)
+    if alarm is not None and alarm_blocks(alarm, Interlock.MEASURE):
+        invalidate_telemetry(context, alarm.definition.because, t_ns_utc)
 
 
-def tells_of(state: TrackerState, name: str, when: Taken) -> bool:
+def tells_of(state: TrackerState, name: str, when: TelemetrySpan) -> bool:
     """Return whether telemetry was taken since this alarm was raised, or there is no such alarm."""
     alarm = state.alarm(name)
     return alarm is None or not precedes(state, when, alarm.t_ns_utc)
 
 
-def point(turn: Turn, pointing: Pointing | None) -> None:
+def point(context: StepContext, pointing: Pointing | None) -> None:
     """Note where the telescope looks, and remember its way; None: nobody tells."""
     if pointing is None:
         return
-    way, t_ns = turn.state.pointings, 0 if turn.rtc is None else turn.rtc.t_ns
+    way, t_ns = context.state.pointings, 0 if context.rtc is None else context.rtc.t_ns
     if not way or separation_deg(way[-1][1], pointing) >= _TURNED_DEG:
         way = (*way, (t_ns, pointing))[-_POINTINGS_KEPT:]
-    turn.state = replace(turn.state, pointing=pointing, pointings=way)
+    context.state = replace(context.state, pointing=pointing, pointings=way)
 
 
 def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
@@ -133,12 +133,12 @@ def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
     return earlier[-1][1] if earlier else later[0][1]
 
 
-def hold(turn: Turn, registration: Registration) -> None:
+def store_registration(context: StepContext, registration: Registration) -> None:
     """Take something for what is known of α."""
-    turn.known = registration
+    context.registration = registration
 
 
-def displace(turn: Turn, step: Array, spread: Array, still_ns_utc: int) -> None:
+def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_utc: int) -> None:
     """Expect α elsewhere, for the mirror's image was moved; windows must confirm it.
 
     Parameters
@@ -150,134 +150,138 @@ def displace(turn: Turn, step: Array, spread: Array, still_ns_utc: int) -> None:
     still_ns_utc
         When the image stands still, by the RTC's clock.
     """
-    known = turn.known
-    if known is None:
+    registration = context.registration
+    if registration is None:
         return
-    bias = None if known.bias is None else replace(known.bias, earlier=None)
-    turn.known = replace(
-        known,
-        alpha=Misregistration.from_vector(known.alpha.vector + step),
-        covariance=known.covariance + np.diag(spread**2),
+    bias = None if registration.bias is None else replace(registration.bias, previous_estimate=None)
+    context.registration = replace(
+        registration,
+        alpha=Misregistration.from_vector(registration.alpha.vector + step),
+        covariance=registration.covariance + np.diag(spread**2),
         n_windows=0,
-        earlier=None,
-        candidate=None,
+        previous_estimate=None,
+        suspected_jump=None,
         bias=bias,
-        passive_after_ns_utc=max(known.passive_after_ns_utc, still_ns_utc),
+        passive_after_ns_utc=max(registration.passive_after_ns_utc, still_ns_utc),
     )
-    want_window(turn, MOVING)
-    age(turn)
+    want_window(context, MOVING)
+    age(context)
 
 
-def forget(turn: Turn) -> None:
+def forget(context: StepContext) -> None:
     """Know nothing of α any more."""
-    turn.known = None
+    context.registration = None
 
 
-def forget_bias(turn: Turn) -> None:
+def forget_bias(context: StepContext) -> None:
     """Forget how far the passive estimate is off."""
-    if turn.known is not None:
-        turn.known = replace(turn.known, bias=None)
+    if context.registration is not None:
+        context.registration = replace(context.registration, bias=None)
 
 
-def unconfirm(turn: Turn) -> None:
+def require_confirmation(context: StepContext) -> None:
     """Have windows confirm what is known anew."""
-    if turn.known is not None:
-        turn.known = replace(turn.known, n_windows=0)
+    if context.registration is not None:
+        context.registration = replace(context.registration, n_windows=0)
 
 
-def restore(turn: Turn, known: Registration) -> None:
+def restore(context: StepContext, registration: Registration) -> None:
     """Take over what was known before a restart of the service."""
-    turn.known = replace(known, n_windows=0, restored_ns_utc=turn.now_ns)
+    context.registration = replace(registration, n_windows=0, restored_ns_utc=context.now_ns)
 
 
-def age(turn: Turn) -> None:
+def age(context: StepContext) -> None:
     """Let σ grow to the present, and say what α is then worth."""
-    known = turn.known
-    if known is not None:
-        known = _without_old_candidate(known, turn.now_ns)
-        walked = turn.policy.drift_rate**2 * elapsed_s(turn.state, known, turn.now_ns)
-        bent = flexure(known.pointing, turn.state.pointing, turn.policy)
-        known = replace(known, grown=walked + bent**2)
-        standing = _standing(turn, known)
-        if standing.validity in _WORTHLESS:
-            want_window(turn, standing.reason)
-        elif turn.dither is None and _too_wide_for_the_gate(turn.state, known):
-            want_window(turn, "σ has grown beyond what the stability gate accepts")
-        turn.known = replace(known, standing=standing)
-    text = _why_stale(turn.state, turn.now_ns)
+    registration = context.registration
+    if registration is not None:
+        registration = _without_old_suspicion(registration, context.now_ns)
+        walked = context.policy.drift_rate**2 * elapsed_s(
+            context.state, registration, context.now_ns
+        )
+        bent = flexure(registration.pointing, context.state.pointing, context.policy)
+        registration = replace(registration, grown=walked + bent**2)
+        standing = _validity_of(context, registration)
+        if standing.level in _WORTHLESS:
+            want_window(context, standing.reason)
+        elif context.dither is None and _too_wide_for_the_gate(context.state, registration):
+            want_window(context, "σ has grown beyond what the stability gate accepts")
+        context.registration = replace(registration, validity=standing)
+    text = _stale_reason(context.state, context.now_ns)
     if text is None:
-        turn.calm(STALE)
+        context.clear_alarm(STALE)
     else:
-        turn.alarm(STALE, text)
+        context.raise_alarm(STALE, text)
 
 
-def want_window(turn: Turn, reason: str) -> None:
+def want_window(context: StepContext, reason: str) -> None:
     """Want a dithered window; a wish that stands keeps its beginning."""
-    if turn.state.dither_due_since_ns_utc is None:
-        due = replace(turn.state, dither_due_since_ns_utc=turn.now_ns, dither_due_reason=reason)
-        turn.state = due
-        turn.log("dither.due", reason)
+    if context.state.dither_due_since_ns_utc is None:
+        due = replace(
+            context.state, dither_due_since_ns_utc=context.now_ns, dither_due_reason=reason
+        )
+        context.state = due
+        context.log("dither.due", reason)
 
 
-def have_window(turn: Turn) -> None:
+def have_window(context: StepContext) -> None:
     """Note that the wish has been fulfilled."""
-    turn.state = replace(turn.state, dither_due_since_ns_utc=None, dither_due_reason="")
+    context.state = replace(context.state, dither_due_since_ns_utc=None, dither_due_reason="")
 
 
-def flexure(known: Pointing | None, now: Pointing | None, policy: Policy) -> Array:
+def flexure(pointing_then: Pointing | None, now: Pointing | None, policy: Policy) -> Array:
     """Return ``(4,)`` 1 σ of what a change of elevation has done to α; 0 where nobody tells it."""
-    if known is None or now is None:
+    if pointing_then is None or now is None:
         return np.zeros(4)
-    return policy.flexure_per_degree * abs(now.elevation_deg - known.elevation_deg)
+    return policy.flexure_per_degree * abs(now.elevation_deg - pointing_then.elevation_deg)
 
 
-def slewed_deg(state: TrackerState, known: Registration) -> float:
+def slewed_deg(state: TrackerState, registration: Registration) -> float:
     """Return how far the telescope has moved since the last dithered window, degrees."""
-    if state.pointing is None or known.window_pointing is None:
+    if state.pointing is None or registration.window_pointing is None:
         return 0.0
-    return separation_deg(state.pointing, known.window_pointing)
+    return separation_deg(state.pointing, registration.window_pointing)
 
 
-def elapsed_s(state: TrackerState, known: Registration, now_ns: int) -> float:
+def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> float:
     """Return how old the estimate is: by the RTC's clock while it tells the time, else by arrival.
 
     A simulated RTC may be slower than its timestamps, and the mirror drifts by its time.
     """
-    if state.rtc is not None and state.rtc.t_ns >= known.t_ns_utc:
-        return (state.rtc.t_ns - known.t_ns_utc) / SECOND_NS
-    return max(now_ns - known.arrived_ns_utc, 0) / SECOND_NS
+    if state.rtc is not None and state.rtc.t_ns >= registration.t_ns_utc:
+        return (state.rtc.t_ns - registration.t_ns_utc) / SECOND_NS
+    return max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
 
 
-def _standing(turn: Turn, known: Registration) -> Standing:
-    policy, reason = turn.policy, _why_invalid(turn.state, known, turn.policy)
+def _validity_of(context: StepContext, registration: Registration) -> ValidityState:
+    policy, reason = context.policy, _why_invalid(context.state, registration, context.policy)
     if reason is not None:
-        return Standing(validity=Validity.INVALID, reason=reason)
-    sigma, limit, before = known.sigma, policy.stale_sigma, turn.before.registration
-    if known.n_windows == 0:
-        return Standing(validity=Validity.STALE, reason="no window has confirmed it yet")
-    was_stale = before is not None and before.standing.validity is Validity.STALE
+        return ValidityState(level=Validity.INVALID, reason=reason)
+    sigma, limit, before = registration.sigma, policy.stale_sigma, context.before.registration
+    if registration.n_windows == 0:
+        return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
+    was_stale = before is not None and before.validity.level is Validity.STALE
     ends = NO_LONGER_STALE if was_stale and before and before.n_windows else 1.0
     if np.any(sigma > ends * limit):
-        return Standing(validity=Validity.STALE, reason=_worst(sigma, limit))
+        return ValidityState(level=Validity.STALE, reason=_worst(sigma, limit))
     rate = np.maximum(policy.drift_rate**2, np.finfo(float).tiny)
     left_s = float(np.min((limit**2 - sigma**2) / rate))
     # a rate of zero never ends it; a century is beyond any night
-    until_ns = turn.now_ns + round(left_s * SECOND_NS) if left_s < 3e9 else None
+    until_ns = context.now_ns + round(left_s * SECOND_NS) if left_s < 3e9 else None
     if np.any(sigma > AGEING_SHARE * limit):
         reason = _worst(sigma, AGEING_SHARE * limit)
-        return Standing(validity=Validity.AGEING, reason=reason, until_ns_utc=until_ns)
-    return Standing(until_ns_utc=until_ns)
+        return ValidityState(level=Validity.AGEING, reason=reason, until_ns_utc=until_ns)
+    return ValidityState(until_ns_utc=until_ns)
 
 
-def _why_invalid(state: TrackerState, known: Registration, policy: Policy) -> str | None:
+def _why_invalid(state: TrackerState, registration: Registration, policy: Policy) -> str | None:
     """Return why α may be somewhere else altogether, or None."""
-    if known.doubt and known.doubt_voids:
-        return known.doubt
-    moved_deg = slewed_deg(state, known)
+    if registration.doubt and registration.doubt_voids:
+        return registration.doubt
+    moved_deg = slewed_deg(state, registration)
     if moved_deg > policy.slew_limit_deg:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
-    if np.any(known.sigma > USELESS_SIGMA):
-        return _worst(known.sigma, USELESS_SIGMA)
+    if np.any(registration.sigma > USELESS_SIGMA):
+        return _worst(registration.sigma, USELESS_SIGMA)
     return None
 
 
@@ -288,38 +292,43 @@ def _worst(sigma: Array, limit: Array) -> str:
     return f"1 sigma of {PARAMETERS[worst]} has grown beyond {most:.4g}"
 
 
-def _without_old_candidate(known: Registration, now_ns: int) -> Registration:
-    candidate = known.candidate
-    if candidate is None or now_ns - candidate.held_ns_utc < CANDIDATE_FOR_S * SECOND_NS:
-        return known
+def _without_old_suspicion(registration: Registration, now_ns: int) -> Registration:
+    candidate = registration.suspected_jump
+    if candidate is None or now_ns - candidate.held_ns_utc < SUSPECTED_FOR_S * SECOND_NS:
+        return registration
     doubt = "a window was far out, and none has come since"
-    return replace(known, candidate=None, doubt=doubt, doubt_voids=True)
+    return replace(registration, suspected_jump=None, doubt=doubt, doubt_voids=True)
 
 
-def _why_stale(state: TrackerState, now_ns: int) -> str | None:
+def _stale_reason(state: TrackerState, now_ns: int) -> str | None:
     """Return why α is worth too little for a closed loop, in the words of its validity, or None."""
-    known = state.registration
-    if known is None or state.rtc is None or not state.rtc.in_loop or known.n_windows == 0:
+    registration = state.registration
+    if (
+        registration is None
+        or state.rtc is None
+        or not state.rtc.in_loop
+        or registration.n_windows == 0
+    ):
         return None
-    if state.alarm(STALE) is None and _sharpens(known, now_ns):
+    if state.alarm(STALE) is None and _sharpens(registration, now_ns):
         return None
-    if known.standing.validity in _WORTHLESS and not known.doubt:
-        return f"{known.standing.reason}: have it dithered"
+    if registration.validity.level in _WORTHLESS and not registration.doubt:
+        return f"{registration.validity.reason}: have it dithered"
     return None
 
 
-def _sharpens(known: Registration, now_ns: int) -> bool:
+def _sharpens(registration: Registration, now_ns: int) -> bool:
     """Return whether σ is above its limit because only the first windows have come so far."""
-    since_s = (now_ns - known.window_ns_utc) / SECOND_NS
-    few = known.n_windows < FIRST_WINDOWS and since_s < FIRST_WINDOWS_S
-    return few and known.standing.validity is Validity.STALE
+    since_s = (now_ns - registration.window_ns_utc) / SECOND_NS
+    few = registration.n_windows < FIRST_WINDOWS and since_s < FIRST_WINDOWS_S
+    return few and registration.validity.level is Validity.STALE
 
 
-def _too_wide_for_the_gate(state: TrackerState, known: Registration) -> bool:
+def _too_wide_for_the_gate(state: TrackerState, registration: Registration) -> bool:
     """Return whether the margin is short only because σ has grown since the last window."""
     margin = state.margin
     # an edge that would slip is refused whatever σ is
     if margin is None or margin.worst_pole_radius <= margin.bound:
         return False
-    own = np.sqrt(np.diag(known.covariance) + known.floor**2)
-    return bool(np.any(known.sigma > 2.0 * own))
+    own = np.sqrt(np.diag(registration.covariance) + registration.floor**2)
+    return bool(np.any(registration.sigma > 2.0 * own))

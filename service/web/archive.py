@@ -24,7 +24,7 @@ from service.runtime.recording import needed
 from service.web.commands import AcceptedView, ClientDep, Said
 from service.web.problems import INVALID, UNKNOWN
 from service.web.reading import TimeParameters
-from service.web.views import ServiceDep, answer, picture, shows, view
+from service.web.views import ServiceDep, answer, define_view, shows, to_json
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
 
@@ -45,8 +45,8 @@ class Kept:
     """On their disk."""
 
 
-view("ArchiveItemView", Item)
-KEPT = view("ArchiveView", Kept)
+define_view("ArchiveItemView", Item)
+KEPT = define_view("ArchiveView", Kept)
 
 
 @router.get("/archive", responses={200: shows(KEPT)})
@@ -63,9 +63,11 @@ def _kept(kept: Archive, in_use: frozenset[str]) -> Kept:
 
 
 @router.put("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
-async def pin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedView:
+async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> AcceptedView:
     """Keep a matrix for ever, whatever its age: who and why are kept with it."""
-    entry = client.caller.entry("archive.pinned", product_id, by=said.by, why=said.reason)
+    entry = client.actor.entry(
+        "archive.pinned", product_id, by=instruction.by, why=instruction.reason
+    )
     made = Pin(id=product_id, who=entry.who, why=entry.why)
     await run_in_threadpool(client.service.archive.pin, made)
     client.service.audit(entry)
@@ -73,11 +75,13 @@ async def pin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedV
 
 
 @router.delete("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
-async def unpin(client: ClientDep, product_id: ProductId, said: Said) -> AcceptedView:
+async def unpin(client: ClientDep, product_id: ProductId, instruction: Said) -> AcceptedView:
     """Let a matrix go when it is old."""
     await run_in_threadpool(client.service.archive.unpin, product_id)
     client.service.audit(
-        client.caller.entry("archive.unpinned", product_id, by=said.by, why=said.reason)
+        client.actor.entry(
+            "archive.unpinned", product_id, by=instruction.by, why=instruction.reason
+        )
     )
     return client.accepted(f"{product_id} goes when it is old", archive="/v1/archive")
 
@@ -127,8 +131,8 @@ class Trail:
     """Oldest first."""
 
 
-ENTRY = view("AuditEntryView", AuditEntry)
-TRAIL = view("AuditView", Trail)
+ENTRY = define_view("AuditEntryView", AuditEntry)
+TRAIL = define_view("AuditView", Trail)
 
 
 @router.get(
@@ -170,7 +174,7 @@ def _all(archive: Archive, part: Range) -> Iterator[dict[str, Any]]:
     """Yield all entries of a part as they leave; each page waits for the disk."""
     page = replace(part, limit=PAGE)
     while entries := archive.audit_trail(page):
-        yield from map(picture, entries)
+        yield from map(to_json, entries)
         page = replace(page, after=entries[-1].id)
 
 

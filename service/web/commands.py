@@ -18,8 +18,8 @@ from pydantic_core import from_json
 from starlette.datastructures import MutableHeaders
 
 from service.errors import StaleError, UntaggedError
-from service.runtime import keeping
-from service.runtime.recording import Caller
+from service.runtime import telemetry_recorder
+from service.runtime.recording import Actor
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as instructions
 from service.tracking.commands import (
@@ -34,6 +34,7 @@ from service.tracking.commands import (
     Publish,
     Ramp,
     Reject,
+    ReportedValue,
     Resume,
     Rollback,
     SeenAlarm,
@@ -44,14 +45,13 @@ from service.tracking.commands import (
     StartDither,
     StopDither,
     StopEverything,
-    ToldValue,
     UnmuteAlarm,
 )
 from service.tracking.state import TrackerState
-from service.web.admission import caller_of
+from service.web.authentication import actor_of
 from service.web.numbers import MatrixId
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.web.views import RECONSTRUCTORS, Schema, ServiceDep, explained, known, tagged
+from service.web.views import RECONSTRUCTORS, Schema, ServiceDep, explained, found_or_refuse, tagged
 
 # --- what is asked: JSON, read into a record
 
@@ -113,9 +113,9 @@ Said = Annotated[Instruction, body(Instruction)]
 """The body of a request whose path says all the rest."""
 
 
-def about(kind: type[Asked], said: Instruction, **more: str) -> Asked:
+def about(kind: type[Asked], instruction: Instruction, **more: str) -> Asked:
     """Return the command that says the same, and what the path or the service adds."""
-    return kind(**said.said(), **more)
+    return kind(**instruction.as_fields(), **more)
 
 
 Where = tuple[int | str, ...]
@@ -194,7 +194,7 @@ def bodies(by_operation: Mapping[str, Body]) -> tuple[dict[str, Schema], dict[st
         for name, body in by_operation.items()
     }
     schemas: dict[str, Schema] = document.get("$defs", {})
-    records = vars(instructions) | vars(keeping)
+    records = vars(instructions) | vars(telemetry_recorder)
     for name, schema in schemas.items():
         texts = explained(records[name]) if "properties" in schema else {}
         if "action" in schema.get("properties", ()):  # what tells alternatives apart
@@ -242,7 +242,7 @@ class Client:
     service: Supervisor
     """That is to obey."""
 
-    caller: Caller
+    actor: Actor
     seen: str | None
     """ETags of what the order was decided on; None: not told."""
 
@@ -254,14 +254,14 @@ class Client:
 
     async def orders(self, command: Command, **links: str) -> AcceptedView:
         """Hand a command on; say what was done, and where to look for what becomes of it."""
-        return await self._orders(command, self.caller, links)
+        return await self._orders(command, self.actor, links)
 
     async def decides(
         self, command: Command, *shown: Callable[[TrackerState], Response], **links: str
     ) -> AcceptedView:
         """Do the same, if one of what is ``shown`` is still what whoever decides has seen."""
-        caller = replace(self.caller, check=lambda: self._check(shown))
-        return await self._orders(command, caller, links)
+        actor = replace(self.actor, check=lambda: self._check(shown))
+        return await self._orders(command, actor, links)
 
     def _check(self, shown: Sequence[Callable[[TrackerState], Response]]) -> None:
         if self.seen is None:
@@ -274,13 +274,11 @@ class Client:
             told = " or ".join(now)
             raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: look again")
 
-    async def _orders(
-        self, command: Command, caller: Caller, links: dict[str, str]
-    ) -> AcceptedView:
-        if caller.key:
-            by = f"{command.by} ({caller.key})" if command.by else caller.key
+    async def _orders(self, command: Command, actor: Actor, links: dict[str, str]) -> AcceptedView:
+        if actor.key:
+            by = f"{command.by} ({actor.key})" if command.by else actor.key
             command = replace(command, by=by)
-        text = await self.service.submit(command, caller)
+        text = await self.service.submit(command, actor)
         usual = {"state": "/v1/state", "events": "/v1/events"}
         accepted = self.accepted(text, **(links or usual))
         return accepted.model_copy(update={"links": usual | links})
@@ -294,7 +292,7 @@ class Client:
 async def _client_of(request: Request, response: Response, service: ServiceDep) -> Client:
     sent = request.headers
     strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
-    return Client(service, caller_of(request), sent.get("if-match"), strict, response.headers)
+    return Client(service, actor_of(request), sent.get("if-match"), strict, response.headers)
 
 
 ClientDep = Annotated[Client, Depends(_client_of)]
@@ -320,7 +318,9 @@ async def dither(
 
 def _one(matrix_id: str) -> Callable[[TrackerState], Response]:
     """Return what shows a reconstructor."""
-    return lambda state: tagged(known(state.reconstructor(matrix_id), f"reconstructor {matrix_id}"))
+    return lambda state: tagged(
+        found_or_refuse(state.reconstructor(matrix_id), f"reconstructor {matrix_id}")
+    )
 
 
 def _all(state: TrackerState) -> Response:
@@ -340,26 +340,26 @@ _DECIDES: dict[int | str, Any] = {**UNKNOWN, **DECISION}
 
 
 @router.post("/reconstructors/{id}/approve", status_code=202, responses=_DECIDES)
-async def approve(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
+async def approve(client: ClientDep, matrix_id: MatrixId, instruction: Said) -> AcceptedView:
     """Publish a proposed reconstructor."""
-    command = about(Approve, said, id=matrix_id)
+    command = about(Approve, instruction, id=matrix_id)
     return await client.decides(command, _one(matrix_id), reconstructor=_link(matrix_id))
 
 
 @router.post("/reconstructors/{id}/reject", status_code=202, responses=_DECIDES)
-async def reject(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
+async def reject(client: ClientDep, matrix_id: MatrixId, instruction: Said) -> AcceptedView:
     """Discard a proposed reconstructor; the reason is kept with it."""
-    command = about(Reject, said, id=matrix_id)
+    command = about(Reject, instruction, id=matrix_id)
     return await client.decides(command, _one(matrix_id), reconstructor=_link(matrix_id))
 
 
 @router.post("/reconstructors/{id}/publish", status_code=202, responses=_DECIDES)
-async def publish(client: ClientDep, matrix_id: MatrixId, said: Said) -> AcceptedView:
+async def publish(client: ClientDep, matrix_id: MatrixId, instruction: Said) -> AcceptedView:
     """Send a known reconstructor again, under a new id, unless the gate refuses it now.
 
     What has been in use is sent even where the gate cannot judge it: α unknown, or the loop open.
     """
-    command = about(Publish, said, id=matrix_id)
+    command = about(Publish, instruction, id=matrix_id)
     return await client.decides(command, _one(matrix_id), reconstructors=_ALL)
 
 
@@ -393,24 +393,24 @@ async def resume(client: ClientDep, command: Annotated[Resume, body(Resume)]) ->
 
 @router.post("/alarms/{name}/acknowledge", status_code=202, responses={**UNKNOWN})
 async def acknowledge(
-    client: ClientDep, name: AlarmName, said: Annotated[SeenAlarm, body(SeenAlarm)]
+    client: ClientDep, name: AlarmName, instruction: Annotated[SeenAlarm, body(SeenAlarm)]
 ) -> AcceptedView:
     """Say that an alarm is known of: it stays while it lasts; one that is over goes."""
-    return await client.orders(about(AcknowledgeAlarm, said, name=name), alarms="/v1/alarms")
+    return await client.orders(about(AcknowledgeAlarm, instruction, name=name), alarms="/v1/alarms")
 
 
 @router.post("/alarms/{name}/mute", status_code=202, responses={**UNKNOWN})
 async def mute(
-    client: ClientDep, name: AlarmName, said: Annotated[MuteTime, body(MuteTime)]
+    client: ClientDep, name: AlarmName, instruction: Annotated[MuteTime, body(MuteTime)]
 ) -> AcceptedView:
     """Show an alarm no more for a time; what it forbids, it goes on to forbid."""
-    return await client.orders(about(MuteAlarm, said, name=name), alarms="/v1/alarms")
+    return await client.orders(about(MuteAlarm, instruction, name=name), alarms="/v1/alarms")
 
 
 @router.post("/alarms/{name}/unmute", status_code=202, responses={**UNKNOWN})
-async def unmute(client: ClientDep, name: AlarmName, said: Said) -> AcceptedView:
+async def unmute(client: ClientDep, name: AlarmName, instruction: Said) -> AcceptedView:
     """Show an alarm again."""
-    return await client.orders(about(UnmuteAlarm, said, name=name), alarms="/v1/alarms")
+    return await client.orders(about(UnmuteAlarm, instruction, name=name), alarms="/v1/alarms")
 
 
 @router.put("/mode", status_code=202)
@@ -453,7 +453,7 @@ async def acquisition(
 
 @observatory.put("/values/{name}", status_code=202, responses={**UNKNOWN})
 async def value(
-    client: ClientDep, name: AlarmName, said: Annotated[ToldValue, body(ToldValue)]
+    client: ClientDep, name: AlarmName, said: Annotated[ReportedValue, body(ReportedValue)]
 ) -> AcceptedView:
     """Tell a value that operators' own rules ask for; it counts for the time that is said.
 

@@ -27,7 +27,7 @@ from service.errors import PyrcalError, TooLargeError, TooSlowError
 from service.web.problems import Problem, known_problem, problem
 from service.web.stream import ABORT
 
-MOST_BODY_BYTES = 1_000_000
+MAX_BODY_BYTES = 1_000_000
 """Of a request; uploads to be fitted have a limit of their own."""
 
 BODY_S = 20.0
@@ -36,7 +36,7 @@ BODY_S = 20.0
 HALF_OPEN_S = 10.0
 """Longest time a request's head may take, seconds; also for what still comes after the answer."""
 
-MOST_CONNECTIONS = 100
+MAX_CONNECTIONS = 100
 """Beyond it the one that has waited longest, with no request at work, gives way."""
 
 RETRY_S = 5
@@ -109,7 +109,7 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
         If it is beyond the limit, or has not come in time.
     """
     told = request.headers.get("content-length", "")
-    if told.isdecimal() and int(told) > MOST_BODY_BYTES:
+    if told.isdecimal() and int(told) > MAX_BODY_BYTES:
         raise _too_large(f"{int(told) / 1e6:.1f} MB")
     body = bytearray()
     try:
@@ -119,7 +119,7 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
                 if message["type"] == "http.disconnect":
                     return None
                 body += message.get("body", b"")
-                if len(body) > MOST_BODY_BYTES:
+                if len(body) > MAX_BODY_BYTES:
                     raise _too_large("more")
                 if not message.get("more_body", False):
                     return bytes(body)
@@ -128,7 +128,7 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
 
 
 def _too_large(found: str) -> TooLargeError:
-    return TooLargeError(f"body: found {found}, expected at most {MOST_BODY_BYTES / 1e6:.1f} MB")
+    return TooLargeError(f"body: found {found}, expected at most {MAX_BODY_BYTES / 1e6:.1f} MB")
 
 
 def again(body: bytes, receive: Receive) -> Receive:
@@ -154,7 +154,7 @@ def server_config(app: ASGIApp, **options: Any) -> uvicorn.Config:  # noqa: ANN4
 
 async def _busy(scope: Scope, receive: Receive, send: Send) -> None:
     """Answer instead of the application."""
-    detail = f"{MOST_CONNECTIONS} requests are at work, the most there may be: try later"
+    detail = f"{MAX_CONNECTIONS} requests are at work, the most there may be: try later"
     headers = {"Retry-After": str(RETRY_S), "Connection": "close"}
     status = HTTPStatus.SERVICE_UNAVAILABLE
     answer = problem(Request(scope), status, "busy", detail, headers)
@@ -185,7 +185,7 @@ class _Connection(H11Protocol):
         super().connection_made(transport)
         self._since_s = self.loop.time()
         others = [c for c in self.connections if isinstance(c, _Connection) and c.stands]
-        if len(others) > MOST_CONNECTIONS:
+        if len(others) > MAX_CONNECTIONS:
             resting = [c for c in others if c.rests and c is not self]
             if resting:
                 min(resting, key=lambda c: c._since_s).transport.abort()  # noqa: SLF001 - its own
@@ -265,7 +265,7 @@ ONCE = "idempotency-key"
 """Header of whoever may send a request again."""
 
 LONGEST_KEY = 200
-MOST_KEPT = 1000
+MAX_KEPT = 1000
 """Answers that are remembered; the oldest go first."""
 
 LARGEST_KEPT = 100_000
@@ -279,7 +279,7 @@ _Name = tuple[object, str]
 
 
 @dataclass(eq=False, slots=True)
-class _Given:
+class _StoredAnswer:
     """A request with a key, and its answer once there is one."""
 
     print: bytes
@@ -289,7 +289,7 @@ class _Given:
     done: asyncio.Event = field(default_factory=asyncio.Event)
 
 
-class Once(Middleware):
+class Idempotency(Middleware):
     """Answers a POST with an ``Idempotency-Key`` that has been answered as it was answered then.
 
     One that comes while the first is at work waits for its answer. What is remembered is lost
@@ -298,7 +298,7 @@ class Once(Middleware):
 
     def __init__(self, app: ASGIApp) -> None:
         super().__init__(app)
-        self._given: OrderedDict[_Name, _Given] = OrderedDict()
+        self._given: OrderedDict[_Name, _StoredAnswer] = OrderedDict()
 
     @override
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -328,13 +328,13 @@ class Once(Middleware):
                     await send(message)
                 return None
         receive = again(body, request.receive)
-        return await self._carry_out(name, print_, receive, request.scope, send)
+        return await self._perform(name, print_, receive, request.scope, send)
 
-    async def _carry_out(
+    async def _perform(
         self, name: _Name, print_: bytes, receive: Receive, scope: Scope, send: Send
     ) -> None:
         """Hand a request on, and remember what it is answered."""
-        given = _Given(print_)
+        given = _StoredAnswer(print_)
         self._given[name] = given
         heard: list[Message] = []
 
@@ -350,7 +350,7 @@ class Once(Middleware):
             if not given.answer and self._given.get(name) is given:
                 del self._given[name]
             given.done.set()
-            while len(self._given) > MOST_KEPT:
+            while len(self._given) > MAX_KEPT:
                 self._given.popitem(last=False)
 
     async def _refuse(self, request: Request, send: Send, found: str) -> None:
@@ -359,12 +359,12 @@ class Once(Middleware):
         await answer(request.scope, request.receive, send)
 
 
-def _lasts(heard: list[Message]) -> bool:
+def _lasts(messages: list[Message]) -> bool:
     """Return whether an answer is to be given again: whole, small, and of something done."""
-    if not heard or heard[-1].get("more_body", False):
+    if not messages or messages[-1].get("more_body", False):
         return False
-    size = sum(len(message.get("body", b"")) for message in heard)
-    return heard[0]["status"] not in _NOT_DONE and size <= LARGEST_KEPT
+    size = sum(len(message.get("body", b"")) for message in messages)
+    return messages[0]["status"] not in _NOT_DONE and size <= LARGEST_KEPT
 
 
 # --- which request has led to what: an id in its answer and in every line of the log
@@ -376,7 +376,7 @@ _USABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 """An id of the client's own that is harmless in a log."""
 
 
-class Traced(Middleware):
+class RequestId(Middleware):
     """Gives each request an id, the client's own where that can be used.
 
     What is logged while it is at work has the id as ``request_id``, in the tasks it starts, too.

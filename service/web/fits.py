@@ -23,10 +23,10 @@ from service.web.views import (
     ServiceDep,
     answer,
     beside_the_four,
-    known,
-    picture,
+    define_view,
+    found_or_refuse,
     shows,
-    view,
+    to_json,
 )
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
@@ -40,8 +40,10 @@ class FitJobs:
     """Oldest first."""
 
 
-FIT_JOB = view("FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason")
-FIT_JOBS = view("FitJobsView", FitJobs)
+FIT_JOB = define_view(
+    "FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason"
+)
+FIT_JOBS = define_view("FitJobsView", FitJobs)
 
 
 async def _fits_of(request: Request) -> FitQueue:
@@ -252,7 +254,7 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
     if job.document is not None:
         return JSONResponse(dict(job.document))
     ended = job.state in {FitState.FAILED, FitState.GIVEN_UP}
-    return JSONResponse(picture(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
+    return JSONResponse(to_json(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
 
 
 class FitMap(BaseModel):
@@ -301,7 +303,8 @@ async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
     """Return what the figures of a finished fit are drawn from; 404 while there are none."""
     job = fits.job(fit_id)
     return Response(
-        known(job.figures, f"figures of {fit_id}, {job.state}"), media_type="application/json"
+        found_or_refuse(job.figures, f"figures of {fit_id}, {job.state}"),
+        media_type="application/json",
     )
 
 

@@ -17,14 +17,14 @@ from pydantic import BaseModel
 
 from service import __version__
 from service.link.statistics import LinkStatistics
-from service.runtime.snapshot import Pace, Snapshot
-from service.tracking.activity import Occupation, Operation
-from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, Attention, Party, Severity
+from service.runtime.snapshot import Snapshot, WorkerLoad
+from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, AlarmState, Responsible, Severity
 from service.tracking.dither_request import DitherPhase
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
+from service.tracking.running_operations import CurrentOperation, ServiceState
 from service.tracking.state import Mode, TrackerState
-from service.web.admission import OPEN
+from service.web.authentication import OPEN
 from service.web.problems import problem, problem_response
 from service.web.views import ServiceDep
 from service.wire import Pattern
@@ -69,24 +69,24 @@ async def readyz(request: Request, service: ServiceDep) -> ReadyView | Response:
     It asks for more than ``ready`` of the state, which a service without an RTC is, too.
     """
     snapshot = service.snapshot()
-    detail = "; ".join(f"{part}: {text}" for part, text in troubles(snapshot).items() if text)
+    detail = "; ".join(f"{part}: {text}" for part, text in find_problems(snapshot).items() if text)
     if detail:
         return problem(request, HTTPStatus.SERVICE_UNAVAILABLE, "not-ready", detail)
     return ReadyView(ready=True, reason=snapshot.ready_reason)
 
 
-def troubles(snapshot: Snapshot) -> dict[str, str]:
+def find_problems(snapshot: Snapshot) -> dict[str, str]:
     """Return what is the matter with telemetry, archive and worker; empty: nothing."""
     alarms = {alarm.name: alarm.text for alarm in snapshot.tracker.alarms}
-    hindering = [wait for wait in snapshot.waiting_for if wait.hinders]
+    hindering = [wait for wait in snapshot.waiting_for if wait.blocks]
     age_s = snapshot.link.frame_age_s
     stopped = []
     if age_s is None:
         stopped = ["no frame has come from an RTC yet"]
     elif age_s > FRESH_S:
         stopped = [f"the last frame came {age_s:.0f} s ago, expected one within {FRESH_S:g} s"]
-    unusable = [wait.text for wait in hindering if wait.party is not Party.WORKER]
-    lost = [wait.text for wait in hindering if wait.party is Party.WORKER]
+    unusable = [wait.text for wait in hindering if wait.responsible is not Responsible.WORKER]
+    lost = [wait.text for wait in hindering if wait.responsible is Responsible.WORKER]
     return {
         "telemetry": "; ".join([*stopped, *unusable]),
         "archive": alarms.get(ARCHIVE_FAILED, ""),
@@ -157,21 +157,21 @@ class SnapshotCollector(Collector):
         snapshot = self._snapshot()
         tracker = snapshot.tracker
         yield _gauge("build_info", "Version", {__version__: 1}, "version")
-        parts = {part: not text for part, text in troubles(snapshot).items()}
+        parts = {part: not text for part, text in find_problems(snapshot).items()}
         yield _gauge("ready", "1 for each part that does its work; all: /readyz", parts, "part")
         yield _gauge("uptime_seconds", "Since the service started", snapshot.uptime_s)
         refused = "Attempts to write that the disk has refused"
         yield _counter("archive_failures", refused, snapshot.archive_failures)
         waiting = "Lines of the audit trail that are not on the disk yet"
         yield _gauge("archive_waiting", waiting, snapshot.archive_waiting)
-        yield from _of_pace(snapshot.pace)
+        yield from _of_worker_load(snapshot.worker_load)
         yield from _of_link(snapshot.link)
         yield from _of_registration(snapshot)
         yield from _of_the_dither(tracker)
         yield from _of_reconstructors(tracker)
         yield from _of_measurement(snapshot)
         yield from _of_alarms(snapshot)
-        waits = {wait.name: wait.hinders + 1 for wait in snapshot.waiting_for}
+        waits = {wait.name: wait.blocks + 1 for wait in snapshot.waiting_for}
         expected = "1 for what is waited for, 2 where nothing can be done meanwhile"
         yield _gauge("waiting_for", expected, waits, "name")
 
@@ -179,33 +179,33 @@ class SnapshotCollector(Collector):
 def _of_alarms(snapshot: Snapshot) -> Iterator[Metric]:
     lasting, operating = snapshot.alarms, snapshot.operating
     yield _gauge("alarms", "Alarms that last", len(lasting))
-    names = {alarm.note.name: 1 for alarm in lasting}
+    names = {alarm.record.name: 1 for alarm in lasting}
     yield _gauge("alarm", "1 for each alarm that lasts", names, "name")
-    by_severity = Counter(str(alarm.severity) for alarm in lasting if alarm.note.muted is None)
+    by_severity = Counter(str(alarm.severity) for alarm in lasting if alarm.record.muted is None)
     shown = {str(severity): by_severity[severity] for severity in Severity}
     yield _gauge("alarms_shown", "Alarms that last and are not muted", shown, "severity")
-    active = sum(alarm.note.attention is Attention.ACTIVE for alarm in lasting)
+    active = sum(alarm.record.alarm_state is AlarmState.ACTIVE for alarm in lasting)
     yield _gauge("alarms_unacknowledged", "Alarms that last and nobody has acknowledged", active)
     stale = "Alarms that have gone and nobody has acknowledged"
     yield _gauge("alarms_stale", stale, len(snapshot.stale_alarms))
     yield _gauge("alarms_muted", "Alarms that are muted", len(snapshot.muted_alarms))
-    states = _one_of(Operation, operating.operation)
-    yield _gauge("operation", "1 for the state of the service", states, "state")
-    doing = _one_of(Occupation, operating.occupation)
-    yield _gauge("occupation", "1 for what the service does", doing, "occupation")
+    states = _one_of(ServiceState, operating.service_state)
+    yield _gauge("service_state", "1 for the state of the service", states, "state")
+    doing = _one_of(CurrentOperation, operating.current_operation)
+    yield _gauge("current_operation", "1 for what the service does", doing, "current_operation")
 
 
-def _of_pace(pace: Pace) -> Iterator[Metric]:
+def _of_worker_load(load: WorkerLoad) -> Iterator[Metric]:
     text = "Processor time of the worker per second of telemetry, last minute"
-    yield _gauge("worker_load_ratio", text, pace.worker_per_s)
-    yield _gauge("worker_job_load_ratio", f"{text}, by job", pace.by_job, "job")
+    yield _gauge("worker_load_ratio", text, load.worker_per_s)
+    yield _gauge("worker_job_load_ratio", f"{text}, by job", load.by_job, "job")
     text = "Processor time of the service itself per second, last minute"
-    yield _gauge("service_load_ratio", text, pace.service_per_s)
+    yield _gauge("service_load_ratio", text, load.service_per_s)
     busy = "Share of the last minute in which the worker had a job"
-    yield _gauge("worker_busy_ratio", busy, pace.busy_ratio)
-    yield _gauge("window_seconds", "Mean length of the windows of the last minute", pace.window_s)
+    yield _gauge("worker_busy_ratio", busy, load.busy_ratio)
+    yield _gauge("window_seconds", "Mean length of the windows of the last minute", load.window_s)
     late = "Windows of the last minute that were joined to one the worker had no hand free for"
-    yield _gauge("windows_late", late, pace.windows_late)
+    yield _gauge("windows_late", late, load.windows_late)
 
 
 def _of_link(link: LinkStatistics) -> Iterator[Metric]:
@@ -232,14 +232,14 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     yield _counter("windows", "Windows of telemetry, by verdict", windows, "verdict")
     # the last look of each kind
     misfits = {str(entry.source): entry.misfit for entry in tracker.history}
-    if tracker.watchdog is not None:
-        misfits[str(Source.PASSIVE)] = tracker.watchdog.misfit
+    if tracker.passive is not None:
+        misfits[str(Source.PASSIVE)] = tracker.passive.misfit
     explained = "Residual power over what noise explains, last of each kind: 1 is all explained"
     yield _gauge("misfit_ratio", explained, misfits, "source")
     alpha = snapshot.alpha
     if alpha is None:
         return
-    registration = alpha.known
+    registration = alpha.registration
     for name, text, four in (
         ("alpha", "Registration", registration.alpha.vector),
         ("alpha_sigma", "1 sigma, floor included", registration.sigma),
@@ -247,7 +247,7 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
         for parameter, value in zip(_ALPHA, four.tolist(), strict=True):
             yield _gauge(f"{name}_{parameter}", text, value)
     yield _gauge("alpha_age_seconds", "Age of the estimate", alpha.age_s)
-    worth = registration.standing.validity
+    worth = registration.validity.level
     text = "1 for what the estimate is worth"
     yield _gauge("alpha_validity", text, _one_of(Validity, worth), "validity")
     due = tracker.dither_due_since_ns_utc is not None
@@ -257,7 +257,7 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
 
 
 def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
-    dithering = tracker.dithering
+    dithering = tracker.dither_policy
     mean = "Quadratic mean of the dither over ten minutes, OPD"
     yield _gauge("dither_mean_meters", mean, dithering.mean_cost_m)
     yield _gauge("dither_budget_meters", "Largest RMS of all modes together", dithering.budget_m)

@@ -29,7 +29,7 @@ from service.web.commands import AcceptedView, ClientDep, Said, about, body
 from service.web.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.web.problems import COMMAND, INVALID, UNKNOWN
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, known, shows, view
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
 router = APIRouter(
     prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}
@@ -42,19 +42,19 @@ _NOISY = "/v1/noisy-matrix"
 MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
 NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
 
-view(
+define_view(
     "NoisyFindingView",
     NoisyFinding,
     "n_slopes n_frames n_missing snr alpha sigma optical_gain misfit cm_id session created_ns_utc "
     "sha256",
 )
-NOISY = view(
+NOISY = define_view(
     "NoisyView",
     MeasurementRecord,
     "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
     "asked_ns_utc basis_id config_id finding",
 )
-NOISY_MATRICES = view(
+NOISY_MATRICES = define_view(
     "NoisyListView",
     TrackerState,
     "noisy_matrices=noisy",
@@ -115,18 +115,20 @@ async def measurements(service: ServiceDep) -> Response:
 async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
     """Return how a matrix was measured, or how far it is."""
     record = service.snapshot().tracker.measurement(measurement_id)
-    return answer(known(record, f"measurement {measurement_id}"))
+    return answer(found_or_refuse(record, f"measurement {measurement_id}"))
 
 
 @router.delete("/measurements/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def give_up(client: ClientDep, measurement_id: MeasurementId, said: Said) -> AcceptedView:
+async def give_up(
+    client: ClientDep, measurement_id: MeasurementId, instruction: Said
+) -> AcceptedView:
     """Wait no longer for a matrix under way; one that is stored stays.
 
     Nothing on the wire ends the RTC's own work: it may go on to the end, and refuse other commands
     until then. The service ignores what comes of it and asks, as often as it takes, for the loop
     to be closed again if it was closed before.
     """
-    command = about(GiveUp, said, id=measurement_id)
+    command = about(GiveUp, instruction, id=measurement_id)
     return await client.orders(command, measurement=f"{_MEASURED}/{measurement_id}")
 
 
@@ -174,13 +176,13 @@ async def noisy_matrices(service: ServiceDep) -> Response:
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of a noisy matrix, or how far it is."""
     record = service.snapshot().tracker.measurement(noisy_id)
-    return answer(known(record, f"noisy matrix {noisy_id}"), NOISY)
+    return answer(found_or_refuse(record, f"noisy matrix {noisy_id}"), NOISY)
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, said: Said) -> AcceptedView:
+async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, instruction: Said) -> AcceptedView:
     """End a noisy matrix under way, and its dither; one that is stored stays."""
-    command = about(GiveUp, said, id=noisy_id)
+    command = about(GiveUp, instruction, id=noisy_id)
     return await client.orders(command, matrix=f"{_NOISY}/{noisy_id}")
 
 

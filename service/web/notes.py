@@ -10,11 +10,11 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import Field
 
 from service.archive.notes import Annotation
-from service.runtime.keeping import AnnotationChoice
+from service.runtime.telemetry_recorder import AnnotationChoice
 from service.web.commands import AcceptedView, ClientDep, body
 from service.web.problems import COMMAND, INVALID
 from service.web.reading import TimeParameters
-from service.web.views import ServiceDep, answer, shows, view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
 
@@ -34,8 +34,8 @@ class AnnotationParameters(TimeParameters):
     """At most so many, the newest ones."""
 
 
-view("AnnotationView", Annotation)
-ANNOTATIONS = view("AnnotationsView", AnnotationList)
+define_view("AnnotationView", Annotation)
+ANNOTATIONS = define_view("AnnotationsView", AnnotationList)
 
 
 class AnnotationAcceptedView(AcceptedView):
@@ -61,7 +61,7 @@ async def annotate(
     client: ClientDep, choice: Annotated[AnnotationChoice, body(AnnotationChoice)]
 ) -> AnnotationAcceptedView:
     """Note something about a moment: it is kept for ever, in the history and the audit trail."""
-    entry = client.caller.entry("annotation", choice.note, by=choice.by, why=choice.reason)
+    entry = client.actor.entry("annotation", choice.note, by=choice.by, why=choice.reason)
     t_ns = entry.t_ns_utc if choice.t_ns_utc is None else choice.t_ns_utc
     note = Annotation(t_ns_utc=t_ns, written_ns_utc=entry.t_ns_utc, who=entry.who, note=choice.note)
     number = await run_in_threadpool(client.service.archive.annotations.add, note)

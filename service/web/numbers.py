@@ -24,7 +24,7 @@ from service.runtime.supervisor import Supervisor
 from service.tracking.products import MatrixState
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, shows, view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 Numbers = NDArray[np.float32]
 
@@ -245,9 +245,9 @@ class MatrixComparison:
 SHOWN_S = 0.5
 """So long a picture of the slopes serves whoever asks."""
 
-SINGULAR = view("SingularValuesView", SingularValues)
-SLOPES = view("SlopeMapsView", SlopeMaps)
-COMPARISON = view("MatrixComparisonView", MatrixComparison)
+SINGULAR = define_view("SingularValuesView", SingularValues)
+SLOPES = define_view("SlopeMapsView", SlopeMaps)
+COMPARISON = define_view("MatrixComparisonView", MatrixComparison)
 
 
 @router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
@@ -339,11 +339,11 @@ async def slopes(request: Request, service: ServiceDep) -> Response:
     """Return the RMS of the last residual slopes as maps."""
     if service.newest_frames is None:
         raise UnknownIdError("slopes: no telemetry has come yet")
-    shown: SlopesShown = request.app.state.slopes
+    shown: SlopesCache = request.app.state.slopes
     return Response(await run_in_threadpool(shown.body, service), media_type="application/json")
 
 
-class SlopesShown:
+class SlopesCache:
     """The last slopes as they leave, worked out once for all pages: each asks every second."""
 
     def __init__(self) -> None:

@@ -24,9 +24,9 @@ from service.control.gate import LIMIT_M
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
-from service.web.admission import OPEN
+from service.web.authentication import OPEN
 from service.web.connections import Middleware
-from service.web.views import ServiceDep, answer, shows, view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"])
 
@@ -135,7 +135,7 @@ def _with_headers(app: ASGIApp, headers: Mapping[str, str]) -> ASGIApp:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MirrorDrawn:
+class MirrorDrawing:
     """The mirror on the sensor, as far as it can be drawn: lengths in subapertures, centred."""
 
     n_subapertures: int
@@ -165,7 +165,7 @@ class MirrorDrawn:
     told where the actuators are."""
 
 
-MIRROR: Final = view("MirrorView", MirrorDrawn)
+MIRROR: Final = define_view("MirrorView", MirrorDrawing)
 
 
 @router.get("/mirror", responses={200: shows(MIRROR)})
@@ -174,7 +174,7 @@ async def mirror(service: ServiceDep) -> Response:
     instrument = service.instrument
     wfs = instrument.wfs
     return answer(
-        MirrorDrawn(
+        MirrorDrawing(
             n_subapertures=wfs.n_subapertures,
             pupil_diameter_subap=wfs.pupil_diameter,
             obscuration_ratio=instrument.obscuration_ratio,

@@ -16,7 +16,7 @@ from service.archive import Archive, Mark, Night
 from service.archive.nights import FOREVER_NS
 from service.control.gains import ModeGain, gain_table
 from service.errors import CommandError
-from service.runtime.snapshot import GainTableShown
+from service.runtime.snapshot import ModeGainTable
 from service.runtime.supervisor import Supervisor
 from service.tracking.registration import HistoryEntry
 from service.web import views
@@ -29,7 +29,7 @@ from service.web.numbers import (
 )
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, known, shows, tagged, view
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows, tagged
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -178,7 +178,7 @@ def _older(archive: Archive, first_ns: int, last_ns: int, asked: RangeParameters
     if first_ns > last_ns:
         return ()
     if asked.points is not None:
-        return archive.nights.thinned(first_ns, last_ns, asked.points)
+        return archive.nights.downsampled(first_ns, last_ns, asked.points)
     n_most = asked.limit + OF_ONE_TIME
     return archive.nights.estimates(first_ns, last_ns, n_most, newest=asked.after is None)
 
@@ -186,7 +186,7 @@ def _older(archive: Archive, first_ns: int, last_ns: int, asked: RangeParameters
 def _cut(found: History, asked: RangeParameters) -> History:
     """Return as much of what was found as was asked for."""
     if asked.points is not None:
-        return thinned(found, asked.points)
+        return downsample(found, asked.points)
     if asked.after is None:
         return found[-asked.limit :]
     page = found[: asked.limit]
@@ -194,7 +194,7 @@ def _cut(found: History, asked: RangeParameters) -> History:
     return (*page, *(entry for entry in rest if entry.t_ns_utc == page[-1].t_ns_utc))
 
 
-def thinned(history: History, n_points: int) -> History:
+def downsample(history: History, n_points: int) -> History:
     """Return at most so many entries, with the extremes of each parameter in equal parts of time.
 
     A line drawn through them looks like one through all, however short a jump was.
@@ -236,10 +236,10 @@ class MarkParameters(TimeParameters):
     """At most so many, the newest ones."""
 
 
-view("NightView", Night)
-view("MarkView", Mark)
-NIGHTS = view("NightsView", NightList)
-MARKS = view("MarksView", MarkList)
+define_view("NightView", Night)
+define_view("MarkView", Mark)
+NIGHTS = define_view("NightsView", NightList)
+MARKS = define_view("MarksView", MarkList)
 
 
 @router.get("/nights", responses={200: shows(NIGHTS)})
@@ -268,7 +268,7 @@ async def reconstructors(service: ServiceDep) -> Response:
 async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
-    return tagged(known(record, f"reconstructor {matrix_id}"))
+    return tagged(found_or_refuse(record, f"reconstructor {matrix_id}"))
 
 
 @router.get(
@@ -335,14 +335,14 @@ async def gains(service: ServiceDep) -> Response:
 async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the optical gains that were measured when a reconstructor was made, for its modes."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
-    record = known(found, f"reconstructor {matrix_id}")
+    record = found_or_refuse(found, f"reconstructor {matrix_id}")
     return _gain_table(record.id, record.optical_gains, record.n_modes)
 
 
 def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int) -> Response:
     table = gain_table(measured, n_modes)
     return answer(
-        GainTableShown(
+        ModeGainTable(
             reconstructor=matrix_id,
             measured=measured,
             optical_gain=table.optical_gain.tolist(),

@@ -12,12 +12,12 @@ from fastapi.responses import FileResponse
 
 from service.archive.recordings import RecordingRecord
 from service.errors import PyrcalError
-from service.runtime.keeping import RecordingChoice
+from service.runtime.telemetry_recorder import RecordingChoice
 from service.tracking.commands import Instruction
 from service.web.commands import AcceptedView, Client, ClientDep, Said, body
 from service.web.problems import COMMAND, INVALID, UNKNOWN
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, known, shows, view
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
 T = TypeVar("T")
 
@@ -25,18 +25,18 @@ router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID
 
 RecordingId = Annotated[str, Path(alias="id", max_length=128, description="Id of a recording")]
 
-RECORDING = view("RecordingView", RecordingRecord)
+RECORDING = define_view("RecordingView", RecordingRecord)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingsShown:
+class RecordingList:
     """Telemetry that was kept on request."""
 
     recordings: tuple[RecordingRecord, ...]
     """Oldest first."""
 
 
-RECORDINGS = view("RecordingsView", RecordingsShown)
+RECORDINGS = define_view("RecordingsView", RecordingList)
 
 
 class RecordingAcceptedView(AcceptedView):
@@ -46,9 +46,9 @@ class RecordingAcceptedView(AcceptedView):
     """Of the recording."""
 
 
-async def _tried(client: Client, name: str, said: Instruction, order: Awaitable[T]) -> T:
+async def _tried(client: Client, name: str, instruction: Instruction, order: Awaitable[T]) -> T:
     """Wait for an order; it is on record, and so is why it is refused."""
-    entry = client.caller.entry(name, by=said.by, why=said.reason)
+    entry = client.actor.entry(name, by=instruction.by, why=instruction.reason)
     try:
         done = await order
     except PyrcalError as error:
@@ -68,7 +68,7 @@ async def begin(
     ``duration_s`` of 0 nothing else.
     The file is what ``pyrcal sim --replay`` plays and ``pyrcal archive aot`` reads.
     """
-    who = client.caller.entry("", by=choice.by).who
+    who = client.actor.entry("", by=choice.by).who
     recordings = client.service.recordings
     begun = recordings.begin(choice.duration_s, who, choice.reason, choice.before_s)
     made = await _tried(client, "recording.begin", choice, begun)
@@ -81,7 +81,7 @@ async def begin(
 @router.get("/recordings", responses={200: shows(RECORDINGS)})
 async def recordings(service: ServiceDep) -> Response:
     """Return the telemetry that was kept on request, oldest first."""
-    return answer(RecordingsShown(recordings=await run_in_threadpool(service.recordings.all)))
+    return answer(RecordingList(recordings=await run_in_threadpool(service.recordings.all)))
 
 
 @router.get("/recordings/{id}", responses={200: shows(RECORDING), **UNKNOWN})
@@ -89,24 +89,26 @@ async def recording(service: ServiceDep, recording_id: RecordingId) -> Response:
     """Return how far a recording is."""
     every = await run_in_threadpool(service.recordings.all)
     found = next((one for one in every if one.id == recording_id), None)
-    return answer(known(found, f"recording {recording_id}"))
+    return answer(found_or_refuse(found, f"recording {recording_id}"))
 
 
 @router.post("/recordings/{id}/end", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def end(client: ClientDep, recording_id: RecordingId, said: Said) -> AcceptedView:
+async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
     """End a recording before its time; what is in it is kept."""
     recordings = client.service.recordings
-    reason = f"{said.by or client.caller.key or 'an operator'} has ended it"
-    record = await _tried(client, "recording.end", said, recordings.end(reason, recording_id))
+    reason = f"{instruction.by or client.actor.key or 'an operator'} has ended it"
+    record = await _tried(
+        client, "recording.end", instruction, recordings.end(reason, recording_id)
+    )
     text = f"{recording_id} has ended: {record.n_bytes / 1e6:.0f} MB"
     return client.accepted(text, recording=f"/v1/recordings/{recording_id}")
 
 
 @router.delete("/recordings/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def remove(client: ClientDep, recording_id: RecordingId, said: Said) -> AcceptedView:
+async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
     """Remove a recording that has ended: it is gone for good."""
     removed = client.service.recordings.remove(recording_id)
-    await _tried(client, "recording.remove", said, removed)
+    await _tried(client, "recording.remove", instruction, removed)
     return client.accepted(f"{recording_id} is removed", recordings="/v1/recordings")
 
 

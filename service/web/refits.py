@@ -10,13 +10,13 @@ from service.runtime.refits import RefitJob
 from service.tracking.commands import Refit
 from service.web.commands import AcceptedView, ClientDep, body
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.views import ServiceDep, answer, shows, view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what an operator asks of it"], responses={**INVALID})
 
 RefitId = Annotated[str, Path(alias="id", max_length=128, description="Id of a refit")]
 
-REFIT = view("RefitView", RefitJob)
+REFIT = define_view("RefitView", RefitJob)
 
 
 class RefitAcceptedView(AcceptedView):

@@ -9,10 +9,10 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.errors import UnknownIdError
-from service.web.admission import COOKIE, OPEN, caller_of, needs, shown_key
+from service.web.authentication import COOKIE, OPEN, actor_of, needs, shown_key
 from service.web.keys import Key, KeyFile, KeyScope
 from service.web.problems import INVALID, UNKNOWN
-from service.web.views import answer, shows, view
+from service.web.views import answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["who may ask"], responses={**INVALID})
 
@@ -35,9 +35,11 @@ class Holders:
     keys: tuple[Key, ...]
 
 
-SESSION = view("SessionView", Session)
-view("KeyView", Key, "name scope created_ns_utc", "A key, but for what only its owner knows.")
-KEYS = view("KeysView", Holders)
+SESSION = define_view("SessionView", Session)
+define_view(
+    "KeyView", Key, "name scope created_ns_utc", "A key, but for what only its owner knows."
+)
+KEYS = define_view("KeysView", Holders)
 
 
 @router.get("/session", responses={200: shows(SESSION)})
@@ -61,7 +63,7 @@ async def log_in(request: Request) -> Response:
     if request.user is not None and secret is not None:
         safe = request.headers.get("origin", "").startswith("https:")
         answered.set_cookie(COOKIE, secret, secure=safe, httponly=True, samesite="strict")
-        request.app.state.service.audit(caller_of(request).entry("session.begun"))
+        request.app.state.service.audit(actor_of(request).entry("session.begun"))
     return answered
 
 
@@ -85,7 +87,7 @@ async def revoke(request: Request, name: Annotated[str, Path(description="Of the
     if request.user is None:
         raise UnknownIdError(f"key {name!r:.80}: no such key; there are none at all")
     await run_in_threadpool(_file(request).revoke, name)
-    request.app.state.service.audit(caller_of(request).entry("key.revoked", name))
+    request.app.state.service.audit(actor_of(request).entry("key.revoked", name))
 
 
 def _file(request: Request) -> KeyFile:

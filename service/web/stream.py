@@ -17,9 +17,9 @@ from typing_extensions import override
 from service.errors import BusyError
 from service.runtime.supervisor import Supervisor
 from service.tracking.state import LogEntry
-from service.tracking.turn import LOG_LENGTH
+from service.tracking.step_context import LOG_LENGTH
 from service.web.problems import INVALID, problem_response
-from service.web.views import as_json, picture
+from service.web.views import as_json, to_json
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -32,7 +32,7 @@ HEARTBEAT_S = 10.0
 TAKEN_WITHIN_S = 10.0
 """A listener that has not taken a message for so long is dropped: it comes back where it was."""
 
-MOST_LISTENERS = 60
+MAX_LISTENERS = 60
 """Fewer than there may be connections: others want to ask something, too."""
 
 RETRY_MS = 1000
@@ -103,7 +103,7 @@ class Stream:
             if self._log is not snapshot.tracker.log:
                 self._log = snapshot.tracker.log
                 self._ids = _ids(self._log, snapshot.started_ns)
-            shown = picture(snapshot)
+            shown = to_json(snapshot)
             lasting = _without_clocks(shown)
             self._version += lasting != self._lasting
             self._lasting = lasting
@@ -123,7 +123,7 @@ class Stream:
             return _event("reset", b'{"log":"/v1/events"}', self._ids[-1])
         first = self._ids.index(heard)
         lines = zip(self._ids[first + 1 :], (self._log or ())[first:], strict=True)
-        return b"".join(_event("log", as_json(picture(e)), k) for k, e in lines)
+        return b"".join(_event("log", as_json(to_json(e)), k) for k, e in lines)
 
 
 def _ids(log: Log, started_ns: int) -> list[str]:
@@ -151,7 +151,7 @@ def _event(name: str, data: bytes, identity: str = "") -> bytes:
     return head.encode() + b"data: " + data + b"\n\n"
 
 
-class _Listening(StreamingResponse):
+class _EventStream(StreamingResponse):
     """One listener's stream, which is dropped when nobody takes it."""
 
     media_type = "text/event-stream"
@@ -203,6 +203,6 @@ async def stream(
 
     Who comes back with the ``Last-Event-ID`` it has heard gets the lines it has missed.
     """
-    if stream.n_listeners >= MOST_LISTENERS:
-        raise BusyError(f"stream: found {MOST_LISTENERS} listeners, the most there may be")
-    return _Listening(stream, last_event_id)
+    if stream.n_listeners >= MAX_LISTENERS:
+        raise BusyError(f"stream: found {MAX_LISTENERS} listeners, the most there may be")
+    return _EventStream(stream, last_event_id)

@@ -12,7 +12,7 @@ from pydantic import Field
 from service.archive.trends import TREND_S, TrendSample
 from service.web.problems import INVALID
 from service.web.reading import TimeParameters
-from service.web.views import ServiceDep, answer, shows, view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -35,8 +35,8 @@ class TrendParameters(TimeParameters):
     """At most so many of the whole time: of more, the last and the worst in each part of it."""
 
 
-view("TrendSampleView", TrendSample)
-TRENDS = view("TrendsView", TrendList)
+define_view("TrendSampleView", TrendSample)
+TRENDS = define_view("TrendsView", TrendList)
 
 
 @router.get("/trends", responses={200: shows(TRENDS)})

@@ -37,17 +37,17 @@ from service.errors import UnknownIdError
 from service.estimation.comparison import ProbationFinding
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.runtime.snapshot import AlarmShown, Alpha, GainTableShown, Pace, Rtc, Snapshot
+from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
 from service.runtime.supervisor import Supervisor
-from service.tracking.activity import Operating
-from service.tracking.alarms import Alarm, Note, Remark, Waiting
+from service.tracking.alarms import Alarm, AlarmRecord, OperatorNote, Prerequisite
 from service.tracking.commands import GainGroup
-from service.tracking.dither_request import Dither, Dithering, DitherPlan
+from service.tracking.dither_request import Dither, DitherPlan, DitherPolicyState
 from service.tracking.interlocks import Permission
 from service.tracking.loop import LoopCommand
 from service.tracking.mode_limits import ModeLimit, ModeProof
 from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
-from service.tracking.registration import HistoryEntry, Move, Watchdog
+from service.tracking.registration import HistoryEntry, Offload, PassiveState
+from service.tracking.running_operations import Operating
 from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState
 from service.wire import Pointing
 
@@ -60,7 +60,7 @@ _LATEST_NS = 253_402_300_800 * 1_000_000_000
 """RFC 3339 has years of four digits."""
 
 
-class FieldShown(NamedTuple):
+class FieldView(NamedTuple):
     """A field of a picture."""
 
     path: str
@@ -85,7 +85,7 @@ class View:
     text: str
     """What it shows."""
 
-    parts: Mapping[str, FieldShown]
+    parts: Mapping[str, FieldView]
     """By the name each leaves under."""
 
 
@@ -93,7 +93,9 @@ _USUAL: dict[type, View] = {}
 _NAMED: dict[str, View] = {}
 
 
-def view(name: str, record: type, fields_of: str = "", text: str = "", **below: View) -> View:
+def define_view(
+    name: str, record: type, fields_of: str = "", text: str = "", **below: View
+) -> View:
     """Make a view known, and return it.
 
     Parameters
@@ -114,7 +116,7 @@ def view(name: str, record: type, fields_of: str = "", text: str = "", **below: 
     for word in fields_of.split() or [field.name for field in fields(record)]:
         own, _, path = word.rpartition("=")
         own = own or path.rpartition(".")[2]
-        parts[own] = FieldShown(path, attrgetter(path), below.get(own), clock_of(own))
+        parts[own] = FieldView(path, attrgetter(path), below.get(own), clock_of(own))
     text = text or inspect.cleandoc(record.__doc__ or "")
     made = View(name=name, record=record, text=text, parts=parts)
     _NAMED[name] = made
@@ -122,7 +124,7 @@ def view(name: str, record: type, fields_of: str = "", text: str = "", **below: 
     return made
 
 
-def picture(record: object, of: View | None = None) -> dict[str, Any]:
+def to_json(record: object, of: View | None = None) -> dict[str, Any]:
     """Return what JSON can hold of a record, as its usual view or another shows it."""
     of = of or _USUAL[type(record)]
     shown = {}
@@ -137,7 +139,7 @@ def picture(record: object, of: View | None = None) -> dict[str, Any]:
 @lru_cache(maxsize=1500)
 def _lasting(record: HistoryEntry | LogEntry | AuditEntry) -> dict[str, Any]:
     """Return the picture of what is asked for again and again, and never changes."""
-    return picture(record)
+    return to_json(record)
 
 
 def clock_of(name: str) -> str:
@@ -160,7 +162,7 @@ as_json = msgspec.json.Encoder(enc_hook=methodcaller("item")).encode
 
 def answer(record: object, of: View | None = None) -> Response:
     """Return the answer that shows a record."""
-    return Response(as_json(picture(record, of)), media_type="application/json")
+    return Response(as_json(to_json(record, of)), media_type="application/json")
 
 
 def tagged(record: object, of: View | None = None) -> Response:
@@ -170,7 +172,7 @@ def tagged(record: object, of: View | None = None) -> Response:
     return shown
 
 
-def known(record: Record | None, what: str) -> Record:
+def found_or_refuse(record: Record | None, what: str) -> Record:
     """Return the record that was looked up.
 
     Raises
@@ -183,7 +185,7 @@ def known(record: Record | None, what: str) -> Record:
     return record
 
 
-def four(vector: NDArray[np.float64]) -> dict[str, float | None]:
+def named_parameters(vector: NDArray[np.float64]) -> dict[str, float | None]:
     """Return a 4-vector in numeric units under its names and in the units of every boundary."""
     values = (vector * BOUNDARY_SCALE).tolist()
     return {name: finite(value) for name, value in zip(PARAMETERS, values, strict=True)}
@@ -202,14 +204,14 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     if isinstance(value, _LASTING):
         return _lasting(value)
     if isinstance(value, Misregistration):
-        return four(value.vector)
+        return named_parameters(value.vector)
     if isinstance(value, np.ndarray):
-        return four(value)
+        return named_parameters(value)
     if isinstance(value, tuple | list):
         return [_plain(entry, of) for entry in value]
     if isinstance(value, Mapping):
         return {key: _plain(entry, of) for key, entry in value.items()}
-    return picture(value, of)
+    return to_json(value, of)
 
 
 _LASTING = (HistoryEntry, LogEntry, AuditEntry)
@@ -366,133 +368,146 @@ def _for_readers(text: str) -> str:
 # --- what of each record leaves
 
 
-view("PointingView", Pointing)
-view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=scatter t_ns_utc")
-view("VerdictView", GateVerdict)
-view("ExpectedGainView", ExpectedGain)
-view("AssessmentView", Assessment)
-view("ProbationFindingView", ProbationFinding)
-view("ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback")
-view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
-view("ModeProofView", ModeProof, "n_proven contrary_modes own_response_ratio")
-ALPHA = view(
+define_view("PointingView", Pointing)
+define_view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=scatter t_ns_utc")
+define_view("VerdictView", GateVerdict)
+define_view("ExpectedGainView", ExpectedGain)
+define_view("AssessmentView", Assessment)
+define_view("ProbationFindingView", ProbationFinding)
+define_view(
+    "ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback"
+)
+define_view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
+define_view("ModeProofView", ModeProof, "n_proven contrary_modes own_response_ratio")
+ALPHA = define_view(
     "AlphaView",
     Alpha,
-    "known.alpha known.sigma known.floor covariance parameters known.t_ns_utc age_s window_age_s "
-    "known.n_windows known.standing.validity validity_reason=known.standing.reason "
-    "valid_until_ns_utc=known.standing.until_ns_utc known.restored_ns_utc known.jumped_ns_utc "
-    "suspected known.optical_gain known.optical_gains passive_bias passive_bias_sigma "
-    "known.pointing",
+    "registration.alpha registration.sigma registration.floor covariance parameters "
+    "registration.t_ns_utc age_s window_age_s "
+    "registration.n_windows validity=registration.validity.level "
+    "validity_reason=registration.validity.reason "
+    "valid_until_ns_utc=registration.validity.until_ns_utc registration.restored_ns_utc "
+    "registration.jumped_ns_utc "
+    "suspected registration.optical_gain registration.optical_gains passive_bias "
+    "passive_bias_sigma "
+    "registration.pointing",
 )
-view("HistoryEntryView", HistoryEntry)
-HISTORY = view("HistoryView", TrackerState, "entries=history", "The last estimates.")
-view("WatchdogView", Watchdog)
+define_view("HistoryEntryView", HistoryEntry)
+HISTORY = define_view("HistoryView", TrackerState, "entries=history", "The last estimates.")
+define_view("PassiveView", PassiveState)
 
-view("GainGroupView", GainGroup)
-view(
+define_view("GainGroupView", GainGroup)
+define_view(
     "RtcView",
     Rtc,
-    "known.session known.loop known.frame_rate_hz known.delay_frames known.leak gains "
-    "known.n_controlled known.n_modes known.n_slopes known.cm_id known.basis_id known.config_id "
-    "known.magnitude known.max_dither_m known.max_dither_modes t_ns_utc=known.t_ns",
+    "status.session status.loop status.frame_rate_hz status.delay_frames status.leak gains "
+    "status.n_controlled status.n_modes status.n_slopes status.cm_id status.basis_id "
+    "status.config_id "
+    "status.magnitude status.max_dither_m status.max_dither_modes t_ns_utc=status.t_ns",
 )
-view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
-view(
+define_view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
+define_view(
     "DitherView",
     Dither,
     "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
     "request.duration_s start_seq",
 )
-view("DitherPlanView", DitherPlan)
-view(
-    "DitheringView",
-    Dithering,
+define_view("DitherPlanView", DitherPlan)
+define_view(
+    "DitherPolicyView",
+    DitherPolicyState,
     "phase reason budget_m mean_cost_m plan next_ns_utc n_windows_learnt avoided_hz",
 )
-view(
+define_view(
     "AcquisitionView",
     Acquisition,
     "stage text under_way started_ns_utc since_ns_utc held_off commanded n_attempts=attempt alpha "
     "n_modes",
 )
-view("MoveView", Move, "id state text step total n_moves asked_ns_utc")
-RECONSTRUCTOR = view(
+define_view("OffloadView", Offload, "id state text step total n_moves asked_ns_utc")
+RECONSTRUCTOR = define_view(
     "ReconstructorView",
     ReconstructorRecord,
     "id state n_modes created_ns_utc alpha sigma parent origin sha256 condition_number gate reason "
     "published_ns_utc applied_frame_seq",
 )
-RECONSTRUCTORS = view(
+RECONSTRUCTORS = define_view(
     "ReconstructorsView",
     TrackerState,
     "in_use reconstructors",
     "The reconstructors the service remembers.",
 )
-GAINS = view("GainTableView", GainTableShown)
+GAINS = define_view("GainTableView", ModeGainTable)
 
-MEASUREMENT = view(
+MEASUREMENT = define_view(
     "MeasurementView",
     MeasurementRecord,
     "id state reason pattern modes amplitude_m n_average frequency_hz duration_s asked_ns_utc "
     "start_seq created_ns_utc n_slopes double_pass session basis_id config_id sha256",
 )
-MEASUREMENTS = view(
+MEASUREMENTS = define_view(
     "MeasurementsView", TrackerState, "measurements=by_rtc", "Measured interaction matrices."
 )
-MEASURING = view(
+MEASURING = define_view(
     "MeasuringView",
     MeasurementRecord,
     "id state pattern modes asked_ns_utc opens_loop",
     "The interaction matrix being measured: ``/v1/measurements/{id}`` says more.",
 )
-GATHERING = view(
-    "GatheringView",
+NOISY_MEASUREMENT = define_view(
+    "NoisyMeasurementView",
     MeasurementRecord,
     "id state total_m duration_s asked_ns_utc",
     "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
 )
 
-view("RemarkView", Remark)
-view(
+define_view("OperatorNoteView", OperatorNote)
+define_view(
     "AlarmView",
-    AlarmShown,
-    "note.name severity worst_severity=note.worst note.attention note.since_ns_utc note.text cause "
-    "do note.over_ns_utc note.acknowledged note.muted",
+    AlarmStatus,
+    "record.name severity worst_severity=record.worst record.alarm_state record.since_ns_utc "
+    "record.text cause "
+    "do record.over_ns_utc record.acknowledged record.muted",
 )
-view("RaisedView", Alarm, "name since_ns_utc text")
-view("MutedView", Note, "name muted")
-view("OperatingView", Operating)
-view("ObservatoryValueView", ObservatoryValue)
-view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
-EVENTS = view("EventsView", TrackerState, "alarms log", "What happened, and what is wrong now.")
-view("WaitingView", Waiting)
-view("PermissionView", Permission)
-view("PaceView", Pace)
-view(
+define_view("RaisedView", Alarm, "name since_ns_utc text")
+define_view("MutedView", AlarmRecord, "name muted")
+define_view("OperatingView", Operating)
+define_view("ObservatoryValueView", ObservatoryValue)
+define_view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
+EVENTS = define_view(
+    "EventsView", TrackerState, "alarms log", "What happened, and what is wrong now."
+)
+define_view("PrerequisiteView", Prerequisite)
+define_view("PermissionView", Permission)
+define_view("WorkerLoadView", WorkerLoad)
+define_view(
     "LinkView",
     LinkStatistics,
     "rtc_alive session frame_age_s latency_p50_s frames_received frames_lost frames_recovered "
     "frames_duplicate frames_late frames_nonfinite frames_overwritten frames_refused "
     "messages_malformed",
 )
-STATE = view(
+STATE = define_view(
     "StateView",
     Snapshot,
     "tracker.system tracker.mode tracker.stopped_because ready ready_reason now_ns uptime_s "
     "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit "
     "tracker.mode_proof tracker.probation rtc tracker.pointing tracker.basis_id "
-    "tracker.config_id tracker.dither tracker.dithering tracker.vibrations_hz tracker.measuring "
-    "tracker.gathering "
-    "tracker.acquisition tracker.move tracker.loop_command tracker.dither_due_since_ns_utc "
-    "tracker.dither_due_reason tracker.watchdog tracker.unwatched waiting_for operating permitted "
+    "tracker.config_id tracker.dither tracker.dither_policy tracker.vibrations_hz "
+    "tracker.measuring "
+    "tracker.noisy_measurement "
+    "tracker.acquisition tracker.offload tracker.loop_command tracker.dither_due_since_ns_utc "
+    "tracker.dither_due_reason tracker.passive tracker.passive_unavailable_reason waiting_for "
+    "operating permitted "
     "no_return "
-    "tracker.told alarms stale_alarms muted_alarms worst_severity tracker.windows_accepted "
-    "tracker.windows_refused tracker.windows_outlying window_refusal pace link",
+    "tracker.observatory_values alarms stale_alarms muted_alarms worst_severity "
+    "tracker.windows_accepted "
+    "tracker.windows_refused tracker.windows_outlying window_refusal worker_load link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
-    gathering=GATHERING,
+    noisy_measurement=NOISY_MEASUREMENT,
 )
-ALARMS = view(
+ALARMS = define_view(
     "AlarmsView",
     Snapshot,
     "alarms stale_alarms muted_alarms worst_severity",

@@ -314,11 +314,20 @@ def _check_status(status: Status, where: str) -> None:
         raise refusal("flux", flux, "bytes of four square float32 images", where)
 
 
-def _check_acknowledgement(said: Acknowledgement, where: str) -> None:
-    if (said.frame_seq is not None) != (said.state is AckState.APPLIED):
-        raise refusal("frame_seq", said.frame_seq, "a number if and only if applied", where)
-    if said.state is not AckState.REJECTED and (said.id is None or said.sha256 is None):
-        raise refusal("id, sha256", (said.id, said.sha256), "both, unless rejected", where)
+def _check_acknowledgement(acknowledgement: Acknowledgement, where: str) -> None:
+    if (acknowledgement.frame_seq is not None) != (acknowledgement.state is AckState.APPLIED):
+        raise refusal(
+            "frame_seq", acknowledgement.frame_seq, "a number if and only if applied", where
+        )
+    if acknowledgement.state is not AckState.REJECTED and (
+        acknowledgement.id is None or acknowledgement.sha256 is None
+    ):
+        raise refusal(
+            "id, sha256",
+            (acknowledgement.id, acknowledgement.sha256),
+            "both, unless rejected",
+            where,
+        )
 
 
 def _state_fields(values: Map, where: str) -> Map:

@@ -150,8 +150,8 @@ class Staging:
     def void(self) -> None:
         """Forget what has not been applied: a new session begins."""
         self._collected.clear()
-        for matrix_id, said in list(self._said.items()):
-            if said.state is AckState.STAGED:
+        for matrix_id, acknowledgement in list(self._said.items()):
+            if acknowledgement.state is AckState.STAGED:
                 del self._said[matrix_id]
 
     def _collection(self, matrix_id: str) -> _Collection:
@@ -212,13 +212,13 @@ class Staging:
             frame_seq=None,
         )
 
-    def _remember(self, said: Acknowledgement) -> Acknowledgement:
-        if said.id is not None:
-            self._said[said.id] = said
-            self._said.move_to_end(said.id)
+    def _remember(self, acknowledgement: Acknowledgement) -> Acknowledgement:
+        if acknowledgement.id is not None:
+            self._said[acknowledgement.id] = acknowledgement
+            self._said.move_to_end(acknowledgement.id)
         if len(self._said) > _MOST_REMEMBERED:
             self._said.popitem(last=False)
-        return said
+        return acknowledgement
 
 
 def truncated_inverse(interaction: Array32) -> Array32:

@@ -124,9 +124,9 @@ class Matrices(Background):
     def _report(self) -> None:
         """Say what the loop has done since the last time."""
         for matrix_id, seq in self._computer.take_swaps():
-            said = self._staging.applied(matrix_id, seq)
-            if said is not None:
-                self._acknowledge(said)
+            acknowledgement = self._staging.applied(matrix_id, seq)
+            if acknowledgement is not None:
+                self._acknowledge(acknowledgement)
         for measured in self._computer.take_measured():
             self._send(measured)
 
@@ -213,8 +213,8 @@ class Matrices(Background):
         return None
 
     def _carry_out(self, outcome: Outcome) -> None:
-        for said in outcome.said:
-            self._acknowledge(said)
+        for acknowledgement in outcome.said:
+            self._acknowledge(acknowledgement)
         for reconstructor in outcome.staged:
             late = self._plan.active(FaultKind.LATE_SWAP)
             if late is None:
@@ -228,16 +228,16 @@ class Matrices(Background):
         while self._late and self._late[0][0] <= self._plan.now_s:
             self._computer.stage(self._late.pop(0)[1])
 
-    def _acknowledge(self, said: Acknowledgement) -> None:
+    def _acknowledge(self, acknowledgement: Acknowledgement) -> None:
         _log.info(
-            "reconstructor." + said.state,
-            id=said.id,
-            reason=said.reason,
-            frame_seq=said.frame_seq,
+            "reconstructor." + acknowledgement.state,
+            id=acknowledgement.id,
+            reason=acknowledgement.reason,
+            frame_seq=acknowledgement.frame_seq,
         )
         if self._plan.active(FaultKind.MUTE):
             return
-        data = encode(said)
+        data = encode(acknowledgement)
         if self._recorder is not None:
             self._recorder.put(RecordedKind.ACKNOWLEDGEMENT, data)
         acknowledge(self._session, self._keys, data)

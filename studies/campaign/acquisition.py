@@ -21,9 +21,9 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_settings
 from service.config.policy import policy_of
-from service.estimation.openloop import FarEstimate
+from service.estimation.openloop import WideCaptureEstimate
 from service.model.misregistration import BOUNDARY_SCALE
-from service.tracking.events import FarFitted
+from service.tracking.events import WideCaptureFitted
 from service.tracking.state import AcquisitionStage, Mode
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory
@@ -96,7 +96,7 @@ def play(start: Start) -> Row:
             night.advance(_LOOK_S)
             stage = night.state.acquisition.stage
             over_s = (over_s or night.time_s) if stage in _OVER else None
-    acquisition, known = night.state.acquisition, night.state.registration
+    acquisition, registration = night.state.acquisition, night.state.registration
     row: Row = {
         "stage": str(acquisition.stage),
         "text": acquisition.text,
@@ -111,12 +111,14 @@ def play(start: Start) -> Row:
         "log": [entry.text for entry in night.state.log if entry.name.startswith("acquisition")],
     }
     row["far"] = [
-        _far(event.found, night) for _, event in night.events if isinstance(event, FarFitted)
+        _far(event.found, night)
+        for _, event in night.events
+        if isinstance(event, WideCaptureFitted)
     ]
-    if known is not None:
-        error = known.alpha.vector - night.dome.alpha.vector
+    if registration is not None:
+        error = registration.alpha.vector - night.dome.alpha.vector
         row["error"] = (error * BOUNDARY_SCALE).tolist()
-        row["sigma"] = (known.sigma * BOUNDARY_SCALE).tolist()
+        row["sigma"] = (registration.sigma * BOUNDARY_SCALE).tolist()
     row["radii"] = [swap.radius for swap in night.swaps]
     return asdict(start) | row | {"took_s": time.monotonic() - begun}
 
@@ -135,7 +137,7 @@ def _ended(night: Observatory, over_s: float | None) -> bool:
     return not tracking or night.time_s >= over_s + _HOLDS_S
 
 
-def _far(found: FarEstimate, night: Observatory) -> Row:
+def _far(found: WideCaptureEstimate, night: Observatory) -> Row:
     """Return how far off a window with the loop open was, and what it saw."""
     error = found.estimate.alpha.vector - night.dome.alpha.vector
     gains = np.abs(found.estimate.optical_gain)

@@ -23,12 +23,12 @@ from service.config.policy import policy_of
 from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
 from service.tracker import step
-from service.tracking.activity import under_way
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.resume import restored, resumed, saved_of
+from service.tracking.running_operations import under_way
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import new_lines
+from service.tracking.step_context import new_lines
 from studies.campaign.golden_codec import Json, decoded, encoded
 
 FOLDER = Path("tests/data/golden")
@@ -98,21 +98,21 @@ class Teller:
 
 def seen_by_operator(state: TrackerState, now_ns: int) -> dict[str, Json]:
     """Return what an operator sees of a state."""
-    known = state.registration
+    registration = state.registration
     return {
         "mode": state.mode.value,
-        "runs": [running.activity.name for running in under_way(state, now_ns)],
+        "runs": [running.kind.name for running in under_way(state, now_ns)],
         "acquisition": state.acquisition.stage.value,
         "alarms": {alarm.name: alarm.text for alarm in state.alarms},
-        "alpha": None if known is None else known.alpha.vector.tolist(),
-        "sigma": None if known is None else known.sigma.tolist(),
-        "validity": None if known is None else known.standing.validity.value,
+        "alpha": None if registration is None else registration.alpha.vector.tolist(),
+        "sigma": None if registration is None else registration.sigma.tolist(),
+        "validity": None if registration is None else registration.validity.level.value,
         "in use": state.in_use,
         "matrices": {record.id: record.state.value for record in state.reconstructors},
         "measured": {record.id: record.state.value for record in state.by_rtc},
         "noisy": {record.id: record.state.value for record in state.noisy},
         "dither": None if state.dither is None else state.dither.id,
-        "phase": [state.dithering.phase.value, state.dithering.reason],
+        "phase": [state.dither_policy.phase.value, state.dither_policy.reason],
         "loop": None if state.loop_command is None else state.loop_command.state.value,
         "windows": [state.windows_accepted, state.windows_refused, state.windows_outlying],
     }

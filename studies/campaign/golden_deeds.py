@@ -35,7 +35,7 @@ def order(command: Order) -> Do:
 
 def trouble(name: str, text: str = "as it is said", *, over: bool = False) -> Do:
     """Return an alarm of the link, or its end."""
-    return hear(ev.Trouble(name=name, text=text, over=over))
+    return hear(ev.ConditionChanged(name=name, text=text, over=over))
 
 
 def begin(mischief: Mischief) -> Do:
@@ -97,7 +97,7 @@ def vanish(night: GoldenNight) -> None:
 def appear(night: GoldenNight) -> None:
     """Let it be there again."""
     night.silent = False
-    night.post(ev.Noted(name="rtc.appeared", text="the RTC is there"))
+    night.post(ev.LogEvent(name="rtc.appeared", text="the RTC is there"))
 
 
 def approve(night: GoldenNight) -> None:
@@ -128,7 +128,7 @@ def acknowledged(state: AckState, reason: str, name: str | None = LAST) -> Do:
 
     def answer(night: GoldenNight) -> None:
         rtc, last = night.state.rtc, night.state.reconstructors[-1].id
-        said = Acknowledgement(
+        acknowledgement = Acknowledgement(
             session="" if rtc is None else rtc.session,
             id=last if name == LAST else name,
             sha256=None,
@@ -136,7 +136,7 @@ def acknowledged(state: AckState, reason: str, name: str | None = LAST) -> Do:
             reason=reason,
             frame_seq=3 if state is AckState.APPLIED else None,
         )
-        night.post(said)
+        night.post(acknowledgement)
 
     return answer
 

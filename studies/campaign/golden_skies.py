@@ -305,8 +305,14 @@ FAULTS = (
             (31.0, trouble("worker-behind")),
             (33.0, trouble("worker-behind", over=True)),
             (34.0, trouble("columns-misaligned")),
-            (36.0, hear(ev.Noted(name="message.malformed", text="status: 3", level=Level.WARNING))),
-            (36.5, hear(ev.Noted(name="message.malformed", text="status: 4", level=Level.WARNING))),
+            (
+                36.0,
+                hear(ev.LogEvent(name="message.malformed", text="status: 3", level=Level.WARNING)),
+            ),
+            (
+                36.5,
+                hear(ev.LogEvent(name="message.malformed", text="status: 4", level=Level.WARNING)),
+            ),
             (38.0, trouble("commands-off-loop")),
             (40.0, trouble("commands-off-loop", over=True)),
         ),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.estimation.lockin import Spectra, WindowEstimate
+from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.random_dither import Correlated, RandomEstimate
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
@@ -30,7 +30,7 @@ from studies.campaign.telemetry import LINE_FRACTIONS, Arriving, Window, start_d
 from studies.campaign.trouble import options_for, prepare
 
 Array = NDArray[np.float64]
-Outcome = WindowEstimate | RandomEstimate | WindowRefused
+Outcome = LockInEstimate | RandomEstimate | WindowRefused
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -23,8 +23,8 @@ from service.estimation.lockin import Spectra
 from service.estimation.random_dither import Correlated
 from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
-from service.runtime.estimates import Backlog, fitted, listened, watched
-from service.runtime.looks import WATCH_INTERVAL_S
+from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
+from service.runtime.passive_sums import PASSIVE_INTERVAL_S
 from service.runtime.ports import StorePort
 from service.runtime.worker import OpticsWorker
 from service.runtime.workers import PATIENCE_S
@@ -126,7 +126,7 @@ class Observatory:
         system = self.dome.computer.identity.system
         state = TrackerState(system=system, mode=mode)
         self._engine = Engine(state, policy, self, step=self.step)
-        self._engine.prepared(workbench.describe())
+        self._engine.set_description(workbench.describe())
         self.glances: list[Glance] = []
         self.swaps: list[Swap] = []
         self.events: list[tuple[float, Event]] = []
@@ -188,22 +188,22 @@ class Observatory:
     def force(self, matrix: NDArray[np.float32]) -> None:
         """Have the service send a matrix that the gate has never seen as if it had accepted it."""
         state, n_modes = self.state, len(matrix)
-        known, rtc, margin = state.registration, state.rtc, state.margin
-        if known is None or rtc is None or margin is None:
+        registration, rtc, margin = state.registration, state.rtc, state.margin
+        if registration is None or rtc is None or margin is None:
             raise ValueError("force: found no α, no RTC or no verdict; expected a night under way")
         record = ReconstructorRecord(
             id=f"forced-{self.dome.frame}",
             state=MatrixState.PROPOSED,
             n_modes=n_modes,
             created_ns_utc=self.dome.now_ns,
-            alpha=known.alpha,
-            sigma=known.sigma,
+            alpha=registration.alpha,
+            sigma=registration.sigma,
             parent=state.in_use,
             sha256=checksum(matrix),
             gate=margin,
             judged=judged_now(state, commanded_gains(rtc, n_modes)),
         )
-        self._shelf.reconstructors.store(record, matrix, known.total_covariance, {})
+        self._shelf.reconstructors.store(record, matrix, registration.total_covariance, {})
         self._post(ev.MatrixMade(record=record, wanted=True))
 
     def publications(self) -> list[Publication]:
@@ -235,18 +235,18 @@ class Observatory:
         )
 
     def _begin(self) -> None:
-        self._post(ev.Noted(name="service.ready", text="a night in simulated time"))
-        self._hear(ev.Noted(name="rtc.appeared", text="the RTC is there"))
+        self._post(ev.LogEvent(name="service.ready", text="a night in simulated time"))
+        self._hear(ev.LogEvent(name="rtc.appeared", text="the RTC is there"))
         session = self.dome.computer.session
         self._hear(ev.SessionStarted(session=session))
         self._every(self.latencies.status_s, self._hear_status)
         self._every(self.latencies.tick_s, lambda: self._post(ev.Tick()))
-        self._in(WATCH_INTERVAL_S, self._watch)
+        self._in(PASSIVE_INTERVAL_S, self._watch)
 
     def _idle_worker(self) -> None:
         self._jobs: list[tuple[float, int, Callable[[], _Job]]] = []
         self._busy = self._fitting = False
-        self._backlog = Backlog()
+        self._backlog = PendingWindow()
 
     def _at(self, t_ns: int, happen: Callable[[], None]) -> None:
         heapq.heappush(self._agenda, _Due(t_ns, next(self._numbers), happen))
@@ -286,7 +286,7 @@ class Observatory:
             heapq.heappop(self._agenda).happen()
 
     def _hear(self, event: Event) -> None:
-        self._engine.hear(event)
+        self._engine.receive(event)
 
     def _hear_status(self) -> None:
         self._hear(self.dome.status())
@@ -312,12 +312,12 @@ class Observatory:
         self.swaps.append(swap)
 
     def _look(self) -> None:
-        known = self.state.registration
+        registration = self.state.registration
         self.glances.append(
             Glance(
                 time_s=self.time_s,
-                alpha=None if known is None else known.alpha.vector,
-                sigma=None if known is None else known.sigma,
+                alpha=None if registration is None else registration.alpha.vector,
+                sigma=None if registration is None else registration.sigma,
                 alarms=tuple(alarm.name for alarm in self.state.alarms),
             )
         )
@@ -351,12 +351,12 @@ class Observatory:
 
     def _look_at_sums(self) -> _Job:
         sums = self._engine.take_sums()
-        event = asyncio.run(watched(sums, self.state, self._workers))
+        event = asyncio.run(fit_passive(sums, self.state, self._workers))
 
         def done() -> None:
             if event is not None:
                 self._post(event)
-            self._in(WATCH_INTERVAL_S, self._watch)
+            self._in(PASSIVE_INTERVAL_S, self._watch)
 
         return 0.0 if event is None else self.latencies.watch_s, done
 
@@ -392,7 +392,7 @@ class Observatory:
         matrix, record = self._actions.matrix(in_use), self.state.reconstructor(in_use)
         self._engine.learn(in_use, matrix)
         if record is not None:
-            for event in asyncio.run(listened(record, matrix, self.state, self._workers)):
+            for event in asyncio.run(read_own_matrix(record, matrix, self.state, self._workers)):
                 self._in(self.latencies.listen_s, partial(self._post, event))
 
     def _do(self, effect: Effect, state: TrackerState) -> None:
@@ -443,11 +443,11 @@ class Observatory:
                 return "make", wait.make_s
             case ev.JudgeMatrix():
                 return "margin", wait.judge_s
-            case ev.CopyMatrix(judged=True) | ev.JudgeProposal():
+            case ev.RepublishMatrix(judged=True) | ev.JudgeProposal():
                 return "judge", wait.judge_s
             case ev.FetchMatrix():
                 return "", wait.fetch_s
-            case ev.CopyMatrix() | ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
+            case ev.RepublishMatrix() | ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
                 return "", wait.command_s
             case _:
                 raise TypeError(

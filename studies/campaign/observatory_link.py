@@ -73,9 +73,9 @@ class ShortLink:
             self._dome.stage(reconstructor)
         return [self._told(one) for one in outcome.said]
 
-    def _told(self, said: Acknowledgement) -> Acknowledgement:
+    def _told(self, acknowledgement: Acknowledgement) -> Acknowledgement:
         """Return what is heard of it."""
-        return said
+        return acknowledgement
 
 
 class OwnHands:

@@ -12,7 +12,7 @@ from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.recording import SAVE_INTERVAL_S, has_news, is_urgent, leave, taken_up
+from service.runtime.recording import SAVE_INTERVAL_S, is_unsaved, is_urgent, leave, taken_up
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.events import Event
 from service.tracking.resume import restored
@@ -169,7 +169,7 @@ class OtherNight(Observatory):
         before, due = self._saved, self.time_s >= self._saved_s + SAVE_INTERVAL_S
         if archive is None:
             return
-        if before is None or ((due or is_urgent(before, state)) and has_news(before, state)):
+        if before is None or ((due or is_urgent(before, state)) and is_unsaved(before, state)):
             leave(archive, state, self.dome.now_ns)
             self._saved, self._saved_s = state, self.time_s
 

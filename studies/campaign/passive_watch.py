@@ -23,7 +23,7 @@ from service.estimation.lockin import LockIn, LockInPlan, Spectra
 from service.estimation.passive import Passive, accumulate
 from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
-from service.runtime.streams import PASSIVE_MEMORY_S
+from service.runtime.estimator_bank import PASSIVE_MEMORY_S
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.real_time_computer import RealTimeComputer
@@ -156,7 +156,7 @@ class Watch:
 
     def _look(self, t_s: float) -> Iterator[Look]:
         """Look at the passive estimate, and fold it in when a dither has begun the filter."""
-        found = bench_of("flao-lbt").watch(self._passive, self._near)
+        found = bench_of("flao-lbt").fit_passive(self._passive, self._near)
         if found is None:
             return
         # like the service: no two looks share telemetry

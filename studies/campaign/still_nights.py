@@ -23,7 +23,7 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.tracking.events import Event
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import new_lines
+from service.tracking.step_context import new_lines
 from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile, heading, line
 from studies.campaign.small import SETTINGS, SMALL, bench_of, latencies_of

@@ -55,7 +55,7 @@ class Deed:
 
 
 class StrangeNight(Observatory):
-    """A night whose RTC is up to something; ``listening`` only: nothing is asked of it."""
+    """A night whose RTC is up to something; ``telemetry_checks`` only: nothing is asked of it."""
 
     dome: StrangeDome
 

@@ -237,6 +237,6 @@ class StrangeLink(ShortLink):
         return self._strange.applied()
 
     @override
-    def _told(self, said: Acknowledgement) -> Acknowledgement:
+    def _told(self, acknowledgement: Acknowledgement) -> Acknowledgement:
         other = Mischief.OTHER_SHA in self._strange.mischief
-        return replace(said, sha256="0" * 64) if other else said
+        return replace(acknowledgement, sha256="0" * 64) if other else acknowledgement

@@ -187,7 +187,8 @@ def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
 def waits(state: View) -> dict[str, str]:
     """Return what the service waits for, and whom, by name."""
     return {
-        wait["name"]: f"for the {wait['party']}: {wait['text']}" for wait in state["waiting_for"]
+        wait["name"]: f"for the {wait['responsible']}: {wait['text']}"
+        for wait in state["waiting_for"]
     }
 
 

@@ -17,7 +17,7 @@ from studies.demo.arguments import FORWARDED, REPEATED
 from studies.demo.children import children, interrupted_by_any_end
 from studies.demo.report import table
 from studies.demo.truth import TruthFile
-from studies.demo.watch import ANSWER_WITHIN_S, Promise, Watch
+from studies.demo.watch import ANSWER_WITHIN_S, Promise, TelemetryObserver
 
 LOG = "service.log"
 WANTED_RATIO = 1.5
@@ -57,7 +57,7 @@ def run_demo(options: argparse.Namespace) -> int:
         children(options.dir, commands) as started,
     ):
         truth = TruthFile(options.dir / "truth.jsonl")
-        watch = Watch(client, truth, started, _promise(options), _say)
+        watch = TelemetryObserver(client, truth, started, _promise(options), _say)
         try:
             watch.run()
         except KeyboardInterrupt:

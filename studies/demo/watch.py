@@ -110,7 +110,7 @@ class Promise:
     """Wavefront error before over after."""
 
 
-class Watch:
+class TelemetryObserver:
     """Looks at REST and the truth file, and prints."""
 
     def __init__(

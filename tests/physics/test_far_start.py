@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from service.config import packaged_instrument
-from service.files.prepared import Prepared, usual_folder
+from service.files.disk_cache import DiskCache, usual_folder
 from service.model.interaction import InteractionModel
 from sim_rtc.computer.reconstructors import truncated_inverse
 from sim_rtc.options import FAR_MODES, USUAL_MODES, parse_options
@@ -22,7 +22,7 @@ def largest_pole_radius(coupling, options, optical_gain):
 def test_the_matrix_of_a_perfect_registration_holds_120_modes_there_and_loses_400():
     """With the optical gain of the middle mode, .75 of the usual imperfections' .6 to .9."""
     instrument, options = packaged_instrument("flao-lbt"), parse_options(["--far"])
-    model = InteractionModel(instrument, Prepared(usual_folder(os.environ)).basis(instrument))
+    model = InteractionModel(instrument, DiskCache(usual_folder(os.environ)).basis(instrument))
     nominal = model.interaction_matrix(instrument.start)
     rng = np.random.default_rng(7)
     for _ in range(2):

@@ -6,9 +6,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import Activity, under_way
 from service.tracking.interlocks import ALLOWS
 from service.tracking.products import MeasureState
+from service.tracking.running_operations import OperationKind, under_way
 from service.wire import DitherStop
 from tests.unit.tracking.test_activity import (
     ACTIVITIES,
@@ -18,7 +18,12 @@ from tests.unit.tracking.test_activity import (
     strands,
 )
 
-OWNERS = {Activity.MEASURING, Activity.GATHERING, Activity.RAMPING, Activity.ACQUIRING}
+OWNERS = {
+    OperationKind.MEASURING,
+    OperationKind.GATHERING,
+    OperationKind.RAMPING,
+    OperationKind.ACQUIRING,
+}
 """Each has the mirror and the loop to itself. A dither is not one of them: it makes way."""
 
 
@@ -44,7 +49,7 @@ class Operators(RuleBasedStateMachine):
         running = under_way(self.world.state, self.world.now_ns)
         refusal = refused(self.world, command)
         assert "\n" not in refusal
-        forbidding = [one.text for one in running if type(command) not in ALLOWS[one.activity]]
+        forbidding = [one.text for one in running if type(command) not in ALLOWS[one.kind]]
         opens = isinstance(command, cmd.SetLoop) and command.loop == "open"
         if forbidding and not opens:
             assert refusal == forbidding[0]
@@ -60,12 +65,12 @@ class Operators(RuleBasedStateMachine):
 
     @rule(name=st.sampled_from(TROUBLES), over=st.booleans())
     def trouble(self, name, over):
-        self.world.tell(ev.Trouble(name=name, text="found", over=over))
+        self.world.tell(ev.ConditionChanged(name=name, text="found", over=over))
 
     @invariant()
     def the_mirror_has_one_owner(self):
         running = under_way(self.world.state, self.world.now_ns)
-        owners = [one.text for one in running if one.activity in OWNERS]
+        owners = [one.text for one in running if one.kind in OWNERS]
         assert len(owners) <= 1, owners
 
     @rule()
@@ -86,7 +91,7 @@ class Operators(RuleBasedStateMachine):
         if stopped and self.quiet_from is not None:
             assert not [one for one in effects[self.quiet_from :] if not harmless(one)]
             running = under_way(self.world.state, self.world.now_ns)
-            assert not [one for one in running if one.activity in OWNERS - {Activity.RAMPING}]
+            assert not [one for one in running if one.kind in OWNERS - {OperationKind.RAMPING}]
         self.quiet_from = len(effects) if stopped else None
 
     @invariant()

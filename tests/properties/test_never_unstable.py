@@ -11,7 +11,7 @@ from service.tracking import events as ev
 from service.tracking.loop import commanded_gains
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.tracking.worth import why_stale
+from service.tracking.update_policy import verdict_invalid_reason
 from tests.properties.test_tracker_laws import LAWS, Night, commands, heard, ids
 from tests.unit.tracking.situations import ALPHA, moved, record, rtc, verdict
 
@@ -93,7 +93,7 @@ def test_nothing_is_sent_whose_verdict_is_not_yes_or_of_another_loop(story, mode
 def of_now(state, found, effect):
     """Whether the verdict is of the loop and the α there are."""
     gains = effect.gains or commanded_gains(state.rtc, found.n_modes)
-    return why_stale(state, found.judged, gains[: found.n_modes]) is None
+    return verdict_invalid_reason(state, found.judged, gains[: found.n_modes]) is None
 
 
 def test_a_proposal_whose_verdict_has_changed_since_cannot_be_approved():

@@ -17,7 +17,7 @@ from service.tracking.measuring import MEASUREMENTS_KEPT
 from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import LOG_LENGTH
+from service.tracking.step_context import LOG_LENGTH
 from service.wire import (
     DitherRequest,
     LoopRequest,
@@ -142,9 +142,12 @@ heard = st.one_of(
     st.builds(ev.SessionStarted, session=st.sampled_from(SESSIONS)),
     st.just(ev.RtcVanished()),
     st.builds(
-        ev.Trouble, name=st.sampled_from(TROUBLES), text=st.just("found"), over=st.booleans()
+        ev.ConditionChanged,
+        name=st.sampled_from(TROUBLES),
+        text=st.just("found"),
+        over=st.booleans(),
     ),
-    st.builds(ev.Noted, name=st.just("n"), text=st.text(max_size=3)),
+    st.builds(ev.LogEvent, name=st.just("n"), text=st.text(max_size=3)),
     st.just(ev.WindowLost(refused=WindowRefused(reason="r", t_ns_utc=START_NS))),
     st.builds(
         lambda name, passed: ev.MarginJudged(id=name, verdict=verdict(accepted=passed)),
@@ -251,12 +254,12 @@ class Night:
 
     def judged(self, n_modes):
         """What a verdict given now would be of."""
-        known, view = self.state.registration, self.state.rtc
-        return None if known is None or view is None else judged(known, view, n_modes)
+        registration, view = self.state.registration, self.state.rtc
+        return None if registration is None or view is None else judged(registration, view, n_modes)
 
     def of_matrices(self, effect, how):
         match effect:
-            case ev.MakeMatrix() | ev.CopyMatrix() as asked:
+            case ev.MakeMatrix() | ev.RepublishMatrix() as asked:
                 self.n_made += 1
                 state = MatrixState.REFUSED if how == "refused" else MatrixState.PROPOSED
                 n = asked.n_modes if isinstance(asked, ev.MakeMatrix) else 400
@@ -267,7 +270,7 @@ class Night:
                     created_ns_utc=self.now_ns,
                     judged=self.judged(n),
                 )
-                return ev.MatrixMade(record=made, wanted=isinstance(asked, ev.CopyMatrix))
+                return ev.MatrixMade(record=made, wanted=isinstance(asked, ev.RepublishMatrix))
             case ev.FetchMatrix(id=matrix_id):
                 return ev.MatrixFetched(record=foreign(matrix_id or "initial"))
             case ev.JudgeMatrix(id=matrix_id):
@@ -417,7 +420,7 @@ def test_in_hold_nothing_is_made_or_sent_by_itself(story):
         if isinstance(event, COMMANDS):
             continue
         night.tell(event, after_s)
-        assert not of_kind(night.last, ev.MakeMatrix | ev.CopyMatrix | ev.SendMatrix)
+        assert not of_kind(night.last, ev.MakeMatrix | ev.RepublishMatrix | ev.SendMatrix)
 
 
 @LAWS
@@ -427,7 +430,7 @@ def test_in_propose_nothing_is_sent_but_what_an_operator_approved_or_asked_for_a
     for event, after_s in story:
         if isinstance(event, cmd.SetMode):
             continue
-        copied = any(isinstance(effect, ev.CopyMatrix) for effect in night.open[:1])
+        copied = any(isinstance(effect, ev.RepublishMatrix) for effect in night.open[:1])
         night.tell(event, after_s)
         if of_kind(night.last, ev.SendMatrix):
             assert isinstance(event, cmd.Approve) or copied
@@ -454,7 +457,7 @@ def test_a_long_night_fits_in_the_same_memory():
     for number in range(3 * RECONSTRUCTORS_KEPT):
         made = replace(record(f"cm-{number}", MatrixState.REFUSED), created_ns_utc=night.now_ns)
         night.tell(ev.MatrixMade(record=made, wanted=False), 1.0)
-        night.tell(ev.Noted(name="n", text=str(number)), 1.0)
+        night.tell(ev.LogEvent(name="n", text=str(number)), 1.0)
     check_bounds(night.state)
     check_shelf(night.state)
     assert night.state.in_use == "initial"

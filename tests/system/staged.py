@@ -14,8 +14,8 @@ from service.archive import Archive
 from service.config import packaged_instrument
 from service.model.misregistration import Misregistration
 from service.runtime.snapshot import Snapshot
+from service.tracking.alarm_records import record_of
 from service.tracking.alarms import Alarm
-from service.tracking.attention import note_of
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
 from tests.system.cable import free_port
@@ -43,33 +43,33 @@ class StagedService(FakeService):
 
     def acknowledge(self, name, remark):
         """Have somebody know of an alarm."""
-        notes = {note.name: note for note in self.now.tracker.notes}
+        notes = {record.name: record for record in self.now.tracker.alarm_records}
         notes[name] = replace(notes[name], acknowledged=remark)
-        self.change(notes=tuple(notes.values()))
+        self.change(alarm_records=tuple(notes.values()))
 
     def mute(self, name, remark):
         """Have somebody mute an alarm, or nobody any more."""
-        notes = {note.name: note for note in self.now.tracker.notes}
+        notes = {record.name: record for record in self.now.tracker.alarm_records}
         notes[name] = replace(notes[name], muted=remark)
-        self.change(notes=tuple(notes.values()))
+        self.change(alarm_records=tuple(notes.values()))
 
     def over(self, name):
         """End an alarm that nobody has acknowledged."""
         state = self.now.tracker
-        notes = {note.name: note for note in state.notes}
+        notes = {record.name: record for record in state.alarm_records}
         notes[name] = replace(notes[name], over_ns_utc=time.time_ns())
         alarms = tuple(alarm for alarm in state.alarms if alarm.name != name)
-        self.change(notes=tuple(notes.values()), alarms=alarms)
+        self.change(alarm_records=tuple(notes.values()), alarms=alarms)
 
     def calm(self):
         """End all alarms, and forget them."""
-        self.change(alarms=(), notes=())
+        self.change(alarms=(), alarm_records=())
 
     def _note(self):
         state = self.now.tracker
-        notes = {note.name: note for note in state.notes}
-        notes |= {alarm.name: note_of(state, alarm) for alarm in state.alarms}
-        self.change(notes=tuple(notes.values()))
+        notes = {record.name: record for record in state.alarm_records}
+        notes |= {alarm.name: record_of(state, alarm) for alarm in state.alarms}
+        self.change(alarm_records=tuple(notes.values()))
 
 
 def state_of_now(registration=ALPHA):
@@ -117,7 +117,7 @@ def state_of_now(registration=ALPHA):
         alarms=(),
         reconstructors=tuple(made),
         in_use=made[-1].id,
-        proven=frozenset({STATE.rtc.cm_id}),
+        verified_ids=frozenset({STATE.rtc.cm_id}),
         mode_proof=ALL_SHOWN,
         log=tuple(
             replace(line, t_ns_utc=now_ns - (4 - k) * SECOND) for k, line in enumerate(STATE.log)

@@ -16,7 +16,13 @@ import zenoh.ext
 from service.errors import LinkError, UnknownIdError, WireError
 from service.link.matrices import MeasuredMatrix
 from service.rtc_bridge import Bridge, Endpoint
-from service.tracking.events import Noted, RtcVanished, ServicesMet, SessionStarted, Trouble
+from service.tracking.events import (
+    ConditionChanged,
+    LogEvent,
+    RtcVanished,
+    ServicesMet,
+    SessionStarted,
+)
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -257,7 +263,7 @@ def test_malformed_batches_are_counted_reported_once_and_survived(bridge, rtc):
     rtc.send(10)
     assert sequence(drained(bridge, 20)) == list(range(20))
     wait_until(lambda: bridge.statistics().messages_malformed.get("frames") == 7)
-    assert seen.first(Noted, **MALFORMED).text.startswith("frames: ")
+    assert seen.first(LogEvent, **MALFORMED).text.startswith("frames: ")
     assert sum(getattr(e, "name", "") == "message.malformed" for e in seen.events) == 1
     assert bridge.statistics().callback_errors == 0
 
@@ -272,14 +278,14 @@ def test_frames_of_another_basis_or_configuration_are_refused(bridge, rtc):
     blocks = drained(bridge, 20)
     assert sequence(blocks) == [*range(10), *range(30, 40)]
     assert bridge.statistics().frames_refused == {"basis": 10, "config": 10}
-    mismatch = seen.first(Trouble, name="basis-mismatch")
+    mismatch = seen.first(ConditionChanged, name="basis-mismatch")
     assert "are kl-2 and mask-1, expected kl-1 and mask-1" in mismatch.text
 
 
 def test_the_first_basis_seen_is_adopted_when_none_is_pinned(bridge, rtc):
     seen = Seen(bridge)
     rtc.send(0)
-    adopted = seen.first(Noted, name="ids.adopted")
+    adopted = seen.first(LogEvent, name="ids.adopted")
     assert adopted.text == "basis kl-1, configuration mask-1"
     rtc.send(10, basis_id="kl-2")
     wait_until(lambda: bridge.statistics().frames_refused == {"basis": 10})
@@ -364,7 +370,7 @@ def test_a_restarted_rtc_is_a_new_session_counting_from_zero(bridge, endpoint):
     seen = Seen(bridge)
     with FakeRtc(endpoint.listen[0], session="one") as rtc:
         rtc.send(5000)
-        seen.first(Noted, name="rtc.appeared")
+        seen.first(LogEvent, name="rtc.appeared")
         seen.first(SessionStarted, session="one")
         drained(bridge, 10)
     seen.first(RtcVanished)
@@ -379,7 +385,7 @@ def test_a_restarted_rtc_is_a_new_session_counting_from_zero(bridge, endpoint):
 def test_a_killed_rtc_vanishes_within_the_lease(bridge, endpoint):
     seen = Seen(bridge)
     with rtc_process(endpoint, "doomed") as process:
-        seen.first(Noted, 20.0, name="rtc.appeared")
+        seen.first(LogEvent, 20.0, name="rtc.appeared")
         assert bridge.statistics().rtc_alive
         process.kill()
         seen.first(RtcVanished, 4.0)
@@ -395,7 +401,7 @@ def test_interleaved_sessions_are_a_second_rtc(bridge, rtc, endpoint):
             rtc.send(10 * k)
             other.send(10 * k)
             time.sleep(0.1)
-    assert "sessions s1 and s2" in seen.first(Trouble, name="second-rtc").text
+    assert "sessions s1 and s2" in seen.first(ConditionChanged, name="second-rtc").text
     wait_until(lambda: bridge.statistics().frames_refused == {"session": 150})
     assert {b.session for b in bridge.drain()} == {"s1"}
 
@@ -407,7 +413,7 @@ def test_a_status_is_reported_and_a_bad_one_counted(bridge, rtc):
     rtc.send_status(seq=42, magnitude=None)
     assert seen.first(Status) == rtc.status(seq=42, magnitude=None)
     assert bridge.statistics().messages_malformed == {"status": 2}
-    assert "missing: key 'v'" in seen.first(Noted, **MALFORMED).text
+    assert "missing: key 'v'" in seen.first(LogEvent, **MALFORMED).text
 
 
 def tokens(session, key):
@@ -655,7 +661,7 @@ def test_a_measurement_that_failed_says_why(bridge, rtc):
 def test_a_measured_matrix_under_another_name_is_refused(bridge, rtc):
     manifest = measured(rtc, np.zeros((6, 4), np.float32))
     rtc.send_bytes(rtc.keys.measured_commit("im-2"), encode(manifest))
-    event = Seen(bridge).first(Noted, **MALFORMED)
+    event = Seen(bridge).first(LogEvent, **MALFORMED)
     assert "the manifest of im-1 of system bench came on the key of im-2" in event.text
 
 
@@ -663,7 +669,7 @@ def test_a_measured_matrix_with_a_wrong_checksum_is_refused_and_the_next_one_tak
     matrix = np.arange(24, dtype=np.float32).reshape(6, 4)
     seen = Seen(bridge)
     rtc.send_measured(measured(rtc, matrix, layout=layout_of(matrix + 1, 64)), matrix)
-    assert "sha256" in seen.first(Noted, **MALFORMED).text
+    assert "sha256" in seen.first(LogEvent, **MALFORMED).text
     rtc.send_measured(measured(rtc, matrix), matrix)
     assert np.array_equal(seen.first(MeasuredMatrix).matrix, matrix)
 
@@ -750,7 +756,7 @@ def test_a_missing_router_is_one_clear_line(endpoint):
 def test_the_service_can_be_a_client_of_another_router(bridge, endpoint, rtc):
     with Bridge(Endpoint(system=SYSTEM, connect=endpoint.listen)) as client:
         seen = Seen(client)
-        seen.first(Noted, name="rtc.appeared")
+        seen.first(LogEvent, name="rtc.appeared")
         rtc.send(0)
         assert sequence(drained(client, 10)) == list(range(10))
 

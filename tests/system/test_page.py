@@ -128,7 +128,7 @@ def test_by_keys_alone_one_is_rejected_and_not_without_a_reason(page):
     assert page.night.client.get(f"/v1/reconstructors/{name}").json()["reason"] == "not tonight"
     trail = page.night.client.get("/v1/audit").json()["entries"]
     order = next(entry for entry in reversed(trail) if entry["name"] == "Reject")
-    assert (order["who"], order["whence"]) == ("night operator", "page")
+    assert (order["who"], order["channel"]) == ("night operator", "page")
 
 
 def test_by_keys_alone_the_service_goes_back_and_holds(page):
@@ -301,7 +301,7 @@ def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order
     assert page.js("document.cookie") == "", "no script can read it"
     headers = {"Authorization": f"Bearer {order}"}
     trail = page.night.client.get("/v1/audit", headers=headers).json()["entries"]
-    told = [(e["name"], e["who"], e["address"], e["whence"]) for e in trail]
+    told = [(e["name"], e["who"], e["address"], e["channel"]) for e in trail]
     assert ("SetMode.answered", "orders", "127.0.0.1", "page") in told
     assert ("request.wrong-key", "127.0.0.1", "127.0.0.1", "page") in told
     page.click("#who")

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.tracking.alarms import ALARMS, Remark, Severity
+from service.tracking.alarms import ALARMS, OperatorNote, Severity
 from service.tracking.commands import AcknowledgeAlarm, Approve, MuteAlarm
 from service.tracking.products import MatrixState
 from service.wire import Loop
@@ -122,7 +122,7 @@ def test_once_somebody_knows_it_gives_way_but_stays(page):
         name="loop-diverging", severity=Severity.CRITICAL, reason="opening it"
     )
     before = bottom_px(page, "#critical")
-    page.service.acknowledge("loop-diverging", Remark(by="Ada", reason="", t_ns_utc=1))
+    page.service.acknowledge("loop-diverging", OperatorNote(by="Ada", reason="", t_ns_utc=1))
     page.says("#critical", "Ada knows")
     assert bottom_px(page, "#critical") < 0.75 * before
     assert size_px(page, "#critical .cause") == largest_px(page)
@@ -133,7 +133,9 @@ def test_once_somebody_knows_it_gives_way_but_stays(page):
 def test_muted_it_is_a_line_and_no_banner_and_another_one_takes_its_place(page):
     page.service.alarm("loop-diverging", "found")
     page.until("document.querySelector('#critical').checkVisibility()")
-    page.service.mute("loop-diverging", Remark(by="Ada", reason="", t_ns_utc=1, until_ns_utc=1))
+    page.service.mute(
+        "loop-diverging", OperatorNote(by="Ada", reason="", t_ns_utc=1, until_ns_utc=1)
+    )
     page.says("#critical", "muted by Ada until")
     page.says("#critical h2", "⊘ loop-diverging")
     for size in (LAPTOP, NARROW):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.estimation.lockin import WindowEstimate
+from service.estimation.lockin import LockInEstimate
 from service.estimation.windows import ClosedLoop as FitLoop
 from service.files.recording import RecordedKind, Recording
 from service.link.intake import Intake
@@ -47,7 +47,7 @@ class Tracker:
     def __init__(self, instrument):
         self.bench = OpticsWorker(instrument, Compute(threads=1))
         self.engine = Engine(TrackerState(system=instrument.name, mode=Mode.HOLD), POLICY, self)
-        self.engine.prepared(self.bench.describe())
+        self.engine.set_description(self.bench.describe())
         self.now_s = 0.0
         self.intake = Intake(Endpoint(system=instrument.name), clock=lambda: self.now_s)
         self.matrices = {}
@@ -72,12 +72,12 @@ class Tracker:
         self.engine.post(ev.MatrixFetched(record=ReconstructorRecord.brought(manifest)))
 
     def look(self):
-        for heard in self.intake.events():
-            self.engine.hear(heard)
+        for event in self.intake.events():
+            self.engine.receive(event)
         self.engine.feed(self.intake.drain())
 
     def fit(self, window):
-        rtc, known = self.engine.state.rtc, self.engine.state.registration
+        rtc, registration = self.engine.state.rtc, self.engine.state.registration
         loop = FitLoop(
             reconstructor=self.matrices[window.cm_id],
             gains=np.array(rtc.gains),
@@ -85,9 +85,9 @@ class Tracker:
             delay_frames=rtc.delay_frames,
             frame_rate_hz=rtc.frame_rate_hz,
         )
-        start = Misregistration() if known is None else known.alpha
+        start = Misregistration() if registration is None else registration.alpha
         estimate = self.bench.fit(window, loop, start)
-        if isinstance(estimate, WindowEstimate):
+        if isinstance(estimate, LockInEstimate):
             self.estimates.append((window.first_seq, *estimate.alpha.vector))
             self.engine.post(ev.WindowFitted(estimate=estimate))
 

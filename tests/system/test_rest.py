@@ -184,7 +184,7 @@ def test_what_was_stopped_stays_so_though_the_service_is_killed_at_once(night):
     assert released.json()["text"] == "released: mode is auto"
     assert night.state["stopped_because"] == ""
     entries = night.client.get("/v1/audit").json()["entries"]
-    told = [(entry["name"], entry["who"]) for entry in entries if entry["whence"]]
+    told = [(entry["name"], entry["who"]) for entry in entries if entry["channel"]]
     stop, resume = "StopEverything", "Resume"
     assert told[0] == (stop, "Ada")
     assert told[-1] == (resume, "Bob") or told[-1] == (f"{resume}.answered", "Bob")

@@ -153,7 +153,7 @@ def test_a_service_killed_in_a_move_picks_up_where_it_was_and_leads_the_image_ho
     night.rtc(f"--stage=1.2,{patience(3.0):.1f}", "--truth", str(truth), instrument=pixels)
 
     def moves(n):
-        found = night.state["move"]
+        found = night.state["offload"]
         return found if found is not None and found["n_moves"] >= n else None
 
     def true():

@@ -46,8 +46,10 @@ def test_a_slow_worker_gets_longer_windows_and_is_named(night):
         deadline = Deadline(70.0)
         try:
             # what its first joined window is like shows when it is fitted, after the alarm perhaps
-            while "worker-behind" not in night.alarms or night.state["pace"]["window_s"] <= 2.0:
-                assert not deadline.passed, (night.state["pace"], night.alarms)
+            while (
+                "worker-behind" not in night.alarms or night.state["worker_load"]["window_s"] <= 2.0
+            ):
+                assert not deadline.passed, (night.state["worker_load"], night.alarms)
                 os.kill(worker, signal.SIGSTOP)
                 time.sleep(4.7)
                 os.kill(worker, signal.SIGCONT)

@@ -42,7 +42,7 @@ from service.tracking.commands import (
     StartDither,
     StopDither,
 )
-from service.tracking.dither_request import Dither, Dithering, DitherPhase, DitherPlan
+from service.tracking.dither_request import Dither, DitherPhase, DitherPlan, DitherPolicyState
 from service.tracking.events import MakeMatrix
 from service.tracking.loop import CommandState, LoopCommand
 from service.tracking.products import (
@@ -52,14 +52,14 @@ from service.tracking.products import (
     ReconstructorRecord,
 )
 from service.tracking.registration import (
-    Candidate,
     HistoryEntry,
     PassiveBias,
+    PassiveState,
     Registration,
     Source,
-    Standing,
+    SuspectedJump,
     Validity,
-    Watchdog,
+    ValidityState,
 )
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
@@ -177,7 +177,7 @@ STATE = TrackerState(
     ),
     basis_id="kl",
     config_id="b1",
-    dithering=Dithering(
+    dither_policy=DitherPolicyState(
         phase=DitherPhase.SPARSE,
         reason="ordinary telemetry keeps σ between windows",
         budget_m=8e-9,
@@ -193,7 +193,7 @@ STATE = TrackerState(
     ),
     vibrations_hz=(61.0,),
     dither=Dither(request=REQUEST, start_seq=17, asked_ns_utc=5),
-    watchdog=Watchdog(
+    passive=PassiveState(
         alpha=ALPHA,
         sigma=10 * SIGMA,
         misfit=float("nan"),
@@ -325,12 +325,15 @@ async def test_state_shows_everything_at_one_glance(client):
     assert body["margin"]["worst_pole_radius"] == 0.8
     assert (body["rtc"]["frame_rate_hz"], body["rtc"]["magnitude"]) == (1000.0, None)
     assert body["dither"]["modes"] == [501, 450]
-    assert body["dithering"]["phase"] == "sparse"
-    assert body["dithering"]["plan"]["sigma"]["rotation_deg"] == pytest.approx(0.03)
-    assert (body["dithering"]["mean_cost_m"], body["dithering"]["n_windows_learnt"]) == (3e-9, 0)
+    assert body["dither_policy"]["phase"] == "sparse"
+    assert body["dither_policy"]["plan"]["sigma"]["rotation_deg"] == pytest.approx(0.03)
+    assert (body["dither_policy"]["mean_cost_m"], body["dither_policy"]["n_windows_learnt"]) == (
+        3e-9,
+        0,
+    )
     assert body["vibrations_hz"] == [61.0]
-    assert body["watchdog"]["sigma"]["rotation_deg"] == pytest.approx(0.3)
-    assert body["watchdog"]["misfit"] is None
+    assert body["passive"]["sigma"]["rotation_deg"] == pytest.approx(0.3)
+    assert body["passive"]["misfit"] is None
     assert body["alarms"][0]["name"] == "rtc.silent"
     assert (body["windows_accepted"], body["windows_refused"]) == (4, 1)
     assert body["link"]["frames_refused"] == {"basis": 8}
@@ -339,28 +342,32 @@ async def test_state_shows_everything_at_one_glance(client):
 async def test_the_state_of_a_service_that_knows_nothing_is_readable(client, service):
     service.now = replace(service.now, tracker=TrackerState(system="bench"))
     body = await body_of(client, "/v1/state")
-    assert body["rtc"] is body["margin"] is body["dither"] is body["watchdog"] is None
-    assert body["unwatched"] == ""
+    assert body["rtc"] is body["margin"] is body["dither"] is body["passive"] is None
+    assert body["passive_unavailable_reason"] == ""
 
 
 async def test_the_state_says_why_ordinary_telemetry_says_nothing(client, service):
-    silent = replace(STATE, unwatched="no passive estimate: the loop's delay is 1.5 frames")
+    silent = replace(
+        STATE, passive_unavailable_reason="no passive estimate: the loop's delay is 1.5 frames"
+    )
     service.now = replace(service.now, tracker=silent)
-    assert (await body_of(client, "/v1/state"))["unwatched"] == silent.unwatched
+    assert (await body_of(client, "/v1/state"))[
+        "passive_unavailable_reason"
+    ] == silent.passive_unavailable_reason
 
 
 async def test_a_reading_that_cannot_tell_has_no_sigma(client, service):
-    lost = replace(STATE.watchdog, sigma=np.full(4, np.inf), text="it cannot tell")
-    service.now = replace(service.now, tracker=replace(STATE, watchdog=lost))
+    lost = replace(STATE.passive, sigma=np.full(4, np.inf), text="it cannot tell")
+    service.now = replace(service.now, tracker=replace(STATE, passive=lost))
     body = await body_of(client, "/v1/state")
-    assert set(body["watchdog"]["sigma"].values()) == {None}
+    assert set(body["passive"]["sigma"].values()) == {None}
 
 
 async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(client, service):
-    known = replace(
+    registration = replace(
         STATE.registration,
         window_ns_utc=70 * SECOND,
-        standing=Standing(validity=Validity.AGEING, reason="σ grows", until_ns_utc=120 * SECOND),
+        validity=ValidityState(level=Validity.AGEING, reason="σ grows", until_ns_utc=120 * SECOND),
         optical_gains=(ModeGain(mode=501, gain=0.6, sigma=0.01, scatter=0.03, t_ns_utc=1),),
         bias=PassiveBias(
             offset=np.array([0.05, 0.0, np.deg2rad(0.01), 0.0]),
@@ -372,7 +379,7 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
         restored_ns_utc=60 * SECOND,
         jumped_ns_utc=61 * SECOND,
     )
-    service.change(registration=known)
+    service.change(registration=registration)
     body = await body_of(client, "/v1/alpha")
     assert (body["validity"], body["validity_reason"]) == ("ageing", "σ grows")
     assert body["valid_until_ns_utc"] == 120 * SECOND
@@ -408,14 +415,14 @@ async def test_alpha_of_which_little_is_known_says_null(client):
 
 
 async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, service):
-    candidate = Candidate(
+    candidate = SuspectedJump(
         alpha=replace(ALPHA, shift_x_subap=0.5),
         covariance=np.diag(SIGMA**2),
         t_ns_utc=95 * SECOND,
         held_ns_utc=95 * SECOND,
     )
     service.change(
-        registration=replace(STATE.registration, candidate=candidate, doubt="a jump"),
+        registration=replace(STATE.registration, suspected_jump=candidate, doubt="a jump"),
         dither_due_since_ns_utc=95 * SECOND,
         dither_due_reason="a jump",
         windows_outlying=3,
@@ -442,8 +449,8 @@ async def test_history_is_the_newest_entries_oldest_first(client):
 
 async def test_the_last_goodness_of_fit_of_each_kind_is_measured(client, service):
     last = replace(entry(9), misfit=1.4, source=Source.RANDOM)
-    seen = replace(STATE.watchdog, misfit=0.8)
-    service.change(history=(*STATE.history, last, replace(last, misfit=1.3)), watchdog=seen)
+    seen = replace(STATE.passive, misfit=0.8)
+    service.change(history=(*STATE.history, last, replace(last, misfit=1.3)), passive=seen)
     metrics = (await client.get("/metrics")).text
     found = {source: f'pyrcal_misfit_ratio{{source="{source}"}}' for source in Source}
     assert f"{found[Source.LOCK_IN]} 1.2" in metrics

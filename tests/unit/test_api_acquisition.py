@@ -7,7 +7,7 @@ import pytest
 from service.errors import CommandError
 from service.tracking.commands import AbortAcquisition, Acquire
 from service.tracking.state import Acquisition, AcquisitionStage
-from service.web.views import picture
+from service.web.views import to_json
 from tests.unit.obedient import Obedient
 from tests.unit.tracking.situations import ALPHA
 
@@ -42,7 +42,7 @@ async def test_one_that_cannot_begin_says_why(client, service):
 
 def test_the_view_tells_stage_and_what_was_found_in_degrees():
     under_way = Acquisition(stage=AcquisitionStage.CONFIRMING, text="looking", attempt=1)
-    shown = picture(replace(under_way, alpha=ALPHA))
+    shown = to_json(replace(under_way, alpha=ALPHA))
     assert (shown["stage"], shown["under_way"], shown["n_attempts"]) == ("confirming", True, 1)
     assert shown["alpha"]["rotation_deg"] == pytest.approx(0.2)
-    assert picture(Acquisition())["alpha"] is None
+    assert to_json(Acquisition())["alpha"] is None

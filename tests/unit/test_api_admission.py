@@ -12,7 +12,7 @@ import uvicorn
 
 from service.api import create_app
 from service.web import connections
-from service.web.admission import Hosts
+from service.web.authentication import Hosts
 from service.web.connections import server_config
 from tests.system.pace import in_time
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
@@ -259,7 +259,7 @@ def has_ended(line):
 
 
 async def test_half_open_connections_give_way_to_the_operator(service, monkeypatch):
-    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 20)
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 20)
     async with serving(service) as port:
         held = [socket.create_connection(("127.0.0.1", port)) for _ in range(60)]  # all at once
         for line in held:
@@ -276,7 +276,7 @@ async def test_half_open_connections_give_way_to_the_operator(service, monkeypat
 async def test_too_many_requests_at_work_are_answered_503_with_when_to_come_again(
     service, monkeypatch
 ):
-    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 3)
     head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
     async with serving(service) as port:
         held = [await connected(port, head) for _ in range(3)]

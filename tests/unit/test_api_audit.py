@@ -40,7 +40,7 @@ def service(tmp_path):
                 who="Ada" if k % 2 else "service",
                 name=f"entry-{k}",
                 text="=1+1" if k == 3 else "a, b",
-                whence="page" if k % 2 else "",
+                channel="page" if k % 2 else "",
                 why="clouds\u2028",
             )
             for k in range(N_ENTRIES)
@@ -65,7 +65,7 @@ async def test_the_newest_come_without_a_word_oldest_first(client):
         "name": "entry-0",
         "text": "a, b",
         "address": "",
-        "whence": "",
+        "channel": "",
         "why": "clouds\\u2028",
         "answer": "",
         "id": 1,
@@ -135,7 +135,7 @@ async def test_an_export_has_all_of_it_whatever_a_page_holds(client, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("headers", "whence"),
+    ("headers", "channel"),
     [
         ({}, "rest"),
         ({"User-Agent": "curl/8"}, "rest"),
@@ -144,7 +144,7 @@ async def test_an_export_has_all_of_it_whatever_a_page_holds(client, monkeypatch
         ({"Sec-Fetch-Site": "same-origin"}, "page"),
     ],
 )
-async def test_an_order_says_who_why_and_where_from(client, service, headers, whence):
+async def test_an_order_says_who_why_and_where_from(client, service, headers, channel):
     said = {"reason": "too many modes", "by": "Ada"}
     for method, path, body in (
         ("POST", "/v1/rollback", {}),
@@ -157,7 +157,7 @@ async def test_an_order_says_who_why_and_where_from(client, service, headers, wh
         assert answer.json()["text"] == "so it is"
     for command, caller in service.asked:
         assert (command.reason, command.by) == ("too many modes", "Ada")
-        assert (caller.address, caller.whence) == ("127.0.0.1", whence)
+        assert (caller.address, caller.channel) == ("127.0.0.1", channel)
     assert len(service.asked) == 4
 
 

@@ -10,8 +10,8 @@ import pytest
 from fastapi import Request
 
 from service.api import create_app
-from service.web import admission, stream
-from service.web.admission import COOKIE, Failures, Hosts, Refusal, Refusals
+from service.web import authentication, stream
+from service.web.authentication import COOKIE, Failures, Hosts, Refusal, Refusals
 from service.web.keys import KeyFile, KeyScope
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.test_api_admission import serving
@@ -139,8 +139,8 @@ async def test_without_key_with_a_wrong_one_or_from_a_foreign_page_0_succeed_and
         for scope in KeyScope
         if security and not scope.covers(KeyScope(security[0]["bearer"][0]))
     ]
-    monkeypatch.setattr(admission, "MOST_FAILURES", len(asked))
-    monkeypatch.setattr(admission, "MOST_TOLD", len(asked))
+    monkeypatch.setattr(authentication, "MOST_FAILURES", len(asked))
+    monkeypatch.setattr(authentication, "MOST_TOLD", len(asked))
     for method, path, headers, status, kind in asked:
         response = await client.request(method, as_asked(path), headers=headers)
         assert_problem(response, status, kind)
@@ -285,7 +285,7 @@ async def test_a_flood_of_refusals_is_counted_not_written():
 
 
 async def test_who_tries_keys_is_told_to_wait_and_who_has_one_is_not_locked_out(client, secrets):
-    for _ in range(admission.MOST_FAILURES):
+    for _ in range(authentication.MOST_FAILURES):
         assert_problem(await client.get("/v1/state", headers=bearer("guess")), 401, "wrong-key")
     answer = await client.get("/v1/state", headers=bearer("guess"))
     assert_problem(answer, 429, "too-many", "more than 10 wrong keys")
@@ -297,7 +297,7 @@ async def test_who_tries_keys_is_told_to_wait_and_who_has_one_is_not_locked_out(
 
 def test_failures_are_counted_by_address_for_a_while_and_in_bounded_memory(monkeypatch):
     now_s = 1000.0
-    monkeypatch.setattr(admission.time, "monotonic", lambda: now_s)
+    monkeypatch.setattr(authentication.time, "monotonic", lambda: now_s)
     failures = Failures()
     assert [failures.count("10.0.0.7") for _ in range(12)] == [0] * 10 + [60, 60]
     assert failures.count("10.0.0.8") == 0
@@ -311,7 +311,7 @@ def test_failures_are_counted_by_address_for_a_while_and_in_bounded_memory(monke
     assert failures.count("2001:db8:0:1::1") == 0
     for k in range(5000):
         failures.count(f"10.1.{k // 256}.{k % 256}")
-    assert len(failures._of) == admission.MOST_ADDRESSES
+    assert len(failures._of) == authentication.MAX_ADDRESSES
 
 
 # --- the page

@@ -11,7 +11,7 @@ from service.model.misregistration import Misregistration
 from service.tracking.commands import GiveUp, MeasureNoisy
 from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
 from service.tracking.state import TrackerState
-from service.web.views import GATHERING, picture
+from service.web.views import NOISY_MEASUREMENT, to_json
 from tests.unit.obedient import Obedient
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
@@ -171,7 +171,9 @@ async def test_no_route_publishes_one(client, service, action):
 async def test_the_state_shows_the_one_under_way(client):
     shown = (await client.get("/v1/noisy-matrix/noisy-2")).json()
     assert shown["state"] == "running"
-    state = picture(TrackerState(system="x", measurements=(RUNNING,)).gathering, GATHERING)
+    state = to_json(
+        TrackerState(system="x", measurements=(RUNNING,)).noisy_measurement, NOISY_MEASUREMENT
+    )
     found = (state["id"], state["state"], state["duration_s"])
     assert found == ("noisy-2", MeasureState.RUNNING, 30.0)
 

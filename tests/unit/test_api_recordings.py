@@ -6,10 +6,10 @@ import json
 import pytest
 
 from pyrcal.__main__ import main
-from service.archive.retention import Keeping, due, items
+from service.archive.retention import RetentionPolicy, due, items
 from service.files.recording import RecordedKind, Recording
-from service.runtime import keeping
-from service.runtime.keeping import TelemetryKeeper
+from service.runtime import telemetry_recorder
+from service.runtime.telemetry_recorder import TelemetryRecorder
 from tests.unit.test_api import assert_problem, service
 
 __all__ = ["service"]  # a fixture
@@ -30,11 +30,11 @@ class Tap:
 
 @pytest.fixture
 def keeper(service, monkeypatch):
-    monkeypatch.setattr(keeping, "LOOK_S", 0.01)
+    monkeypatch.setattr(telemetry_recorder, "LOOK_S", 0.01)
     tap = Tap()
-    service.recordings = TelemetryKeeper(
+    service.recordings = TelemetryRecorder(
         archive=service.archive,
-        keeping=Keeping(),
+        retention=RetentionPolicy(),
         system="small",
         tap=tap,
         audit=service.audit,
@@ -116,9 +116,9 @@ async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, 
     name = await begun(client)
     keeper.tap.recorder.put(RecordedKind.FRAMES, bytes(2000))
     if limit == "full":
-        monkeypatch.setattr(keeper, "_keeping", Keeping(reserve_gb=1e9))
+        monkeypatch.setattr(keeper, "_keeping", RetentionPolicy(reserve_gb=1e9))
     else:
-        monkeypatch.setattr(keeping, limit, 1e-6)
+        monkeypatch.setattr(telemetry_recorder, limit, 1e-6)
     running = asyncio.create_task(keeper.run())
     await ended_by_itself(client, name)
     running.cancel()
@@ -128,7 +128,7 @@ async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, 
 
 
 async def test_a_disk_almost_full_takes_none(client, service, keeper, monkeypatch):
-    monkeypatch.setattr(keeper, "_keeping", Keeping(reserve_gb=1e9))
+    monkeypatch.setattr(keeper, "_keeping", RetentionPolicy(reserve_gb=1e9))
     refused = await client.post("/v1/recordings", json=WANTED)
     assert_problem(refused, 409, "not-now", "nothing is recorded", "are free in")
     assert "are free in" in service.audited[-1].answer
@@ -143,7 +143,7 @@ async def test_it_stays_until_somebody_removes_it_and_no_matrix_goes_for_it(
     every = items(service.archive)
     (item,) = [one for one in every if one.kind == "recording"]
     assert item.kept_because == "asked for by Ada: strange edge"
-    assert not list(due(every, Keeping(keep_days=1e-9, keep_gb=1e-9), 2**62))
+    assert not list(due(every, RetentionPolicy(keep_days=1e-9, keep_gb=1e-9), 2**62))
     shown = ["archive", "show", name, "--data-dir", str(service.archive.directory)]
     capsys.readouterr()  # of the log
     assert main([*shown, "--json"]) == 0

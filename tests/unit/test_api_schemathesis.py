@@ -22,8 +22,8 @@ from service.files.fit_folder import FitRequest
 from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
-from service.web import admission
-from service.web.admission import Hosts
+from service.web import authentication
+from service.web.authentication import Hosts
 from service.web.keys import KeyFile, KeyScope
 from tests.unit.runtime.handmade import STATE, Clock, HandmadeBridge
 from tests.unit.runtime.small import small_instrument
@@ -86,12 +86,12 @@ def app(tmp_path, monkeypatch):
             archive=archive,
             actions=actions,
         )
-        limits = FitLimits(most_bytes=10_000, waiting=10_000, seconds=1)
+        limits = FitLimits(max_bytes=10_000, waiting=10_000, seconds=1)
         request = FitRequest(
             asked={},
             own_instrument="small",
             own_sha256="",
-            most_bytes=10_000,
+            max_bytes=10_000,
             threads=1,
             nice=0,
             memory_mb=500,
@@ -100,7 +100,7 @@ def app(tmp_path, monkeypatch):
             folder=tmp_path, program=("false",), request=request, limits=limits, clock_ns=Clock()
         )
         # it sends hundreds of wrong keys, and expects 401 for each: 429 has a test of its own
-        monkeypatch.setattr(admission, "MOST_FAILURES", 100_000)
+        monkeypatch.setattr(authentication, "MOST_FAILURES", 100_000)
         hosts = Hosts(allowed=("testserver",))
         yield create_app(supervisor, desk, hosts=hosts, keys=KeyFile(tmp_path))
 

@@ -12,7 +12,7 @@ import uvicorn
 
 from service.api import create_app
 from service.tracking.state import Level, LogEntry
-from service.tracking.turn import LOG_LENGTH
+from service.tracking.step_context import LOG_LENGTH
 from service.web import stream
 from service.web.connections import server_config
 from tests.system.pace import patience
@@ -203,7 +203,7 @@ async def test_a_stream_ends_at_once_with_the_service(service):
 
 async def test_one_that_takes_nothing_is_dropped_and_leaves_no_place_taken(service, monkeypatch):
     monkeypatch.setattr(stream, "TAKEN_WITHIN_S", 0.3)
-    service.change(unwatched="long " * 100_000)
+    service.change(passive_unavailable_reason="long " * 100_000)
     async with serving(service) as listening:
         reader, writer = await asyncio.open_connection("127.0.0.1", listening.port, limit=1000)
         writer.write(b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -215,14 +215,14 @@ async def test_one_that_takes_nothing_is_dropped_and_leaves_no_place_taken(servi
             k = 0
             while streams.n_listeners:
                 k += 1
-                service.change(unwatched="long " * 100_000 + str(k))
+                service.change(passive_unavailable_reason="long " * 100_000 + str(k))
                 await asyncio.sleep(0.05)
         writer.close()
         del reader
 
 
 async def test_more_than_there_may_be_are_told_to_come_later(service, monkeypatch):
-    monkeypatch.setattr(stream, "MOST_LISTENERS", 1)
+    monkeypatch.setattr(stream, "MAX_LISTENERS", 1)
     async with serving(service) as listening, listening() as listener:
         await listener.event("state")
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{listening.port}") as client:

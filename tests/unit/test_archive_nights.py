@@ -17,7 +17,7 @@ from service.errors import ArchiveError, StorageError, TooLargeError
 from service.model.misregistration import Misregistration
 from service.tracking.registration import HistoryEntry, Source
 from service.tracking.state import TrackerState
-from service.web.reading import thinned
+from service.web.reading import downsample
 
 SECOND = 1_000_000_000
 NOON = 20_000 * DAY_NS + 12 * HOUR_NS
@@ -97,13 +97,13 @@ def test_of_many_the_same_are_kept_as_of_those_in_memory(archive, monkeypatch):
         for k, value in enumerate(values)
     )
     archive.record((), (), every)
-    found = archive.nights.thinned(0, 2 * NOON, 400)
+    found = archive.nights.downsampled(0, 2 * NOON, 400)
     assert 200 < len(found) <= 400
-    assert [one.t_ns_utc for one in found] == [one.t_ns_utc for one in thinned(every, 400)]
-    assert len(archive.nights.thinned(NOON, NOON + 99 * SECOND, 400)) == 100
-    monkeypatch.setattr(of_nights, "MOST_THINNED", 2999)
+    assert [one.t_ns_utc for one in found] == [one.t_ns_utc for one in downsample(every, 400)]
+    assert len(archive.nights.downsampled(NOON, NOON + 99 * SECOND, 400)) == 100
+    monkeypatch.setattr(of_nights, "MAX_DOWNSAMPLED", 2999)
     with pytest.raises(TooLargeError, match="found 3000 estimates in this time, expected at most"):
-        archive.nights.thinned(0, 2 * NOON, 400)
+        archive.nights.downsampled(0, 2 * NOON, 400)
 
 
 @pytest.mark.parametrize(("noon_utc_h", "n_before", "n_after"), [(12, 2, 10), (19, 9, 3)])
@@ -222,7 +222,7 @@ async def test_nights_and_marks_are_told_over_http(client):
 
 
 async def test_too_much_at_once_is_refused_with_what_to_do(client, monkeypatch):
-    monkeypatch.setattr(of_nights, "MOST_THINNED", 5)
+    monkeypatch.setattr(of_nights, "MAX_DOWNSAMPLED", 5)
     answer = await client.get("/v1/alpha/history?points=8")
     assert answer.status_code == 413
     assert "ask for less of it" in answer.json()["detail"]

@@ -95,7 +95,7 @@ def test_the_audit_trail_goes_on_in_the_same_file_and_is_widened_once(archive, f
         name="Reject.refused",
         text='{"id":"cm-1"}',
         address="10.0.0.7",
-        whence="page",
+        channel="page",
         why="too many modes",
         answer="cm-1 is discarded, not proposed",
     )

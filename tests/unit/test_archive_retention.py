@@ -17,7 +17,7 @@ from pyrcal.__main__ import main
 from service.api import create_app
 from service.archive import Archive, Pin, retention
 from service.archive.nights import DAY_NS
-from service.archive.retention import Keeping, due, items
+from service.archive.retention import RetentionPolicy, due, items
 from service.errors import UnknownIdError
 from service.runtime import recording
 from service.tracking.alarms import Alarm
@@ -51,7 +51,7 @@ def archive(tmp_path):
 
 
 def going(archive, in_use=(), **keeping):
-    return [item.id for item, _ in due(items(archive, in_use), Keeping(**keeping), NOW)]
+    return [item.id for item, _ in due(items(archive, in_use), RetentionPolicy(**keeping), NOW)]
 
 
 def test_nothing_goes_unless_somebody_has_said_so(archive):
@@ -143,7 +143,9 @@ async def kept_for_a_moment(archive, keeping, state, monkeypatch):
 async def test_a_running_service_removes_what_is_old_and_says_so(archive, quick, monkeypatch):
     archive.pin(Pin(id="cm-01", who="Ada", why="mine"))
     state = TrackerState(system="small", in_use="cm-00")
-    told, lines = await kept_for_a_moment(archive, Keeping(keep_days=26.5), state, monkeypatch)
+    told, lines = await kept_for_a_moment(
+        archive, RetentionPolicy(keep_days=26.5), state, monkeypatch
+    )
     assert told == []
     assert [(line.who, line.name) for line in lines] == [("service", "archive.removed")]
     assert lines[0].text == "reconstructor cm-02: numbers removed, 27 days old, keep_days is 26.5"
@@ -153,17 +155,19 @@ async def test_little_room_is_an_alarm_until_there_is_more(archive, quick, monke
     usage = SimpleNamespace(free=1_900_000_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
     state = TrackerState(system="small")
-    told, _ = await kept_for_a_moment(archive, Keeping(reserve_gb=2.0), state, monkeypatch)
+    told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), state, monkeypatch)
     assert "1.9 GB are free" in told[0].text
     assert (told[0].name, told[0].over) == ("disk-low", False)
     raised = replace(state, alarms=(Alarm(name="disk-low", since_ns_utc=1, text=""),))
     usage.free = 2_100_000_000  # not a tenth more: it would come and go
-    told, _ = await kept_for_a_moment(archive, Keeping(reserve_gb=2.0), raised, monkeypatch)
+    told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), raised, monkeypatch)
     assert not told[0].over
     usage.free = 2_300_000_000
-    told, _ = await kept_for_a_moment(archive, Keeping(reserve_gb=2.0), raised, monkeypatch)
+    told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), raised, monkeypatch)
     assert told[0].over
-    assert (await kept_for_a_moment(archive, Keeping(reserve_gb=2.0), state, monkeypatch))[0] == []
+    assert (await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), state, monkeypatch))[
+        0
+    ] == []
 
 
 # --- over HTTP

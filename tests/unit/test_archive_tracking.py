@@ -64,7 +64,9 @@ def test_there_is_nothing_before_the_first_night(file):
 def test_what_is_read_is_what_was_written_but_for_what_depends_on_the_time(file, saved):
     file.write(saved)
     found = file.read()
-    fresh = {f.name: f.default for f in fields(Registration) if f.name in {"standing", "candidate"}}
+    fresh = {
+        f.name: f.default for f in fields(Registration) if f.name in {"validity", "suspected_jump"}
+    }
     expected = replace(saved, registration=replace(saved.registration, grown=np.zeros(4), **fresh))
     for f in fields(Registration):
         left, right = getattr(found.registration, f.name), getattr(expected.registration, f.name)

@@ -206,7 +206,7 @@ def test_the_audit_trail_of_a_service_that_runs_has_who_made_and_revoked_a_key(t
         assert main(["key", "add", "ada", "--scope", "operate"]) == 0
         assert main(["key", "revoke", "ada"]) == 0
         made, revoked = archive.audit_trail()
-    assert (made.name, made.text, made.whence) == ("key.added", "ada may operate", "cli")
+    assert (made.name, made.text, made.channel) == ("key.added", "ada may operate", "cli")
     assert (revoked.name, revoked.text) == ("key.revoked", "ada")
     assert made.who == login()
 

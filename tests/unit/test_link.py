@@ -7,8 +7,8 @@ import pytest
 
 from service.errors import UnknownIdError, WireError
 from service.link.intake import LEFT_AS_THEY_CAME, QUEUE_LENGTH, Intake
+from service.link.leader_election import LeaderElection, SessionWatch
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
-from service.link.rivals import Order, SessionWatch
 from service.link.session import Endpoint
 from service.tracking import events as ev
 from service.wire import (
@@ -103,7 +103,7 @@ def test_one_message_of_an_unknown_session_takes_nothing_over_and_is_named():
     watch = SessionWatch()
     watch.admit("a", 0.0)
     assert not watch.admit("stray", 0.1).accepted
-    named = [watch.admit("a", 0.1 * k).rival for k in range(2, 30)]
+    named = [watch.admit("a", 0.1 * k).other_session for k in range(2, 30)]
     assert watch.current == "a"
     assert [rival for rival in named if rival] == ["stray"]
 
@@ -113,14 +113,14 @@ def test_the_last_words_of_a_replaced_session_are_refused_but_no_second_rtc():
     watch.admit("a", 0.0)
     watch.admit("b", 2.0)
     assert not watch.admit("a", 2.5).accepted
-    assert watch.admit("b", 4.0).rival is None
+    assert watch.admit("b", 4.0).other_session is None
 
 
 def test_a_straggler_of_the_old_session_does_not_make_the_new_one_a_second_rtc():
     watch = SessionWatch()
     watch.admit("a", 0.0)
     watch.admit("b", 0.1)
-    assert watch.admit("a", 0.6).rival is None
+    assert watch.admit("a", 0.6).other_session is None
     assert watch.admit("b", 2.7).changed
 
 
@@ -130,7 +130,7 @@ def test_a_session_that_goes_on_beside_the_one_that_counts_is_a_second_rtc():
     named = []
     for k in range(1, 40):
         watch.admit("b", 0.1 * k)
-        named.append(watch.admit("a", 0.1 * k + 0.05).rival)
+        named.append(watch.admit("a", 0.1 * k + 0.05).other_session)
     assert watch.current == "a"
     assert "b" in named
 
@@ -150,7 +150,7 @@ def test_endless_strangers_are_remembered_within_bounds():
     watch.admit("a", 0.0)
     for k in range(100):
         watch.admit(f"s{k}", 0.01 * k)
-    assert len(watch._rivals) <= 16
+    assert len(watch._other_sessions) <= 16
     assert watch.other == "s99"
 
 
@@ -158,7 +158,7 @@ def test_endless_strangers_are_remembered_within_bounds():
 
 
 def order(found=(), own="b", now_ns=1000, **facts):
-    made = Order()
+    made = LeaderElection()
     made.contract_held = facts.get("contract_held", False)
     made.join(found, own, now_ns)
     return made
@@ -179,25 +179,25 @@ def test_a_later_service_stands_by_whatever_its_clock_says_and_takes_over_when_t
     assert late.others(0.0) == ("aa (there since 1970-01-01T00:00:00Z)",)
     late.contract_held = False
     assert not late.settle()
-    late.named("5000-aa", alive=False)
+    late.notice("5000-aa", alive=False)
     assert late.settle()
 
 
 def test_the_first_of_two_drives_on():
     first = order()
     first.settle()
-    first.named("2000-aa", alive=True)
+    first.notice("2000-aa", alive=True)
     assert first.settle()
     assert len(first.others(0.0)) == 1
-    first.named("2000-aa", alive=False)
+    first.notice("2000-aa", alive=False)
     assert first.others(0.0) == ()
 
 
 @pytest.mark.parametrize("starts", [(1000, 1000), (1000, 999), (1000, 1001)])
 def test_of_two_that_come_at_the_same_time_exactly_one_drives(starts):
     one, other = order(own="a", now_ns=starts[0]), order(own="b", now_ns=starts[1])
-    one.named(other.name, alive=True)
-    other.named(one.name, alive=True)
+    one.notice(other.name, alive=True)
+    other.notice(one.name, alive=True)
     assert one.settle() is not other.settle()
 
 
@@ -207,7 +207,7 @@ def test_one_that_gives_no_name_was_first_if_it_was_there_first():
     assert late.others(0.0) == ("one that gives no name",)
     late.contract_held = False
     assert late.settle()
-    late.heard(10.0)
+    late.receive(10.0)
     assert late.settle()
     assert late.others(11.0) == ("one that gives no name",)
     assert late.others(16.0) == ()
@@ -215,7 +215,7 @@ def test_one_that_gives_no_name_was_first_if_it_was_there_first():
 
 def test_tokens_that_are_no_names_are_nobody():
     alone = order(["x", "12-XYZ", "-ab"])
-    alone.named("rubbish", alive=True)
+    alone.notice("rubbish", alive=True)
     assert alone.settle()
     assert alone.others(0.0) == ()
 
@@ -241,7 +241,7 @@ def test_frames_of_another_size_start_over_in_the_same_session(intake):
 
 
 def applied(intake, session):
-    said = Acknowledgement(
+    acknowledgement = Acknowledgement(
         session=session,
         id="cm-1",
         sha256="0" * 64,
@@ -249,7 +249,7 @@ def applied(intake, session):
         reason="",
         frame_seq=5,
     )
-    intake.acknowledgement(said, known=True)
+    intake.acknowledgement(acknowledgement, known=True)
 
 
 def say(intake, **changes):
@@ -307,7 +307,7 @@ def test_frames_of_another_shape_than_the_status_says_cost_themselves_only(intak
     send(intake, 10, n_slopes=2)
     send(intake, 20)
     send(intake, 30, n_slopes=2)
-    fate = next(f for f in intake.statistics().fates if f.outcome == "shape")
+    fate = next(f for f in intake.statistics().dispositions if f.outcome == "shape")
     assert (fate.kind, fate.n) == ("frames", 20)
     assert fate.text.startswith("2 slopes and 2 modes, expected 3 and 2")
     assert intake.statistics().frames_refused == {"shape": 20}
@@ -346,7 +346,7 @@ def test_frames_behind_a_hole_are_held_back_until_patience_ends(intake, clock):
 
 def fate(intake, outcome, kind="frames"):
     """Return what the link says of frames, or messages, that met this fate."""
-    fates = intake.statistics().fates
+    fates = intake.statistics().dispositions
     return next((f for f in fates if (f.kind, f.outcome) == (kind, outcome)), None)
 
 
@@ -508,7 +508,7 @@ def test_the_age_of_the_last_frame_is_told_by_arrival(intake, clock):
 
 def test_of_too_many_events_the_oldest_give_way_and_are_counted(intake):
     for number in range(QUEUE_LENGTH + 1):
-        intake.event(ev.Noted(name=f"{number}", text=""))
+        intake.event(ev.LogEvent(name=f"{number}", text=""))
     intake.event(ev.RtcVanished())
     events = intake.events()
     assert (len(events), events[0].name, events[-1]) == (QUEUE_LENGTH, "2", ev.RtcVanished())

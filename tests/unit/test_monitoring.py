@@ -11,7 +11,14 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.cli.serve import log_to_the_terminal
 from service.runtime.recording import ids_of
-from service.tracking.alarms import ALARMS, ARCHIVE_FAILED, WORKER_BEHIND, Alarm, Party, Waiting
+from service.tracking.alarms import (
+    ALARMS,
+    ARCHIVE_FAILED,
+    WORKER_BEHIND,
+    Alarm,
+    Prerequisite,
+    Responsible,
+)
 from service.tracking.registration import Validity
 from tests.unit.test_api import LINK, SECOND, STATE, assert_problem, service
 from tests.unit.test_house import ROOT
@@ -47,8 +54,8 @@ NO_UNIT = {
     "alarms_stale",
     "alarms_unacknowledged",
     "mode",
-    "occupation",
-    "operation",
+    "current_operation",
+    "service_state",
     "pole_radius_bound",
     "ready",
     "reconstructors",
@@ -125,7 +132,11 @@ def alarm(name, text):
         ({"link": replace(LINK, frame_age_s=12.0)}, "telemetry", "12 s ago"),
         ({"link": replace(LINK, frame_age_s=None)}, "telemetry", "no frame has come"),
         (
-            {"waiting_for": (Waiting(name="x", party=Party.RTC, text="odd", hinders=True),)},
+            {
+                "waiting_for": (
+                    Prerequisite(name="x", responsible=Responsible.RTC, text="odd", blocks=True),
+                )
+            },
             "telemetry",
             "odd",
         ),
@@ -140,7 +151,13 @@ def alarm(name, text):
             "busy",
         ),
         (
-            {"waiting_for": (Waiting(name="w", party=Party.WORKER, text="died", hinders=True),)},
+            {
+                "waiting_for": (
+                    Prerequisite(
+                        name="w", responsible=Responsible.WORKER, text="died", blocks=True
+                    ),
+                )
+            },
             "worker",
             "died",
         ),

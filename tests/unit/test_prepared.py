@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.files import prepared
-from service.files.prepared import Prepared, usual_folder
+from service.files import disk_cache
+from service.files.disk_cache import DiskCache, usual_folder
 from service.model.modes import modal_basis
 from tests.numerics import small_instrument
 
@@ -22,7 +22,7 @@ def counted(monkeypatch):
     """How often modes were computed."""
     made = []
     monkeypatch.setattr(
-        prepared,
+        disk_cache,
         "modal_basis",
         lambda instrument: made.append(instrument) or modal_basis(instrument),
     )
@@ -37,8 +37,8 @@ def same(one, other):
 
 
 def test_modes_are_computed_once_for_all_who_share_the_folder(tmp_path, counted):
-    first = Prepared(tmp_path).basis(small_instrument())
-    second = Prepared(tmp_path).basis(small_instrument())
+    first = DiskCache(tmp_path).basis(small_instrument())
+    second = DiskCache(tmp_path).basis(small_instrument())
     assert len(counted) == 1
     same(first, second)
     same(second, modal_basis(small_instrument()))
@@ -46,26 +46,26 @@ def test_modes_are_computed_once_for_all_who_share_the_folder(tmp_path, counted)
 
 def test_without_a_folder_everything_is_computed(counted):
     for _ in range(2):
-        Prepared(None).basis(small_instrument())
+        DiskCache(None).basis(small_instrument())
     assert len(counted) == 2
 
 
 def test_another_instrument_has_other_modes_whatever_its_name(tmp_path, counted):
     for instrument in (small_instrument(), small_instrument(obscuration_ratio=0.2)):
-        same(Prepared(tmp_path).basis(instrument), modal_basis(instrument))
+        same(DiskCache(tmp_path).basis(instrument), modal_basis(instrument))
     assert len(counted) == 2
 
 
 def test_another_version_of_the_model_finds_nothing(tmp_path, counted, monkeypatch):
-    Prepared(tmp_path).basis(small_instrument())
-    monkeypatch.setattr(prepared, "_code_sha256", lambda: "another")
-    Prepared(tmp_path).basis(small_instrument())
+    DiskCache(tmp_path).basis(small_instrument())
+    monkeypatch.setattr(disk_cache, "_code_sha256", lambda: "another")
+    DiskCache(tmp_path).basis(small_instrument())
     assert len(counted) == 2
 
 
 @pytest.mark.parametrize("what", ["emptied", "cut", "a flipped byte", "text"])
 def test_a_damaged_file_is_made_again(tmp_path, counted, what):
-    Prepared(tmp_path).basis(small_instrument())
+    DiskCache(tmp_path).basis(small_instrument())
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
     middle = len(whole) // 2
@@ -77,16 +77,16 @@ def test_a_damaged_file_is_made_again(tmp_path, counted, what):
             "text": b"not a file of ours",
         }[what]
     )
-    same(Prepared(tmp_path).basis(small_instrument()), modal_basis(small_instrument()))
+    same(DiskCache(tmp_path).basis(small_instrument()), modal_basis(small_instrument()))
     assert len(counted) == 2
-    Prepared(tmp_path).basis(small_instrument())
+    DiskCache(tmp_path).basis(small_instrument())
     assert len(counted) == 2
 
 
 def test_a_folder_that_cannot_be_is_no_error(tmp_path, counted):
     (tmp_path / "file").write_text("in the way")
     for _ in range(2):
-        Prepared(tmp_path / "file" / "cache").basis(small_instrument())
+        DiskCache(tmp_path / "file" / "cache").basis(small_instrument())
     assert len(counted) == 2
 
 
@@ -96,12 +96,12 @@ def test_a_full_disk_is_no_error_and_leaves_nothing_behind(tmp_path, counted, mo
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(np, "savez", full)
-    Prepared(tmp_path).basis(small_instrument())
+    DiskCache(tmp_path).basis(small_instrument())
     assert not list(tmp_path.iterdir())
 
 
 def test_the_files_used_least_recently_make_room(tmp_path):
-    kept = Prepared(tmp_path, most_bytes=30_000)
+    kept = DiskCache(tmp_path, max_bytes=30_000)
     compute = {"numbers": np.ones(1000)}
     for k in range(5):
         kept.arrays(small_instrument(), ("numbers", k), lambda: compute)
@@ -116,7 +116,7 @@ def test_the_files_used_least_recently_make_room(tmp_path):
 
 
 def test_what_is_too_large_is_not_kept(tmp_path):
-    kept = Prepared(tmp_path, most_bytes=1000)
+    kept = DiskCache(tmp_path, max_bytes=1000)
     kept.arrays(small_instrument(), ("numbers",), lambda: {"numbers": np.ones(1000)})
     assert not list(tmp_path.iterdir())
 
@@ -126,7 +126,7 @@ def test_what_a_dead_process_left_is_swept_out_and_what_a_living_one_writes_stay
         path = tmp_path / name
         path.write_bytes(b"half of")
         os.utime(path, (path.stat().st_mtime - age_s,) * 2)
-    Prepared(tmp_path).arrays(small_instrument(), ("numbers",), lambda: {"numbers": np.ones(1)})
+    DiskCache(tmp_path).arrays(small_instrument(), ("numbers",), lambda: {"numbers": np.ones(1)})
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == [".alive.npz"]
 
 
@@ -135,7 +135,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from service.config import load_instrument
-from service.files.prepared import Prepared
+from service.files.disk_cache import Prepared
 instrument, kept = load_instrument(sys.argv[2]), Prepared(Path(sys.argv[1]))
 for k in range(60):
     found = kept.arrays(instrument, ("numbers",), lambda: {"numbers": np.full(50_000, 7.0)})
@@ -169,5 +169,5 @@ def test_the_folder_is_the_users_unless_the_environment_says_otherwise(tmp_path)
 def test_modes_of_the_users_own_are_not_kept(tmp_path):
     instrument = small_instrument()
     own = replace(instrument.mirror, mode_to_actuator=np.eye(len(instrument.mirror.positions_m)))
-    Prepared(tmp_path).basis(replace(instrument, mirror=own))
+    DiskCache(tmp_path).basis(replace(instrument, mirror=own))
     assert not list(tmp_path.iterdir())

@@ -111,11 +111,11 @@ def test_a_restarted_service_knows_the_matrix_it_once_made():
 def test_a_loop_that_diverges_stops_everything_and_is_named():
     story = Story(Mode.AUTO).meet()
     story.see()
-    story.tell(ev.Trouble(name="loop-diverging", text="open the loop"))
+    story.tell(ev.ConditionChanged(name="loop-diverging", text="open the loop"))
     assert not story.see(n_windows=5)
     assert not story.wait(60)
     assert story.alarms >= {"loop-diverging"}
-    story.tell(ev.Trouble(name="loop-diverging", text="calm", over=True))
+    story.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
     assert story.state.registration.n_windows == 1
 
 

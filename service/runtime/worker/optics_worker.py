@@ -18,15 +18,15 @@ from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.estimation import passive
-from service.estimation.dialect import LIKELY, Dialect, of_answer, of_reconstructor
 from service.estimation.estimate import DitheredEstimate
 from service.estimation.light import far_starts
-from service.estimation.lockin import Spectra, WindowEstimate, fit_window
-from service.estimation.openloop import FarEstimate, FarSearch, find, not_found
+from service.estimation.lockin import LockInEstimate, Spectra, fit_window
+from service.estimation.openloop import WideCaptureEstimate, WideCaptureSearch, find, not_found
 from service.estimation.own_matrix import OwnMatrix, recognise_modes
 from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
+from service.estimation.slope_convention import LIKELY, SlopeConvention, of_answer, of_reconstructor
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
-from service.files.prepared import Prepared
+from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
@@ -77,8 +77,8 @@ class OpticsWorker:
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
         check_controllable(instrument)
-        self._prepared = Prepared(compute.cache)
-        self._basis = self._prepared.basis(instrument)
+        self._disk_cache = DiskCache(compute.cache)
+        self._basis = self._disk_cache.basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
         self._compute = compute
         self._mode_response: NDArray[np.float64] | None = None
@@ -106,11 +106,11 @@ class OpticsWorker:
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
         self._start = instrument.start
-        self._far: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
+        self._wide_capture: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
     def tidy(self) -> None:
         """Give back the memory of what a job leaves and the next one hardly ever needs."""
-        models = (self._coarse, *itertools.chain.from_iterable(self._far.values()))
+        models = (self._coarse, *itertools.chain.from_iterable(self._wide_capture.values()))
         for model in (*self._sensor.models, *models):
             model.forget()
 
@@ -138,12 +138,12 @@ class OpticsWorker:
             return {"matrix": found.matrix, "derivatives": found.derivatives}
 
         what = ("linearisation", *sampling, start.vector.tolist())
-        kept = self._prepared.arrays(self._model.instrument, what, computed)
+        kept = self._disk_cache.arrays(self._model.instrument, what, computed)
         return Linearisation(alpha=start, **kept)
 
     def fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration | None
-    ) -> WindowEstimate | WindowRefused:
+    ) -> LockInEstimate | WindowRefused:
         """Estimate α from one window, from ``start`` or, without one, from the nominal rotation.
 
         Where the linearisation at hand is too far away, the coarse model leads to within reach of
@@ -153,7 +153,7 @@ class OpticsWorker:
         """
         begun = start or self._start
         outcome = self._fitted(spectra, loop, begun)
-        if isinstance(outcome, WindowEstimate):
+        if isinstance(outcome, LockInEstimate):
             gains = outcome.optical_gain
             if gains.real.min() > LIKELY[0] and np.abs(gains).max() < LIKELY[1]:
                 return outcome
@@ -169,7 +169,7 @@ class OpticsWorker:
 
     def _fitted(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
-    ) -> WindowEstimate | WindowRefused:
+    ) -> LockInEstimate | WindowRefused:
         try:
             estimate = self._settled_fit(spectra, loop, start)
             if estimate is None:
@@ -181,7 +181,9 @@ class OpticsWorker:
             return WindowRefused(reason=f"no fit: {error}", t_ns_utc=spectra.t_end_ns_utc)
         return _unsettled(spectra) if estimate is None else self._against_flat(estimate)
 
-    def listen(self, in_use: NDArray[np.float32], near: Misregistration | None) -> Dialect:
+    def read_slope_convention(
+        self, in_use: NDArray[np.float32], near: Misregistration | None
+    ) -> SlopeConvention:
         """Return whether the RTC's own matrix is of the slopes that the instrument file tells.
 
         Where the file leaves the orientation open, what is found is taken over.
@@ -243,7 +245,7 @@ class OpticsWorker:
 
     def _settled_fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration
-    ) -> WindowEstimate | None:
+    ) -> LockInEstimate | None:
         """Return the fit about a linearisation that is near enough to it; None: there is none."""
         estimate = fit_window(spectra, self._sensor.near(start), loop)
         if length(estimate.step) > REACH:
@@ -258,15 +260,15 @@ class OpticsWorker:
 
     def find(
         self, spectra: Spectra, start: Misregistration | None, flux: bytes | None
-    ) -> FarEstimate | WindowRefused:
+    ) -> WideCaptureEstimate | WindowRefused:
         """Find α in a window with the loop open; without a start from anywhere in the range.
 
         ``flux`` is the RTC's: where the pupil images move with the mirror's they are a start.
         """
         modes = spectra.plan.modes
-        if modes not in self._far:
+        if modes not in self._wide_capture:
             basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
-            self._far[modes] = tuple(
+            self._wide_capture[modes] = tuple(
                 RtcInteractionModel(
                     self._model.instrument,
                     basis,
@@ -277,10 +279,13 @@ class OpticsWorker:
                 )
                 for sampling in (FAR_SAMPLING, COARSE_SAMPLING)
             )
-        far, near = self._far[modes]
+        far, near = self._wide_capture[modes]
         starts = (start,) if start is not None else far_starts(self._model.instrument, flux)
         try:
-            return find(spectra, FarSearch(far=far, near=near, nominal=self._start, starts=starts))
+            return find(
+                spectra,
+                WideCaptureSearch(coarse=far, fine=near, nominal=self._start, starts=starts),
+            )
         except np.linalg.LinAlgError as error:
             return not_found(str(error), spectra)
 
@@ -324,7 +329,7 @@ class OpticsWorker:
         self,
         spectra: Spectra,
         loop: ClosedLoop,
-        estimate: WindowEstimate,
+        estimate: LockInEstimate,
         start: Misregistration,
     ) -> Misregistration | None:
         """Return where the coarse model's steps lead; None when they do not shrink."""
@@ -355,7 +360,7 @@ class OpticsWorker:
                 matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
             )
 
-        return _most(len(loop.gains), fewer, judged)
+        return _largest_passing(len(loop.gains), fewer, judged)
 
     def assess(
         self,
@@ -428,7 +433,7 @@ class OpticsWorker:
         loop = replace(conditions.loop, optical_gain=optical_gain)
         return verdict, self.assess(in_use, conditions.alpha, loop, magnitude)
 
-    def watch(
+    def fit_passive(
         self, state: passive.Passive, start: Misregistration | None
     ) -> passive.PassiveEstimate | None:
         """Estimate α from ordinary telemetry; None when there is too little of it.
@@ -443,7 +448,7 @@ class OpticsWorker:
         )
 
 
-def _most(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:
+def _largest_passing(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:
     """Return what passes with most modes: fewer are never less stable, so halves are enough."""
     asked = judged(n_modes)
     if asked.gate.accepted:

@@ -63,7 +63,7 @@ export function showWaiting(service, orders) {
   const besides = approval.split("; ").slice(1); // why nobody else sends it, and when another one replaces it
   put($("#proposal"), proposal ? [described(proposal, orders.wins), ...besides].join("; ") : "");
   $("#proposal-buttons").hidden = !proposal;
-  const lines = others.slice(0, 3).map((w) => `${w.party}: ${w.text}`);
+  const lines = others.slice(0, 3).map((w) => `${w.responsible}: ${w.text}`);
   if (others.length > 3) lines.push(`and ${others.length - 3} more`);
   listed($("#waits"), lines);
 }
@@ -102,7 +102,7 @@ export function showLoop(service, mirror) {
   const edge = state?.margin?.edge_motion_m;
   const limit = mirror?.edge_limit_m;
   gauge($("#edge"), present(edge) && limit ? edge / limit : null, present(edge) ? `${nanometres(edge)} of ${nanometres(limit)}` : DASH);
-  const dither = state?.dithering;
+  const dither = state?.dither_policy;
   put($("#dither"), !rtc && dither ? `${dither.phase}: ${dither.reason}` : dither ? `${dither.phase}, ${nanometres(dither.mean_cost_m)} of ${nanometres(dither.budget_m)}: ${dither.reason}` : DASH);
   const link = state?.link;
   put($("#frames"), link ? `${link.frames_received} received, ${link.frames_lost} lost, last ${present(link.frame_age_s) ? `${span(link.frame_age_s)} ago` : DASH}` : DASH);

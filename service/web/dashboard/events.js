@@ -14,7 +14,7 @@ function lineOf(alarm) {
   const been = alarm.severity && alarm.severity !== worst ? `, has been ${worst}` : "";
   const known = seen && `${seen.by} knows since ${clock(milliseconds(seen.t_ns_utc))} UTC${seen.reason ? `: ${seen.reason}` : ""}`;
   const runbook = runbookOf(name);
-  return make("li", { className: alarm.attention, title: alarm.do, data_tone: over ? "" : toneOf(alarm.severity) },
+  return make("li", { className: alarm.alarm_state, title: alarm.do, data_tone: over ? "" : toneOf(alarm.severity) },
     make("strong", { text: `${over ? SYMBOLS.over : SYMBOLS[alarm.severity]} ${name}` }),
     make("span", { text: `${word}${been}` }),
     make("span", { className: "since", data_since: String(milliseconds(alarm.since_ns_utc)) }),

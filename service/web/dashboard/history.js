@@ -226,7 +226,7 @@ export class History {
       const ms = milliseconds(line.t_ns_utc);
       return make("tr", {},
         make("td", {}, make("time", { datetime: new Date(ms).toISOString(), title: day(ms), text: clock(ms) })),
-        make("td", { text: `${line.who}${line.whence && `, ${line.whence}`}`, title: line.address }),
+        make("td", { text: `${line.who}${line.channel && `, ${line.channel}`}`, title: line.address }),
         make("td", { text: `${line.name}: ${line.text}` }),
         make("td", { text: line.why || DASH }), make("td", { text: line.answer || DASH }));
     }));

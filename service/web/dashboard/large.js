@@ -49,7 +49,7 @@ export class Large {
       margin: [margin(state.margin)?.text ?? DASH, state.margin && !state.margin.accepted ? "bad" : ""],
       frames: rtc ? [`${number(rtc.frame_rate_hz, 0)} Hz, ${link.frames_lost} lost`] : [DASH],
       alarms: alarms.length ? [alarms.map((a) => `${SYMBOLS[a.severity]} ${a.name}`).join(", "), toneOf(alarms[0].severity)] : ["none"],
-      "waits for": this.#orders.proposal ? ["you: approve or reject"] : [waits ? `${waits.party}: ${waits.name}` : "nothing"],
+      "waits for": this.#orders.proposal ? ["you: approve or reject"] : [waits ? `${waits.responsible}: ${waits.name}` : "nothing"],
     };
   }
 }

@@ -52,8 +52,8 @@ export class Measurements {
   }
 
   #onState() {
-    const { measuring, gathering } = this.#service.state ?? {};
-    const told = JSON.stringify([measuring?.state, gathering?.state, measuring?.id, gathering?.id]);
+    const { measuring, noisy_measurement } = this.#service.state ?? {};
+    const told = JSON.stringify([measuring?.state, noisy_measurement?.state, measuring?.id, noisy_measurement?.id]);
     if (told !== this.told) {
       this.told = told;
       this.look();

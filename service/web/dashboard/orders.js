@@ -290,7 +290,7 @@ const ORDERS = {
   },
   acknowledge(orders, name) {
     const alarm = alarmOf(orders.state, name);
-    needs(alarm?.attention, `${name} is over`);
+    needs(alarm?.alarm_state, `${name} is over`);
     const lasts = Boolean(alarm.severity);
     return {
       title: `Acknowledge ${name}`,
@@ -451,7 +451,7 @@ const ORDERS = {
     return {
       title: "Start the dither",
       facts: [
-        `The service chooses modes, lines and strength: at most ${nanometres(orders.state.dithering.budget_m)} RMS of all modes together.`,
+        `The service chooses modes, lines and strength: at most ${nanometres(orders.state.dither_policy.budget_m)} RMS of all modes together.`,
         "It dithers again by itself from then on, as the settings allow.",
       ],
       button: "Start the dither",
@@ -492,8 +492,8 @@ const ORDERS = {
     };
   },
   "give-up"(orders) {
-    const { measuring, gathering } = orders.state;
-    const one = measuring ?? gathering;
+    const { measuring, noisy_measurement } = orders.state;
+    const one = measuring ?? noisy_measurement;
     return {
       title: `Give up ${one.id}`,
       facts: [
@@ -566,13 +566,13 @@ const ORDERS = {
     };
   },
   noisy(orders) {
-    const { rtc, dithering } = orders.state;
+    const { rtc, dither_policy } = orders.state;
     return {
       title: "Measure a noisy interaction matrix",
       fields: [{ name: "duration_s", label: "Seconds", needed: true, min: 1, max: 3600, step: "any", value: 30 }],
       facts: ({ duration_s: seconds }) => [
         `The loop stays closed: random signs on its ${rtc.n_controlled} modes at once for ${number(seconds, 0)} s of telemetry.`,
-        `What moves: at most ${nanometres(Math.min(5e-9, dithering.budget_m))} RMS of all modes together; the service's own dither makes way.`,
+        `What moves: at most ${nanometres(Math.min(5e-9, dither_policy.budget_m))} RMS of all modes together; the service's own dither makes way.`,
         "Its windows are fitted like any other; it can never become a reconstructor.",
       ],
       button: "Begin",

@@ -89,15 +89,15 @@ export function toneOf(severity) {
 
 // What the service is in and does. Only a loop that is closed and followed is well.
 export function operation(state) {
-  const { operation: word, occupation, because } = state.operating;
+  const { service_state: word, current_operation, because } = state.operating;
   const [name, symbol, tone] = OPERATIONS[word];
   const open = state.rtc?.loop === "open";
-  const does = state.stopped_because ? "STOPPED" : occupation !== "Idle" ? occupation.toUpperCase()
+  const does = state.stopped_because ? "STOPPED" : current_operation !== "Idle" ? current_operation.toUpperCase()
     : open ? "LOOP OPEN" : state.rtc && !state.registration ? "α NOT KNOWN" : "";
   const shown = { word: does ? `${name} · ${does}` : name, symbol, tone, why: because };
   if (word !== "Operational" && word !== "Ready") return shown;
   if (state.stopped_because) return { ...shown, symbol: SYMBOLS.warning, tone: "warn" };
-  const follows = word === "Operational" && !open && state.registration && occupation !== "Idle";
+  const follows = word === "Operational" && !open && state.registration && current_operation !== "Idle";
   return follows ? shown : { ...shown, symbol: word === "Ready" ? SYMBOLS.none : SYMBOLS.busy, tone: "busy" };
 }
 

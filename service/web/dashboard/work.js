@@ -8,7 +8,7 @@ const RAMPING = new Set(["asked", "accepted"]);
 // What occupies the loop or the mirror, from a state; null: nothing that takes long.
 // share: 0 to 1, null where nobody knows; left_s as well.
 export function busy(state, now) {
-  const { acquisition, measuring, gathering, loop_command: asked, rtc } = state;
+  const { acquisition, measuring, noisy_measurement, loop_command: asked, rtc } = state;
   if (acquisition.under_way) {
     const k = STAGES.indexOf(acquisition.stage);
     return {
@@ -16,7 +16,7 @@ export function busy(state, now) {
       share: k / STAGES.length, left_s: null, since: acquisition.started_ns_utc, order: "abort", button: "Abort",
     };
   }
-  const one = measuring ?? gathering;
+  const one = measuring ?? noisy_measurement;
   if (one) {
     const sofar = one.state === "finishing" ? "being fitted and kept" : one.state === "waiting" ? "waiting for the dither to end" : one.state;
     const what = `${sofar}${measuring ? `, ${measuring.pattern}, ${measuring.modes.length} modes` : ""}`;

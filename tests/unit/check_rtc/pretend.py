@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from check_rtc.ear import Heard, Topic
-from check_rtc.talk import Talk
-from check_rtc.watch import Watch
+from check_rtc.client import RtcClient
+from check_rtc.connection import ReceivedMessage, Topic
+from check_rtc.watch import TelemetryObserver
 from service.errors import LinkError, WireError
 from service.link.session import Endpoint
 from service.model.misregistration import Misregistration
@@ -89,7 +89,9 @@ class Pretend:
         self._hear(Topic.ALIVE, alive=True)
 
     def talk(self):
-        return Talk(self, Watch(ENDPOINT, lambda: self.now_s), lambda: self.now_s, self.sleep)
+        return RtcClient(
+            self, TelemetryObserver(ENDPOINT, lambda: self.now_s), lambda: self.now_s, self.sleep
+        )
 
     # --- the ear
 
@@ -167,7 +169,7 @@ class Pretend:
                 act()
 
     def status(self):
-        told = Status(
+        status = Status(
             session=self.session,
             seq=self.seq - 1 if self.seq else None,
             t_ns=self.t0_ns,
@@ -187,12 +189,12 @@ class Pretend:
             max_dither_modes=8,
             magnitude=None,
         )
-        return replace(told, **self.twists.get("status", {}))
+        return replace(status, **self.twists.get("status", {}))
 
     def _hear(self, topic, data=b"", attachment=None, key="", **more):
         if not self.away:
             self.heard.append(
-                Heard(
+                ReceivedMessage(
                     topic=topic,
                     key=key,
                     at_s=self.now_s,
@@ -371,7 +373,7 @@ class Pretend:
         frame_seq = self.seq + self.twists.get("frame_off", 0)
         self._say(self.staging.applied(staged.manifest.id, frame_seq))
 
-    def _say(self, said: Acknowledgement):
-        if self.twists.get("mute") or said.state in self.twists.get("silent_about", ()):
+    def _say(self, acknowledgement: Acknowledgement):
+        if self.twists.get("mute") or acknowledgement.state in self.twists.get("silent_about", ()):
             return
-        self._hear(Topic.ACK, encode(said))
+        self._hear(Topic.ACK, encode(acknowledgement))

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from check_rtc.articles import ARTICLES, Outcome
-from check_rtc.ear import Heard, Topic
+from check_rtc.connection import ReceivedMessage, Topic
 from check_rtc.examine import Examination, examine
+from check_rtc.requirements import REQUIREMENTS, Outcome
 from service.errors import LinkError, WireError
-from service.estimation.dialect import Dialect
+from service.estimation.slope_convention import SlopeConvention
 from service.model.slopes import Orientation, SlopeRecipe
 from tests.unit.check_rtc.pretend import Pretend
 from tests.vectors import PAGE, anchors_of
@@ -143,7 +143,7 @@ def test_slopes_of_the_other_sign_than_the_matrix_are_named():
 def test_messages_that_cannot_be_read_are_named_with_what_is_wrong():
     rtc = Pretend()
     rtc.sleep(1.0)
-    rtc.heard.append(Heard(topic=Topic.STATUS, key="", at_s=rtc.now_s, data=b"\xc1"))
+    rtc.heard.append(ReceivedMessage(topic=Topic.STATUS, key="", at_s=rtc.now_s, data=b"\xc1"))
     checks = checked(rtc)
     assert flagged(checks) == {"messages"}
     assert "1 status cannot be read: range: a status is not msgpack" in checks["messages"].found
@@ -216,11 +216,13 @@ def test_a_matrix_that_is_not_offered_is_skipped_and_one_of_a_wrong_sum_is_wrong
 
 
 def test_what_the_instrument_file_says_of_the_matrix_is_one_line():
-    turned = Dialect(wrong="slopes have the other sign than the instrument file says")
+    turned = SlopeConvention(wrong="slopes have the other sign than the instrument file says")
     checks = checked(Pretend(), dialect=lambda matrix: turned)
     assert checks["orientation"].found == turned.wrong
     assert checks["orientation"].outcome is Outcome.WRONG
-    found = Dialect(found=SlopeRecipe(orientation=Orientation(sign_x=-1, sign_y=-1)), adopted=True)
+    found = SlopeConvention(
+        found=SlopeRecipe(orientation=Orientation(sign_x=-1, sign_y=-1)), adopted=True
+    )
     checks = checked(Pretend(), dialect=lambda matrix: found)
     assert "sign = -1 }: the instrument file leaves it open" in checks["orientation"].found
     pinned = checked(Pretend(), basis_id="kl-9")
@@ -241,4 +243,6 @@ def test_asking_for_one_check_makes_that_one_only():
 
 
 def test_every_article_stands_in_the_contract():
-    assert {article.anchor for article in ARTICLES.values()} <= anchors_of(PAGE.read_text("utf-8"))
+    assert {article.anchor for article in REQUIREMENTS.values()} <= anchors_of(
+        PAGE.read_text("utf-8")
+    )

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from check_rtc.articles import ARTICLES, Moves, Outcome
 from check_rtc.examine import Examination, examine
+from check_rtc.requirements import REQUIREMENTS, Moves, Outcome
 from service.wire import AckState, CommandKind
 from tests.unit.check_rtc.pretend import Pretend
 
-ASKING = frozenset(name for name, of in ARTICLES.items() if of.moves is not Moves.NOTHING)
+ASKING = frozenset(name for name, of in REQUIREMENTS.items() if of.moves is not Moves.NOTHING)
 
 
 def asked(rtc, *names, **wish):

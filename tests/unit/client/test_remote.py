@@ -20,7 +20,7 @@ from service.api import create_app
 from service.archive import AuditEntry
 from service.archive.recordings import RecordingRecord
 from service.errors import CommandError
-from service.runtime.recording import Whence
+from service.runtime.recording import Channel
 from service.runtime.snapshot import Snapshot
 from service.tracking.events import MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -85,7 +85,7 @@ def service(served, monkeypatch):
     tracker = replace(
         STATE,
         reconstructors=(BEFORE, *STATE.reconstructors),
-        proven=frozenset({STATE.rtc.cm_id}),
+        verified_ids=frozenset({STATE.rtc.cm_id}),
         mode_proof=ALL_SHOWN,
     )
     service.now = Snapshot(
@@ -152,7 +152,7 @@ def test_an_order_reaches_the_service_with_who_and_why(capsys, service, words, k
     assert type(command).__name__ == kind
     assert (command.reason, command.by) == ("clouds, still", "Ada")
     assert {name: getattr(command, name) for name in fields} == fields
-    assert [caller.whence for caller in service.callers] == [Whence.CLI]
+    assert [caller.channel for caller in service.callers] == [Channel.CLI]
     assert f"{kind} is on its way" in capsys.readouterr().out
 
 

@@ -14,7 +14,7 @@ from pyrcal.client.status import status_lines
 from service.runtime.snapshot import Snapshot
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.web.views import STATE as STATE_VIEW
-from service.web.views import picture
+from service.web.views import to_json
 from tests.unit.test_api import LINK, SECOND, STATE
 from tests.unit.tracking.situations import POLICY
 
@@ -32,7 +32,7 @@ def told(tracker=STATE, *, ready=True, **changes):
         archive_failures=0,
         archive_waiting=0,
     )
-    return picture(snapshot, STATE_VIEW)
+    return to_json(snapshot, STATE_VIEW)
 
 
 def test_the_first_line_says_whether_it_is_ready_and_the_next_what_is_wrong():

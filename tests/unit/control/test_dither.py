@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.dither import Demand, Schedule, burst_s, clear_of, schedule, window_s
+from service.control.dither import (
+    DitherRequirement,
+    Schedule,
+    burst_s,
+    clear_of,
+    schedule,
+    window_s,
+)
 
 KAPPA = np.array([0.02, 0.02, np.deg2rad(0.08), 0.004]) * 1e-9
 """Magnitude 10 of the design study: 2 % of a subaperture in 1 s at 1 nm."""
@@ -15,8 +22,10 @@ KAPPA = np.array([0.02, 0.02, np.deg2rad(0.08), 0.004]) * 1e-9
 SLOW = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005]) / np.sqrt(3600.0)
 
 
-def demand(sigma_subap: float = 0.005, budget_m: float = 10e-9, drift: np.ndarray = SLOW) -> Demand:
-    return Demand(
+def demand(
+    sigma_subap: float = 0.005, budget_m: float = 10e-9, drift: np.ndarray = SLOW
+) -> DitherRequirement:
+    return DitherRequirement(
         sigma=np.array([sigma_subap, sigma_subap, np.deg2rad(0.05), 0.002]),
         drift_rate=drift,
         budget_m=budget_m,
@@ -24,7 +33,9 @@ def demand(sigma_subap: float = 0.005, budget_m: float = 10e-9, drift: np.ndarra
     )
 
 
-def worst_of_a_simulated_filter(found: Schedule, asked: Demand, kappa: np.ndarray) -> np.ndarray:
+def worst_of_a_simulated_filter(
+    found: Schedule, asked: DitherRequirement, kappa: np.ndarray
+) -> np.ndarray:
     """σ before each window once a Kalman filter on this schedule has settled, ``(4,)``."""
     noise = kappa**2 / (found.total_m**2 * asked.window_s)
     before = np.full(4, 1.0)

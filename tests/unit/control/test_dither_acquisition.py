@@ -10,7 +10,7 @@ from service.control.dither import (
     FEWEST_LINES,
     FINER,
     LINE_BAND,
-    MOST_LINES,
+    MAX_LINES,
     SMOOTH,
     lines_of,
     modes_of,
@@ -35,7 +35,7 @@ def test_in_a_long_basis_the_bands_are_those_that_were_studied():
 @pytest.mark.parametrize("rate_hz", [300.0, 500.0, 990.0, 1000.0, 2000.0])
 def test_every_line_has_whole_periods_and_room_for_its_noise(rate_hz):
     lines = lines_of(rate_hz, 2.0, 8)
-    assert FEWEST_LINES <= len(lines) <= MOST_LINES
+    assert FEWEST_LINES <= len(lines) <= MAX_LINES
     assert all((2.0 * line) % 1.0 == 0.0 for line in lines)
     assert min(b - a for a, b in combinations(sorted(lines), 2)) >= CLEARANCE_HZ
     assert LINE_BAND[0] * rate_hz <= min(lines)

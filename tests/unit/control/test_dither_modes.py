@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from service.control.dither import information, most_telling
+from service.control.dither import information, most_informative
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
@@ -37,7 +37,7 @@ def test_information_is_that_of_a_fit_with_the_modes_gain_free(linearisation):
 
 def test_no_exchange_of_one_mode_improves_the_chosen_set(linearisation):
     found = information(linearisation)
-    chosen = most_telling(found, range(12), 4, WANTED)
+    chosen = most_informative(found, range(12), 4, WANTED)
     assert len(set(chosen)) == 4
     for place, other in itertools.product(range(4), set(range(12)) - set(chosen)):
         exchanged = [*chosen[:place], other, *chosen[place + 1 :]]
@@ -45,17 +45,17 @@ def test_no_exchange_of_one_mode_improves_the_chosen_set(linearisation):
 
 
 def test_only_candidates_are_chosen(linearisation):
-    assert set(most_telling(information(linearisation), range(5, 30), 3, WANTED)) <= set(
+    assert set(most_informative(information(linearisation), range(5, 30), 3, WANTED)) <= set(
         range(5, 12)
     )
 
 
 def test_fewer_candidates_than_wanted_are_all_taken(linearisation):
-    assert most_telling(information(linearisation), range(9, 40), 4, WANTED) == (9, 10, 11)
+    assert most_informative(information(linearisation), range(9, 40), 4, WANTED) == (9, 10, 11)
 
 
 def test_what_is_wanted_decides_which_modes_tell_most(linearisation):
     found = information(linearisation)
-    only_rotation = most_telling(found, range(12), 1, np.array([1e3, 1e3, 1e-4, 1e3]))
+    only_rotation = most_informative(found, range(12), 1, np.array([1e3, 1e3, 1e-4, 1e3]))
     variances = [np.linalg.inv(found[mode])[2, 2] for mode in range(12)]
     assert only_rotation == (int(np.argmin(variances)),)

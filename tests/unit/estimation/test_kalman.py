@@ -15,7 +15,7 @@ from service.estimation.kalman import (
     allowing,
     begin_joint,
     corrected,
-    forgotten,
+    forget,
     innovation,
     predicted,
     widened,
@@ -139,7 +139,7 @@ class TestBias:
             joint = corrected(joint, NOWHERE, DITHERED)
             joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
         assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, PASSIVE) > JUMP_THRESHOLD
-        gone = forgotten(joint)
+        gone = forget(joint)
         np.testing.assert_array_equal(gone.alpha, joint.alpha)
         np.testing.assert_array_equal(gone.alpha_covariance, joint.alpha_covariance)
         np.testing.assert_array_equal(gone.covariance[4:, 4:], np.diag(BIAS_FLOOR**2))
@@ -199,7 +199,7 @@ class TestExcess:
 
     def test_what_is_forgotten_is_as_uncertain_as_the_look_that_made_it_be(self):
         excess = np.array([0.05, 0.0, 0.0, 0.0])
-        gone = forgotten(allowing(begin_joint(NOWHERE, DITHERED), 3.0 * excess), excess)
+        gone = forget(allowing(begin_joint(NOWHERE, DITHERED), 3.0 * excess), excess)
         np.testing.assert_allclose(np.diag(gone.covariance)[4:], BIAS_FLOOR**2 + excess)
         np.testing.assert_array_equal(gone.excess, excess)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.estimation.comb import SIDE_OFFSETS_HZ
+from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra, joined
 from service.estimation.windows import WindowRefused

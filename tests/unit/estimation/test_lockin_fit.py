@@ -12,9 +12,9 @@ from service.estimation import lockin
 from service.estimation.lockin import (
     MAX_LAG_FRAMES,
     LockIn,
+    LockInEstimate,
     LockInPlan,
     Spectra,
-    WindowEstimate,
     closed_loop_responses,
     fit_window,
 )
@@ -97,7 +97,7 @@ def demodulated(case: Case, block) -> list[Spectra]:
     return ended
 
 
-def settled(case: Case, spectra: list[Spectra]) -> list[WindowEstimate]:
+def settled(case: Case, spectra: list[Spectra]) -> list[LockInEstimate]:
     """Estimates about a linearisation where the first of them are, found from α = 0 in rounds."""
     linearisation = small_linearisation()
     for _ in range(2):
@@ -108,16 +108,16 @@ def settled(case: Case, spectra: list[Spectra]) -> list[WindowEstimate]:
 
 
 @cache
-def bright_estimates() -> list[WindowEstimate]:
+def bright_estimates() -> list[LockInEstimate]:
     return settled(BRIGHT, bright_windows())
 
 
 @cache
-def faint_estimates() -> list[WindowEstimate]:
+def faint_estimates() -> list[LockInEstimate]:
     return settled(FAINT, faint_windows())
 
 
-def errors(case: Case, estimates: list[WindowEstimate]) -> np.ndarray:
+def errors(case: Case, estimates: list[LockInEstimate]) -> np.ndarray:
     return np.array([e.alpha.vector for e in estimates]) - case.sky.alpha.vector
 
 

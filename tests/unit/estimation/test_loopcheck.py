@@ -10,8 +10,8 @@ from service.estimation.loopcheck import (
     ENOUGH_SAMPLES,
     KEPT_SAMPLES,
     LoopCheck,
+    command_residual,
     last_samples,
-    obedience,
     observe,
 )
 from service.estimation.windows import ClosedLoop
@@ -110,7 +110,7 @@ def verdict(telemetry, told=None, first_seq=500, **how):
     check = LoopCheck()
     for block in blocks(telemetry, **how):
         check = observe(check, block, told)
-    return obedience(check, told, first_seq, 10**9)[1]
+    return command_residual(check, told, first_seq, 10**9)[1]
 
 
 @pytest.mark.parametrize("delay", [1, 2, 3])
@@ -209,7 +209,7 @@ def test_a_hole_or_another_matrix_costs_samples_only():
     for number, block in enumerate(blocks(closed_loop(), (50,))):
         if number % 7:
             check = observe(check, block, told)
-    _, found = obedience(check, told, 0, 10**9, enough=5)
+    _, found = command_residual(check, told, 0, 10**9, enough=5)
     np.testing.assert_allclose(found.share, 1.0, atol=1e-3)
 
 
@@ -217,7 +217,7 @@ def test_frames_that_may_be_of_an_older_loop_are_left_out():
     check, told = LoopCheck(from_seq=1000), terms()
     for block in blocks(closed_loop()):
         check = observe(check, block, told)
-    check, _ = obedience(check, told, 0, 10**9)
+    check, _ = command_residual(check, told, 0, 10**9)
     first, last = last_samples(check, 10**9)
     assert 1000 <= first < last < 2500
     assert last_samples(check, 1100) is None
@@ -227,7 +227,7 @@ def test_the_last_samples_span_a_second():
     check, told = LoopCheck(), terms()
     for block in blocks(closed_loop()):
         check = observe(check, block, told)
-    check, _ = obedience(check, told, 0, 10**9)
+    check, _ = command_residual(check, told, 0, 10**9)
     first, last = last_samples(check, 1800)
     assert last <= 1800
     assert last - first == (ENOUGH_SAMPLES - 1) * 50
@@ -247,5 +247,5 @@ def test_frames_of_another_matrix_begin_another_check():
     check = observe(LoopCheck(), first, old)
     for block in blocks(closed_loop(matrix=INVERSE[:12], gains=GAINS[:12]), first=300):
         check = observe(check, replace(block, cm_id="cm-2"), new)
-    assert obedience(check, old, 0, 10**9)[1] is None
-    assert obedience(check, new, 0, 10**9)[1].holds
+    assert command_residual(check, old, 0, 10**9)[1] is None
+    assert command_residual(check, new, 0, 10**9)[1].holds

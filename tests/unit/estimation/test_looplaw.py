@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.looplaw import KEPT_FRAMES, LoopLaw, follow, judged
+from service.estimation.control_law import KEPT_FRAMES, ControlLawCheck, follow, judged
 from tests.unit.estimation.test_loopcheck import GAINS, INVERSE, blocks, closed_loop, terms
 
 
 def found(telemetry, told=None, *, keep=lambda block: True, **how):
-    told, law = told or terms(), LoopLaw()
+    told, law = told or terms(), ControlLawCheck()
     for block in blocks(telemetry, **how):
         if keep(block):
             law = follow(law, block, told)
@@ -115,7 +115,7 @@ def test_a_mirror_that_clips_now_and_then_is_no_other_leak(stroke_m):
 
 
 def test_frames_of_another_matrix_are_forgotten():
-    telemetry, told, law = closed_loop(), terms(), LoopLaw()
+    telemetry, told, law = closed_loop(), terms(), ControlLawCheck()
     for block in blocks(telemetry):
         law = follow(law, block, told)
     law = follow(law, replace(block, cm_id="cm-2"), replace(told, cm_id="cm-2"))
@@ -125,7 +125,7 @@ def test_frames_of_another_matrix_are_forgotten():
 
 
 def test_a_verdict_is_given_on_new_frames_only():
-    told, law = terms(), LoopLaw()
+    told, law = terms(), ControlLawCheck()
     for block in blocks(closed_loop()):
         law = follow(law, block, told)
     law, first = judged(law, told, 2499)
@@ -134,7 +134,7 @@ def test_a_verdict_is_given_on_new_frames_only():
 
 
 def test_frames_that_no_verdict_will_look_at_are_left_out_and_it_is_the_same():
-    told, every, some, left_out = terms(), LoopLaw(), LoopLaw(), 0
+    told, every, some, left_out = terms(), ControlLawCheck(), ControlLawCheck(), 0
     for block in blocks(closed_loop()):
         every, before = follow(every, block, told), some
         some = follow(some, block, told)

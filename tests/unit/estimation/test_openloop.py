@@ -8,7 +8,7 @@ import pytest
 
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.estimation.lockin import LockIn, LockInPlan
-from service.estimation.openloop import UNEXPLAINED, FarEstimate, FarSearch, find
+from service.estimation.openloop import UNEXPLAINED, WideCaptureEstimate, WideCaptureSearch, find
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
@@ -70,14 +70,14 @@ def model(modes, sampling):
 
 def look(spectra, *starts):
     modes = spectra.plan.modes
-    search = FarSearch(
-        far=model(modes, 1), near=model(modes, 2), nominal=NOMINAL, starts=starts or (NOMINAL,)
+    search = WideCaptureSearch(
+        coarse=model(modes, 1), fine=model(modes, 2), nominal=NOMINAL, starts=starts or (NOMINAL,)
     )
     return find(spectra, search)
 
 
 def error(found, alpha):
-    assert isinstance(found, FarEstimate), found
+    assert isinstance(found, WideCaptureEstimate), found
     return np.abs(found.estimate.alpha.vector - alpha.vector)
 
 
@@ -137,5 +137,7 @@ def test_columns_a_frame_apart_are_refused():
 
 def test_without_a_start_nothing_is_found():
     modes = plan().modes
-    nowhere = FarSearch(far=model(modes, 1), near=model(modes, 2), nominal=NOMINAL, starts=())
+    nowhere = WideCaptureSearch(
+        coarse=model(modes, 1), fine=model(modes, 2), nominal=NOMINAL, starts=()
+    )
     assert isinstance(find(window(FAR), nowhere), WindowRefused)

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation.dither_monitor import DitherMonitor, ExpectedDither, measure_block
 from service.estimation.frames import FrameBlock
-from service.estimation.played import Asked, Meter, measured
 
 RATE_HZ = 1000.0
 N_MODES = 12
-ASKED = Asked(
+ASKED = ExpectedDither(
     modes=(8, 9, 10, 11),
     amplitude_m=(4e-9,) * 4,
     frequency_hz=(211.0, 239.0, 283.0, 331.0),
@@ -37,7 +37,7 @@ def columns(first_seq, n, *, asked=ASKED, by=1.0, shift_hz=0.0, modes=None):
 
 
 def played(dither, *, asked=ASKED, commands=None, slopes=None, seconds=1):
-    meter, found = Meter(asked=asked), []
+    monitor, found = DitherMonitor(asked=asked), []
     for k in range(20 * seconds):
         first_seq, n = asked.first_seq + 50 * k, 50
         held = dither(first_seq, n).astype(np.float32)
@@ -52,7 +52,7 @@ def played(dither, *, asked=ASKED, commands=None, slopes=None, seconds=1):
             dither_m=held,
             cm_id="initial",
         )
-        meter, new = measured(meter, block)
+        monitor, new = measure_block(monitor, block)
         found += [] if new is None else [new]
     return found
 

@@ -68,7 +68,7 @@ def test_text_is_no_matrix(hdf5):
 
 
 def test_an_array_too_large_for_memory_is_not_read(hdf5, monkeypatch):
-    monkeypatch.setattr(container, "MOST_BYTES", 40)
+    monkeypatch.setattr(container, "MAX_BYTES", 40)
     assert "found shape (2, 3)" in refused(hdf5, "big")
 
 

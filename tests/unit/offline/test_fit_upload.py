@@ -10,7 +10,7 @@ import h5py
 import pytest
 
 from pyrcal.offline import matrix
-from pyrcal.offline.fit_upload import MOST_FILES, fit_upload, opened_parcel
+from pyrcal.offline.fit_upload import MOST_FILES, fit_upload, open_upload
 from service.cli.serve import FIT_PROGRAM
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError
@@ -39,7 +39,7 @@ def zipped(tmp_path, **contents):
 
 def refused(path, folder, reference=None, most=1_000_000):
     with pytest.raises((MatrixError, ConfigurationError)) as error:
-        opened_parcel(path, folder, reference, most)
+        open_upload(path, folder, reference, most)
     assert "\n" not in str(error.value)
     return str(error.value)
 
@@ -48,18 +48,18 @@ def test_a_file_alone_is_the_measured_one(tmp_path, unpacked):
     path = tmp_path / "upload"
     with h5py.File(path, "w") as file:
         file["D"] = [1.0]
-    parcel = opened_parcel(path, unpacked, None, 100)
-    assert parcel.reference == path
-    assert parcel.instrument is None
+    upload = open_upload(path, unpacked, None, 100)
+    assert upload.reference == path
+    assert upload.instrument is None
 
 
 def test_in_an_archive_what_the_instrument_refers_to_is_not_the_measured_file(tmp_path, unpacked):
     path = zipped(
         tmp_path, my_dot_toml=TOML, mask_dot_h5="m", modes_dot_fits="c", night_dot_h5="measured"
     )
-    parcel = opened_parcel(path, unpacked, None, 1_000_000)
-    assert parcel.instrument == unpacked / "my.toml"
-    assert parcel.reference.read_text() == "measured"
+    upload = open_upload(path, unpacked, None, 1_000_000)
+    assert upload.instrument == unpacked / "my.toml"
+    assert upload.reference.read_text() == "measured"
 
 
 def test_where_several_could_be_it_the_measured_file_is_named(tmp_path, unpacked):
@@ -68,7 +68,7 @@ def test_where_several_could_be_it_the_measured_file_is_named(tmp_path, unpacked
     assert "b.h5, c.h5" in text
     assert "reference=" in text
     (again := unpacked / "again").mkdir()
-    assert opened_parcel(path, again, "c.h5", 1_000_000).reference.read_text() == "c"
+    assert open_upload(path, again, "c.h5", 1_000_000).reference.read_text() == "c"
 
 
 def test_a_name_that_is_not_in_the_archive_is_refused(tmp_path, unpacked):
@@ -167,7 +167,7 @@ REQUEST = FitRequest(
     asked=ASKED,
     own_instrument=str(OWN),
     own_sha256=instrument_sha256(load_instrument(OWN)),
-    most_bytes=1_000_000,
+    max_bytes=1_000_000,
     threads=1,
     nice=0,
     memory_mb=4000,

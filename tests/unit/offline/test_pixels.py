@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from service.errors import MatrixError
-from service.estimation.dialect import of_answer
 from service.estimation.models import FitModels
 from service.estimation.orientation import Pose, find_orientation
 from service.estimation.reference import Reference
+from service.estimation.slope_convention import of_answer
 from service.estimation.solver import nuisances_of
 from service.model.interaction import valid_subapertures
 from service.model.kinds import SignalKind, SlopeOrder
@@ -55,8 +55,8 @@ def test_noise_is_no_worse_for_pixels_than_for_slopes_and_within_what_the_fit_sa
 def test_how_the_images_lie_is_found_where_it_is_not_told(order):
     """But for quarter turns of everything, which nobody can see."""
     rows = listed(matrix(about=PIXELS), order, ODD)
-    told = SlopeOrder.IMAGES if order is SlopeOrder.IMAGES_YX else order
-    search = find_orientation(instrument(None, told), Reference(matrix=rows), small_basis())
+    reported = SlopeOrder.IMAGES if order is SlopeOrder.IMAGES_YX else order
+    search = find_orientation(instrument(None, reported), Reference(matrix=rows), small_basis())
     assert search.refusal == ""
     expected = Pose(
         slopes=SlopeRecipe(order=order, orientation=ODD), rotation_rad=0.0, correlation=1.0

@@ -47,24 +47,24 @@ def test_the_file_says_where_it_comes_from_and_holds_the_document(path):
 
 
 def test_a_product_gives_back_the_fit(path):
-    known = read_fit(written(path, a_report()))
-    np.testing.assert_allclose(known.alpha.vector, ALPHA.vector)
-    np.testing.assert_allclose(known.covariance, a_fit().covariance)
-    np.testing.assert_allclose(known.gains, GAINS)
-    assert known.modes.tolist() == [0, 1, 4]
-    assert known.orientation == Orientation(flip_x=True, sign_y=-1)
-    assert known.order is SlopeOrder.YX
-    assert (known.double_pass, known.accepted) == (True, True)
+    fit = read_fit(written(path, a_report()))
+    np.testing.assert_allclose(fit.alpha.vector, ALPHA.vector)
+    np.testing.assert_allclose(fit.covariance, a_fit().covariance)
+    np.testing.assert_allclose(fit.gains, GAINS)
+    assert fit.modes.tolist() == [0, 1, 4]
+    assert fit.orientation == Orientation(flip_x=True, sign_y=-1)
+    assert fit.order is SlopeOrder.YX
+    assert (fit.double_pass, fit.accepted) == (True, True)
 
 
 def test_a_document_gives_back_what_it_has(tmp_path):
     path = tmp_path / "fit.json"
     path.write_text(json.dumps(document(a_report(a_fit(accepted=False, verdict="refused: x")))))
-    known = read_fit(path)
-    np.testing.assert_allclose(known.covariance, a_fit().covariance)
-    assert known.accepted is False
-    assert known.gains is None
-    assert known.reference_sha256 is None
+    fit = read_fit(path)
+    np.testing.assert_allclose(fit.covariance, a_fit().covariance)
+    assert fit.accepted is False
+    assert fit.gains is None
+    assert fit.reference_sha256 is None
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"[]", b"\xff\xfe", b'{"orientation": 3}'])

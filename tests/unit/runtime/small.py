@@ -8,7 +8,7 @@ import numpy as np
 
 from service.config import load_instrument
 from service.control.loop import ControlLoop
-from service.files.prepared import usual_folder
+from service.files.disk_cache import usual_folder
 from service.runtime.worker import Compute, Conditions
 
 INSTRUMENT = Path(__file__).with_name("small.toml")

@@ -133,7 +133,7 @@ async def test_nothing_unknown_is_sent(actions):
 
 async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(actions, archive):
     source, state = await made(actions)
-    effect = ev.CopyMatrix(source=source.id, why="back")
+    effect = ev.RepublishMatrix(source=source.id, why="back")
     event = await actions.perform(effect, state)
     copy = event.record
     assert event.wanted
@@ -155,7 +155,7 @@ async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(actions, a
 )
 async def test_a_copy_that_cannot_be_judged_says_so(actions, changes, unknown):
     source, state = await made(actions)
-    copied = ev.CopyMatrix(source=source.id, why="back")
+    copied = ev.RepublishMatrix(source=source.id, why="back")
     copy = (await actions.perform(copied, replace(state, **changes))).record
     assert (copy.gate, copy.state) == (None, MatrixState.PROPOSED)
     assert copy.reason.startswith(f"back; the gate could not judge it: {unknown}")
@@ -165,11 +165,12 @@ async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(actions):
     source, state = await made(actions)
     far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
     event = await actions.perform(
-        ev.CopyMatrix(source=source.id, why="back"), replace(state, registration=far)
+        ev.RepublishMatrix(source=source.id, why="back"), replace(state, registration=far)
     )
     assert event.record.state is MatrixState.REFUSED
     event = await actions.perform(
-        ev.CopyMatrix(source=source.id, why="back", anyway=True), replace(state, registration=far)
+        ev.RepublishMatrix(source=source.id, why="back", anyway=True),
+        replace(state, registration=far),
     )
     assert (event.record.state, event.record.gate, event.anyway) == (
         MatrixState.PROPOSED,

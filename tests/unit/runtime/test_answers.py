@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, LinkError
-from service.runtime.answers import Given
+from service.runtime.command_results import CarriedOut
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -25,11 +25,11 @@ from tests.unit.tracking.test_activity import (
 def given(world, command):
     before = world.state
     world.tell(command)
-    return Given(command, before, world.state)
+    return CarriedOut(command, before, world.state)
 
 
 def told(order, world):
-    answer = order.answer(world.state)
+    answer = order.result(world.state)
     assert answer.text
     assert "\n" not in answer.text
     return answer.text, answer.final
@@ -72,7 +72,7 @@ SILENT = "sent, the RTC has not answered yet"
 def test_an_approval_tells_the_frame():
     world = sending()
     name = world.state.reconstructors[-1].id
-    order = Given(cmd.Approve(id=name), world.state, world.state)
+    order = CarriedOut(cmd.Approve(id=name), world.state, world.state)
     first, last = answered_in_the_end(world, order)
     assert first == (f"{name} {SILENT}", False)
     frame = world.state.reconstructor(name).applied_frame_seq
@@ -95,7 +95,9 @@ def test_a_rollback_tells_which_one_went_out_under_which_name_and_that_it_is_hol
 def test_a_copy_that_may_not_be_sent_now_is_said_to_be_kept_and_why():
     world = idle()
     order = given(world, cmd.Rollback())
-    world.tell(ev.Trouble(name="matrix-mismatch", text="the RTC's matrix is of other slopes"))
+    world.tell(
+        ev.ConditionChanged(name="matrix-mismatch", text="the RTC's matrix is of other slopes")
+    )
     world.pass_(2.0)
     (text, final) = told(order, world)
     new = world.state.reconstructors[-1].id
@@ -111,17 +113,17 @@ def test_a_copy_that_the_gate_refuses_tells_why_and_that_one_can_go_back_anyway(
     world.tell(ev.MatrixMade(record=back, wanted=True))
     words = f"the gate refused cm-back: {back.gate.reason}; ordered with anyway"
     with pytest.raises(CommandError, match=words):
-        order.answer(world.state)
+        order.result(world.state)
 
 
 def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
     world = idle()
     order = given(world, cmd.Rollback())
     world.pending.clear()
-    effect = ev.CopyMatrix(source="initial", why="so")
+    effect = ev.RepublishMatrix(source="initial", why="so")
     world.tell(ev.JobFailed(effect=effect, text="initial.h5: damaged"))
     with pytest.raises(CommandError, match=r"initial\.h5: damaged"):
-        order.answer(world.state)
+        order.result(world.state)
 
 
 @pytest.mark.parametrize(
@@ -134,27 +136,27 @@ def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
 def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
     world = sending()
     name = world.state.reconstructors[-1].id
-    order = Given(cmd.Approve(id=name), world.state, world.state)
+    order = CarriedOut(cmd.Approve(id=name), world.state, world.state)
     world.pending.clear()
     if state is None:
         world.pass_(6.0)
     else:
         world.tell(acknowledged(name, state=state, reason="range: too large"))
     with pytest.raises(kind, match=words):
-        order.answer(world.state)
+        order.result(world.state)
 
 
 def test_what_the_gate_refuses_at_the_last_moment_is_a_refusal():
     world = sending()
     record = world.state.reconstructors[-1]
-    order = Given(cmd.Approve(id=record.id), world.state, world.state)
+    order = CarriedOut(cmd.Approve(id=record.id), world.state, world.state)
     refused = MatrixState.REFUSED
     reason = verdict(accepted=False).reason
     changed = replace(record, state=refused, reason=reason)
     others = tuple(r for r in world.state.reconstructors if r.id != record.id)
     now = replace(world.state, reconstructors=(*others, changed))
     with pytest.raises(CommandError, match=f"the gate refused {record.id}: {reason}"):
-        order.answer(now)
+        order.result(now)
 
 
 def test_a_dither_tells_its_first_frame_and_its_cost():
@@ -175,7 +177,7 @@ def test_a_dither_the_rtc_will_not_play_is_a_refusal():
     reply = Reply(id=request.id, accepted=False, reason="busy: other", start_seq=None)
     world.tell(ev.Answered(request=request, reply=reply))
     with pytest.raises(CommandError, match="the RTC refused the dither: busy: other"):
-        order.answer(world.state)
+        order.result(world.state)
 
 
 def test_a_dither_is_over_when_the_status_shows_none():
@@ -203,7 +205,7 @@ def test_a_ramp_the_rtc_refuses_is_a_refusal():
     reply = Reply(id=request.id, accepted=False, reason="unsupported: ramp", start_seq=None)
     world.tell(ev.Answered(request=request, reply=reply))
     with pytest.raises(CommandError, match="the RTC refused: unsupported: ramp"):
-        order.answer(world.state)
+        order.result(world.state)
 
 
 def test_a_measurement_tells_its_first_frame():

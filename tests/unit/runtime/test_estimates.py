@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.estimation import passive
-from service.runtime.estimates import Backlog, watched
+from service.runtime.estimates import PendingWindow, fit_passive
 from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.loop import loop_numbers
@@ -24,7 +24,7 @@ class Worker:
         self.begun_at = []
 
     async def call(self, job, sums, start):
-        assert job is OpticsWorker.watch
+        assert job is OpticsWorker.fit_passive
         self.begun_at.append(start)
         return look(ALPHA)
 
@@ -38,26 +38,26 @@ def sums():
 async def test_a_look_is_taken_though_alpha_is_not_known(sums):
     """It says what it can tell, from the nominal rotation on; the tracker says what it is worth."""
     worker, story = Worker(), Story(Mode.HOLD).meet()
-    event = await watched(sums, story.state, worker)
+    event = await fit_passive(sums, story.state, worker)
     assert worker.begun_at == [None]
     assert event.loop == loop_numbers(story.state.rtc)
     assert event.t_ns_utc == sums.tail.t0_ns_utc + 39 * sums.tail.dt_ns
     story.tell(event)
-    await watched(sums, story.state, worker)
+    await fit_passive(sums, story.state, worker)
     assert worker.begun_at[1] == ALPHA
 
 
 async def test_why_there_is_none_is_told_once():
     worker, story = Worker(), Story(Mode.HOLD).meet()
-    event = await watched("the loop is open", story.state, worker)
-    assert event == ev.Unwatched(text="the loop is open")
+    event = await fit_passive("the loop is open", story.state, worker)
+    assert event == ev.PassiveUnavailable(text="the loop is open")
     story.tell(event)
-    assert await watched("the loop is open", story.state, worker) is None
+    assert await fit_passive("the loop is open", story.state, worker) is None
     assert worker.begun_at == []
 
 
 async def test_windows_that_end_while_one_waits_are_joined_to_it():
-    backlog, windows = Backlog(), run(telemetry(6200))
+    backlog, windows = PendingWindow(), run(telemetry(6200))
     assert [backlog.put(window) for window in windows] == [None] * 6
     await backlog.some()
     window = backlog.take()
@@ -68,7 +68,7 @@ async def test_windows_that_end_while_one_waits_are_joined_to_it():
 
 
 async def test_a_window_that_cannot_be_joined_is_given_up_and_why_is_said():
-    backlog, (first, second) = Backlog(), run(telemetry(2200))
+    backlog, (first, second) = PendingWindow(), run(telemetry(2200))
     backlog.put(first)
     refused = backlog.put(replace(second, cm_id="another"))
     assert refused.t_ns_utc == first.t_end_ns_utc
@@ -77,7 +77,7 @@ async def test_a_window_that_cannot_be_joined_is_given_up_and_why_is_said():
 
 
 async def test_no_window_becomes_so_long_that_alpha_moves_in_it():
-    backlog, (first, second) = Backlog(), run(telemetry(2200))
+    backlog, (first, second) = PendingWindow(), run(telemetry(2200))
     backlog.put(first)
     late = replace(second, t_end_ns_utc=first.t_end_ns_utc + 31 * 10**9)
     assert "for 30 s" in backlog.put(late).reason

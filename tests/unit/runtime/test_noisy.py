@@ -156,7 +156,7 @@ async def test_nothing_that_publishes_finds_one(workers, archive):
     state = replace(STATE, rtc=rtc())
     for effect in (
         ev.SendMatrix(id="noisy-1", n_modes=30, gains=None),
-        ev.CopyMatrix(source="noisy-1", why="a mistake"),
+        ev.RepublishMatrix(source="noisy-1", why="a mistake"),
     ):
         with pytest.raises(UnknownIdError, match="noisy-1"):
             await actions.perform(effect, state)

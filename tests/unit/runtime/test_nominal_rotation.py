@@ -51,10 +51,10 @@ def test_alpha_is_tracked_and_no_healthy_loop_is_opened(turned):
         night = Observatory(words, policy, Mode.AUTO, bench, with_poles=False)
         night.advance(10.0)
     assert night.state.acquisition.stage is AcquisitionStage.IDLE
-    known = night.state.registration
-    assert known.n_windows >= 3
-    error = known.alpha.vector - night.dome.alpha.vector
-    assert (np.abs(error) < 5.0 * known.sigma).all()
+    registration = night.state.registration
+    assert registration.n_windows >= 3
+    error = registration.alpha.vector - night.dome.alpha.vector
+    assert (np.abs(error) < 5.0 * registration.sigma).all()
 
 
 @pytest.mark.timeout(60)
@@ -85,6 +85,6 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
             supervisor._post(rtc())
             near = Misregistration(rotation_rad=np.deg2rad(NOMINAL_DEG + 0.2))
             supervisor._post(ev.WindowFitted(estimate=estimate(near)))
-            known = supervisor.snapshot().tracker.registration
+            registration = supervisor.snapshot().tracker.registration
     workers.close()
-    assert known.alpha == near
+    assert registration.alpha == near

@@ -10,8 +10,8 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.health import LOW_MODES
 from service.runtime.engine import shape_mismatch
-from service.runtime.looks import taken
-from service.runtime.streams import Streams, fed, with_rtc
+from service.runtime.estimator_bank import EstimatorBank, process_block, with_rtc
+from service.runtime.passive_sums import take_passive_sums
 from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking.registration import Source
@@ -67,14 +67,14 @@ def test_the_gate_judges_the_modes_that_move_by_the_bound_it_was_given(night):
 def test_ordinary_telemetry_is_looked_at_and_agrees(night):
     looks = [entry for entry in night.state.history if entry.source is Source.PASSIVE]
     assert looks
-    assert night.state.watchdog.consistent
+    assert night.state.passive.consistent
 
 
 @pytest.fixture
 def many():
     """Streams of a mirror whose outer ring can be watched."""
     variance = np.full(N_MANY, 1e-16)
-    return Streams(
+    return EstimatorBank(
         description=replace(DESCRIPTION, n_modes=N_MANY, mode_variance_m2=variance, actuators=RING)
     )
 
@@ -98,41 +98,41 @@ class TestTheStreams:
     GAINS = (*(0.4,) * 60, *(0.0,) * 5, *(0.4,) * (N_MANY - 65))
 
     def test_the_edge_is_watched_on_the_modes_that_move(self, many):
-        streams = with_rtc(many, partial(self.GAINS))
-        assert streams.edge_watch is not None
-        assert not np.isin(np.arange(60, 65), streams.edge_watch.modes).any()
+        bank = with_rtc(many, partial(self.GAINS))
+        assert bank.edge_watch is not None
+        assert not np.isin(np.arange(60, 65), bank.edge_watch.modes).any()
         few = (*(0.4,) * (2 * LOW_MODES), *(0.0,) * (N_MANY - 2 * LOW_MODES))
         assert with_rtc(many, partial(few)).edge_watch is None
 
     def test_what_stands_in_the_others_is_no_instrument_of_the_passive_estimate(self, many):
-        streams = with_rtc(many, partial(self.GAINS))
+        bank = with_rtc(many, partial(self.GAINS))
         for first_seq in range(0, 2000, 10):
-            streams, _ = fed(streams, standing(first_seq))
-        _, heard = taken(streams)
+            bank, _ = process_block(bank, standing(first_seq))
+        _, heard = take_passive_sums(bank)
         _, moved, power = heard.sums
         assert not power[60:65].any()
         assert not moved[60:65].any()
         assert np.diag(power)[:60].all()
 
     def test_a_dither_of_theirs_is_one(self, many):
-        streams, rng = with_rtc(many, partial(self.GAINS)), np.random.default_rng(1)
+        bank, rng = with_rtc(many, partial(self.GAINS)), np.random.default_rng(1)
         for first_seq in range(0, 2000, 10):
-            streams, _ = fed(streams, standing(first_seq, 1e-8 * rng.standard_normal(10)))
-        _, heard = taken(streams)
+            bank, _ = process_block(bank, standing(first_seq, 1e-8 * rng.standard_normal(10)))
+        _, heard = take_passive_sums(bank)
         expected, power = heard.n_effective * 1e-16, heard.sums[2]
         assert 0.1 * expected < power[62, 62] < 10.0 * expected
         assert not power[61].any()
 
     def test_without_any_gain_it_is_open_and_says_nothing(self, many):
-        streams = with_rtc(many, partial((0.0,) * N_MANY))
-        assert streams.edge_watch is None
-        assert taken(streams)[1] == "no passive estimate: all gains of the loop are 0"
-        streams, _ = fed(streams, driven(0, 1e-3))
-        assert not streams.health.diverging
+        bank = with_rtc(many, partial((0.0,) * N_MANY))
+        assert bank.edge_watch is None
+        assert take_passive_sums(bank)[1] == "no passive estimate: all gains of the loop are 0"
+        bank, _ = process_block(bank, driven(0, 1e-3))
+        assert not bank.health.diverging
 
     def test_an_rtc_of_more_modes_than_the_instrument_file_knows_ends_nothing(self, many):
         """It is named, and its frames are not used, as soon as its status has been seen."""
         other = replace(MANY, n_modes=2 * N_MANY, n_controlled=100, gains=(0.4,) * 2 * N_MANY)
-        streams = with_rtc(many, other)
-        assert shape_mismatch(streams.description, other)
-        assert streams.in_loop.max() < N_MANY
+        bank = with_rtc(many, other)
+        assert shape_mismatch(bank.description, other)
+        assert bank.in_loop.max() < N_MANY

@@ -10,7 +10,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn
 from service.estimation.random_dither import Correlated
 from service.estimation.windows import WindowRefused
-from service.runtime.streams import Streams, fed, with_dither, with_rtc
+from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
 from service.runtime.worker import Description
 from service.tracking.dither_request import Dither, plan_random
 from service.tracking.products import ModeSet
@@ -52,13 +52,13 @@ def block(first_seq, n=100, *, dither=True, cm_id="initial"):
 
 @pytest.fixture
 def streams():
-    return with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), DITHER, 2.0)
+    return with_dither(with_rtc(EstimatorBank(description=DESCRIPTION), RTC), DITHER, 2.0)
 
 
 def play(streams, first_seq, n_blocks, **changes):
     windows = []
     for index in range(n_blocks):
-        streams, ended = fed(streams, block(first_seq + 100 * index, **changes))
+        streams, ended = process_block(streams, block(first_seq + 100 * index, **changes))
         windows += ended
     return streams, windows
 

@@ -10,7 +10,7 @@ from service.errors import StorageError
 from service.runtime import recording
 from service.runtime.recording import Recorder
 from service.tracking import events as ev
-from service.tracking.registration import MoveState
+from service.tracking.registration import OffloadState
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.wire import OffloadRequest
 from tests.system.pace import patience
@@ -74,7 +74,7 @@ async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
     def refuse(*_):
         raise StorageError("full")
 
-    monkeypatch.setattr(recording, "MOST_WAITING", 3)
+    monkeypatch.setattr(recording, "MAX_WAITING", 3)
     with monkeypatch.context() as patch:
         patch.setattr(archive, "record", refuse)
         measured(recorder, 0, 5)
@@ -95,8 +95,8 @@ class TestDemandToMoveTheImage:
         recorder = Recorder(archive, lambda: story.state, lambda event: None)
         (asked,) = story.asked(OffloadRequest)
         await recorder.before(ev.Ask(request=asked))
-        move = archive.tracking.read().move
-        assert (move.id, move.state) == (asked.id, MoveState.ASKED)
+        move = archive.tracking.read().offload
+        assert (move.id, move.state) == (asked.id, OffloadState.ASKED)
 
     async def test_it_is_not_asked_where_the_disk_refuses(self, archive, monkeypatch):
         def refuse(*_):
@@ -111,15 +111,15 @@ class TestDemandToMoveTheImage:
 
     async def test_a_write_that_began_before_it_does_not_come_after_it(self, archive, monkeypatch):
         story = a_story()
-        states = [replace(story.state, move=None), story.state]
+        states = [replace(story.state, offload=None), story.state]
         (asked,) = story.asked(OffloadRequest)
         writing, go_on, written = threading.Event(), threading.Event(), []
 
         def slowly(_archive, state, _now_ns):
-            if state.move is None:
+            if state.offload is None:
                 writing.set()
                 assert go_on.wait(patience(20.0))
-            written.append(state.move)
+            written.append(state.offload)
 
         monkeypatch.setattr(recording, "leave", slowly)
         recorder = Recorder(archive, lambda: states[0], lambda event: None)
@@ -130,4 +130,4 @@ class TestDemandToMoveTheImage:
         await asyncio.wait({second}, timeout=0.2)
         go_on.set()
         await asyncio.gather(first, second)
-        assert written == [None, story.state.move]
+        assert written == [None, story.state.offload]

@@ -10,8 +10,8 @@ from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.runtime.engine import Engine
-from service.runtime.estimates import Backlog
-from service.runtime.recording import has_news, is_urgent, leave, taken_up
+from service.runtime.estimates import PendingWindow
+from service.runtime.recording import is_unsaved, is_urgent, leave, taken_up
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -36,7 +36,7 @@ class TestWhatCannotWait:
             before = story.state
             follow()
             assert is_urgent(before, story.state)
-            assert has_news(before, story.state)
+            assert is_unsaved(before, story.state)
 
     @pytest.mark.parametrize("order", [cmd.SetMode(mode=Mode.HOLD), cmd.StopDither()])
     def test_what_an_operator_orders_and_takes_back(self, order):
@@ -46,14 +46,14 @@ class TestWhatCannotWait:
             before = story.state
             story.tell(command)
             assert is_urgent(before, story.state)
-            assert has_news(before, story.state)
+            assert is_unsaved(before, story.state)
 
     def test_a_window_can_wait_but_is_news(self):
         story = Acquiring()
         story.see()
         before = story.state
         story.see()
-        assert has_news(before, story.state)
+        assert is_unsaved(before, story.state)
         assert not is_urgent(before, story.state)
 
     def test_nothing_new_is_no_news(self):
@@ -61,7 +61,7 @@ class TestWhatCannotWait:
         story.tell(cmd.Acquire())
         before = story.state
         story.tell(ev.Tick(), 1.0)
-        assert not has_news(before, story.state)
+        assert not is_unsaved(before, story.state)
 
 
 def test_the_alpha_on_the_disk_goes_when_an_acquisition_forgets_it(tmp_path):
@@ -135,12 +135,12 @@ class Restartable(Observatory):
         leave(archive, old, now_ns)
         self._agenda.clear()
         self._link.sent.clear()
-        self._fitting, self._backlog, self._worker_free_ns = False, Backlog(), 0
+        self._fitting, self._backlog, self._worker_free_ns = False, PendingWindow(), 0
         shelf = restored(old.reconstructors)
         fresh = TrackerState(system=old.system, mode=mode, reconstructors=shelf)
         policy = self._engine.policy
         self._engine = Engine(taken_up(archive, fresh, policy, now_ns), policy, self)
-        self._engine.prepared(bench.describe())
+        self._engine.set_description(bench.describe())
         self._begin()
 
     def until(self, stage, within_s=30.0):

@@ -8,9 +8,21 @@ from service.estimation.frames import FrameBlock
 from service.estimation.health import LOW_MODES, Actuators
 from service.estimation.lockin import Spectra
 from service.estimation.windows import RefusalKind, WindowRefused
-from service.runtime.engine import STEADY_GATHER_S, Engine, news, shape_mismatch, troubles
-from service.runtime.looks import taken
-from service.runtime.streams import Streams, fed, with_dither, with_matrix, with_rtc
+from service.runtime.engine import (
+    STEADY_GATHER_S,
+    Engine,
+    detect_changes,
+    detect_conditions,
+    shape_mismatch,
+)
+from service.runtime.estimator_bank import (
+    EstimatorBank,
+    process_block,
+    with_dither,
+    with_matrix,
+    with_rtc,
+)
+from service.runtime.passive_sums import take_passive_sums
 from service.runtime.worker import Description
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
@@ -64,13 +76,13 @@ def block(first_seq, n=100, *, session="s1", cm_id="initial", dither=True, scale
 
 @pytest.fixture
 def streams():
-    return with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), DITHER, WINDOW_S)
+    return with_dither(with_rtc(EstimatorBank(description=DESCRIPTION), RTC), DITHER, WINDOW_S)
 
 
 def play(streams, first_seq, n_blocks, **changes):
     windows = []
     for index in range(n_blocks):
-        streams, ended = fed(streams, block(first_seq + 100 * index, **changes))
+        streams, ended = process_block(streams, block(first_seq + 100 * index, **changes))
         windows += ended
     return streams, windows
 
@@ -223,12 +235,12 @@ class TestCommandsOffTheLoop:
     def play(self, streams, blocks, *, status_every=2):
         windows, off = [], []
         for number, frames in enumerate(blocks):
-            streams, ended = fed(streams, frames)
+            streams, ended = process_block(streams, frames)
             windows += ended
             if number % status_every == 0:
                 seq = frames.first_seq + frames.n_frames - 1
                 streams = with_rtc(streams, replace(streams.rtc, seq=seq))
-                off.append(streams.off is not None)
+                off.append(streams.command_residual is not None)
         return streams, windows, off
 
     def test_a_loop_that_obeys_gives_its_windows(self, streams):
@@ -243,7 +255,7 @@ class TestCommandsOffTheLoop:
         assert [type(w) for w in windows] == [WindowRefused] * 5
         assert "off the loop equation" in windows[0].reason
         assert off.index(True) * 0.2 < 2.0
-        assert "4 of 4 modes (0-3)" in streams.off.text
+        assert "4 of 4 modes (0-3)" in streams.command_residual.text
 
     @pytest.mark.parametrize("from_frame", [2300, 2700, 3100, 3500, 3900, 4300])
     def test_whenever_it_begins_to_saturate_that_is_named_in_time(self, streams, from_frame):
@@ -260,8 +272,8 @@ class TestCommandsOffTheLoop:
         for window_s, obeyed_seq in ((0.5, 0), (1.0, 1299)):
             begun = with_dither(streams, played(id=f"of {window_s}"), window_s)
             for frames in self.telemetry(14):
-                begun, _ = fed(begun, frames)
-            assert begun.obeyed_seq == obeyed_seq
+                begun, _ = process_block(begun, frames)
+            assert begun.checked_seq == obeyed_seq
 
     def test_nobody_is_blamed_for_a_matrix_that_is_not_known(self, streams):
         blocks = self.telemetry(30, stroke_m=5e-10)
@@ -273,14 +285,14 @@ class TestCommandsOffTheLoop:
         blocks = self.telemetry(40)
         streams = with_matrix(with_rtc(streams, replace(RTC, leak=0.5)), "initial", self.R)
         for number, frames in enumerate(blocks):
-            streams, _ = fed(streams, frames)
+            streams, _ = process_block(streams, frames)
             told = replace(streams.rtc, leak=RTC.leak, seq=frames.first_seq + 99)
             if number == 4:
                 told_before = replace(told, leak=0.5, seq=0)
                 streams = with_rtc(streams, told_before)
             if number >= 10:
                 streams = with_rtc(streams, told)
-                assert streams.off is None
+                assert streams.command_residual is None
         assert streams.check.from_seq == 1100
 
     def test_only_the_matrices_that_may_still_come_are_kept(self, streams):
@@ -358,15 +370,15 @@ def slipped_edge():
     description = replace(
         DESCRIPTION, n_modes=N_MANY, mode_variance_m2=np.full(N_MANY, 1e-16), actuators=RING
     )
-    streams = with_rtc(Streams(description=description), MANY)
+    bank = with_rtc(EstimatorBank(description=description), MANY)
     for first_seq in range(0, 1000, 10):
-        streams, _ = fed(streams, driven(first_seq, 0.0))
-    assert streams.edge_watch is not None
-    assert dict(told(streams))["edge-slip"] is None
+        bank, _ = process_block(bank, driven(first_seq, 0.0))
+    assert bank.edge_watch is not None
+    assert dict(told(bank))["edge-slip"] is None
     for first_seq in range(1000, 2000, 10):
-        streams, _ = fed(streams, driven(first_seq, 2e-6))
-    assert "the edge has slipped" in dict(told(streams))["edge-slip"]
-    return streams
+        bank, _ = process_block(bank, driven(first_seq, 2e-6))
+    assert "the edge has slipped" in dict(told(bank))["edge-slip"]
+    return bank
 
 
 def of_modes(n_controlled, seq):
@@ -385,7 +397,7 @@ def test_or_until_so_few_modes_are_controlled_that_nobody_can_tell(slipped):
     assert dict(told(few))["edge-slip"] is None
     many = with_rtc(few, replace(MANY, seq=3000))
     for first_seq in range(3000, 4000, 10):
-        many, _ = fed(many, driven(first_seq, 2e-6))
+        many, _ = process_block(many, driven(first_seq, 2e-6))
     assert "the edge has slipped" in dict(told(many))["edge-slip"]
 
 
@@ -395,7 +407,7 @@ def test_but_not_because_a_few_modes_less_are_controlled(slipped):
 
 
 def told(streams):
-    return [(name, text) for name, text, _ in troubles(streams)]
+    return [(name, text) for name, text, _ in detect_conditions(streams)]
 
 
 def test_no_window_is_begun_that_the_end_of_the_dither_would_cut(streams):
@@ -424,16 +436,16 @@ class TestVibrations:
         streams = with_dither(streams, None, WINDOW_S)
         state = TrackerState(system="flao", rtc=RTC)
         for number in range(130):
-            streams, _ = fed(streams, self.shaken(100 * number))
-        (told,) = [e for e in news(0.0, streams, state) if isinstance(e, ev.Vibrations)]
+            streams, _ = process_block(streams, self.shaken(100 * number))
+        (told,) = [e for e in detect_changes(0.0, streams, state) if isinstance(e, ev.Vibrations)]
         np.testing.assert_allclose(told.lines_hz, [130.0], atol=1.0)
         known = replace(state, vibrations_hz=told.lines_hz)
-        assert not [e for e in news(0.0, streams, known) if isinstance(e, ev.Vibrations)]
+        assert not [e for e in detect_changes(0.0, streams, known) if isinstance(e, ev.Vibrations)]
 
     def test_an_open_loop_is_not_listened_to(self, streams):
         streams = with_rtc(streams, replace(RTC, loop="open"))
         for number in range(130):
-            streams, _ = fed(streams, self.shaken(100 * number))
+            streams, _ = process_block(streams, self.shaken(100 * number))
         assert streams.vibrations.lines_hz == ()
 
 
@@ -442,18 +454,20 @@ class TestLooks:
 
     def test_too_little_stays_where_it_is(self, streams):
         young, _ = play(streams, 0, 1, n=15)
-        kept, sums = taken(young)
+        kept, sums = take_passive_sums(young)
         assert sums.endswith("0 frames in runs without gaps, 20 are needed for 4 modes")
         assert kept is young
 
     def test_a_loop_that_answers_too_soon_says_so(self, streams):
         """Two frames are what the instrument needs: 1.5 leave it none."""
         quick, _ = play(with_rtc(streams, replace(RTC, delay_frames=1.5)), 0, 20)
-        assert "1.5 frames" in taken(quick)[1]
+        assert "1.5 frames" in take_passive_sums(quick)[1]
 
     def test_an_open_loop_and_a_missing_rtc_say_so_too(self, streams):
-        assert "the loop is open" in taken(with_rtc(streams, replace(RTC, loop="open")))[1]
-        assert "no telemetry" in taken(with_rtc(streams, None))[1]
+        assert (
+            "the loop is open" in take_passive_sums(with_rtc(streams, replace(RTC, loop="open")))[1]
+        )
+        assert "no telemetry" in take_passive_sums(with_rtc(streams, None))[1]
 
     def test_no_two_looks_share_telemetry(self, streams):
         """Nothing is forgotten here: two looks hold together what one of all telemetry would."""
@@ -461,10 +475,10 @@ class TestLooks:
         quiet = with_dither(replace(streams, passive=sums), None, WINDOW_S)
         one, _ = play(quiet, 0, 20)
         all_of_it, _ = play(one, 2000, 20)
-        rest, first = taken(one)
+        rest, first = take_passive_sums(one)
         rest, _ = play(rest, 2000, 20)
-        _, second = taken(rest)
-        _, both = taken(all_of_it)
+        _, second = take_passive_sums(rest)
+        _, both = take_passive_sums(all_of_it)
         assert both.n_effective == pytest.approx(first.n_effective + second.n_effective)
         power = first.sums[2] + second.sums[2]
         np.testing.assert_allclose(both.sums[2], power, rtol=1e-5, atol=1e-20)
@@ -472,33 +486,33 @@ class TestLooks:
     def test_beside_windows_that_tell_of_alpha_one_stretch_in_four_is_looked_at(self, streams):
         """And a look says of which time it is."""
         one, _ = play(streams, 0, 40)
-        rest, first = taken(one, told=True)
+        rest, first = take_passive_sums(one, has_windows=True)
         resting, _ = play(rest, 4000, 120)
-        assert taken(resting, told=True)[1] is None
+        assert take_passive_sums(resting, has_windows=True)[1] is None
         some, _ = play(resting, 16000, 20)
-        assert taken(some, told=True)[1] is None
-        _, second = taken(play(some, 18000, 20)[0], told=True)
+        assert take_passive_sums(some, has_windows=True)[1] is None
+        _, second = take_passive_sums(play(some, 18000, 20)[0], has_windows=True)
         assert second.n_effective == pytest.approx(first.n_effective, rel=0.02)
         assert second.since_ns_utc == first.tail.next_t_ns - 1_000_000 + 12_000_000_000
 
     def test_beside_windows_that_do_not_every_other_stretch_is_left_out(self, streams):
         one, _ = play(streams, 0, 40)
-        rest, first = taken(one)
+        rest, first = take_passive_sums(one)
         resting, _ = play(rest, 4000, 40)
-        assert taken(resting)[1] is None
-        _, second = taken(play(resting, 8000, 40)[0])
+        assert take_passive_sums(resting)[1] is None
+        _, second = take_passive_sums(play(resting, 8000, 40)[0])
         assert second.n_effective == pytest.approx(first.n_effective, rel=0.02)
 
     @pytest.mark.parametrize("how", ["no window is accepted", "the dither ends"])
     def test_a_rest_ends_where_windows_tell_of_alpha_no_longer(self, streams, how):
-        rest, first = taken(play(streams, 0, 40)[0], told=True)
+        rest, first = take_passive_sums(play(streams, 0, 40)[0], has_windows=True)
         resting, _ = play(rest, 4000, 40)
         if how == "the dither ends":
-            resting, _ = taken(with_dither(resting, None, WINDOW_S), told=True)
+            resting, _ = take_passive_sums(with_dither(resting, None, WINDOW_S), has_windows=True)
         else:
-            resting, sums = taken(resting)
+            resting, sums = take_passive_sums(resting)
             assert sums is None
-        _, sums = taken(play(resting, 8000, 40)[0])
+        _, sums = take_passive_sums(play(resting, 8000, 40)[0])
         assert sums.since_ns_utc == 7_999_000_000
         assert sums.n_effective == pytest.approx(first.n_effective, rel=0.05)
 
@@ -511,19 +525,19 @@ class TestLooks:
                 return START_NS
 
         since_ns = START_NS - round(age_s * 1e9)
-        known = replace(handmade.STATE.registration, window_ns_utc=since_ns, doubt=doubt)
-        engine = Engine(replace(handmade.STATE, registration=known), POLICY, Driver())
-        engine.streams, _ = play(streams, 0, 40)
+        registration = replace(handmade.STATE.registration, window_ns_utc=since_ns, doubt=doubt)
+        engine = Engine(replace(handmade.STATE, registration=registration), POLICY, Driver())
+        engine.bank, _ = play(streams, 0, 40)
         assert engine.take_sums().n_effective > 1000
-        assert engine.streams.passive.from_seq == 4000 + 1000 * rest_s
+        assert engine.bank.passive.from_seq == 4000 + 1000 * rest_s
 
     def test_what_is_taken_is_gone_at_once(self, streams):
         one, _ = play(streams, 0, 20)
-        rest, sums = taken(one)
+        rest, sums = take_passive_sums(one)
         assert sums.n_effective > 1000
-        assert taken(rest)[1] is None
+        assert take_passive_sums(rest)[1] is None
         quiet = with_dither(rest, None, WINDOW_S)
-        assert isinstance(taken(quiet)[1], str)
+        assert isinstance(take_passive_sums(quiet)[1], str)
 
 
 class TestLaw:
@@ -542,16 +556,16 @@ class TestLaw:
     def after(self, telemetry, told=TOLD, **moving):
         """Streams after two and a half seconds with a status five times a second."""
         description = Description(n_slopes=60, n_modes=24, mode_variance_m2=np.full(24, 4e-14 / 24))
-        streams = with_rtc(Streams(description=description), told)
-        streams = with_matrix(streams, "cm-1", loops.INVERSE)
+        bank = with_rtc(EstimatorBank(description=description), told)
+        bank = with_matrix(bank, "cm-1", loops.INVERSE)
         for part in loops.blocks(telemetry, lengths=(50,)):
-            streams, _ = fed(streams, part)
+            bank, _ = process_block(bank, part)
             seq = part.first_seq + part.n_frames
             if seq % 200 == 0:
                 gains = tuple(g * (1 + 0.01 * seq / 1000) for g in told.gains)
                 now = replace(told, seq=seq - 1)
-                streams = with_rtc(streams, replace(now, gains=gains) if moving else now)
-        return {name: text for name, text, _ in troubles(streams) if text is not None}
+                bank = with_rtc(bank, replace(now, gains=gains) if moving else now)
+        return {name: text for name, text, _ in detect_conditions(bank) if text is not None}
 
     def test_one_that_is_as_told_raises_nothing(self):
         assert self.after(loops.closed_loop()) == {}
@@ -584,7 +598,9 @@ class TestStrengthOfTheDither:
 
     def test_windows_of_one_that_is_twenty_times_too_strong_are_refused(self, streams):
         asked = played(amplitude_m=(5e-9 / 20,))
-        streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), asked, WINDOW_S)
+        streams = with_dither(
+            with_rtc(EstimatorBank(description=DESCRIPTION), RTC), asked, WINDOW_S
+        )
         _, windows = play(streams, 0, 20)
         assert windows
         assert all(isinstance(window, WindowRefused) for window in windows)
@@ -593,18 +609,24 @@ class TestStrengthOfTheDither:
     def test_it_is_news_once_and_again_when_it_is_over(self, streams):
         state = TrackerState(system="s", rtc=RTC)
         asked = played(amplitude_m=(5e-9 / 20,))
-        streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), asked, WINDOW_S)
+        streams = with_dither(
+            with_rtc(EstimatorBank(description=DESCRIPTION), RTC), asked, WINDOW_S
+        )
         streams, _ = play(streams, 0, 12)
-        (told,) = [e for e in news(0.0, streams, state) if isinstance(e, ev.DitherMeasured)]
+        (told,) = [
+            e for e in detect_changes(0.0, streams, state) if isinstance(e, ev.DitherMeasured)
+        ]
         assert told.found_m == pytest.approx(5e-9, rel=0.01)
-        told_of = replace(state.dithering, amiss_id=told.id, amiss_m=told.found_m)
-        state = replace(state, dithering=told_of)
-        assert not [e for e in news(0.0, streams, state) if isinstance(e, ev.DitherMeasured)]
+        told_of = replace(state.dither_policy, amiss_id=told.id, amiss_m=told.found_m)
+        state = replace(state, dither_policy=told_of)
+        assert not [
+            e for e in detect_changes(0.0, streams, state) if isinstance(e, ev.DitherMeasured)
+        ]
 
     def test_columns_that_hold_nothing_hold_no_dither(self, streams):
         quiet = block(0, dither=True)
         quiet = replace(quiet, dither_m=np.zeros_like(quiet.dither_m))
-        streams, _ = fed(streams, quiet)
+        streams, _ = process_block(streams, quiet)
         assert streams.dither_silent_s == pytest.approx(0.1)
 
 
@@ -613,17 +635,17 @@ class TestGainsThatFollowTheSeeing:
 
     def windows(self, gain_of, window_s, seconds=20, **changes):
         """Windows, and how often the sums of ordinary telemetry began anew."""
-        streams = with_dither(with_rtc(Streams(description=DESCRIPTION), RTC), DITHER, window_s)
+        bank = with_dither(with_rtc(EstimatorBank(description=DESCRIPTION), RTC), DITHER, window_s)
         found, resets = 0, 0
         for t in range(seconds):
             gains = tuple(gain * gain_of(t) for gain in RTC.gains)
             rtc_now = replace(RTC, gains=gains, seq=1000 * t)
             for name, change in changes.items():
                 rtc_now = replace(rtc_now, **{name: change(t)})
-            before = streams.passive
-            streams = with_dither(with_rtc(streams, rtc_now), DITHER, window_s)
-            resets += streams.passive is not before
-            streams, ended = play(streams, 1000 * t, 10)
+            before = bank.passive
+            bank = with_dither(with_rtc(bank, rtc_now), DITHER, window_s)
+            resets += bank.passive is not before
+            bank, ended = play(bank, 1000 * t, 10)
             found += sum(isinstance(window, Spectra) for window in ended)
         return found, resets
 
@@ -685,12 +707,12 @@ def test_estimators_follow_the_rtc_again_after_a_look_that_fails(streams, monkey
         raise ValueError("an inhomogeneous shape")
 
     engine = Engine(replace(handmade.STATE, rtc=RTC), POLICY, Driver())
-    engine.streams = streams
-    monkeypatch.setattr("service.runtime.engine.fed", broken)
+    engine.bank = streams
+    monkeypatch.setattr("service.runtime.engine.process_block", broken)
     with pytest.raises(ValueError, match="inhomogeneous"):
         engine.feed([block(0)])
-    engine.hear(replace(RTC, session="s2"))
-    assert engine.streams.rtc.session == "s2"
+    engine.receive(replace(RTC, session="s2"))
+    assert engine.bank.rtc.session == "s2"
 
 
 class TestModesThatComeIntoTheLoop:
@@ -708,8 +730,8 @@ class TestModesThatComeIntoTheLoop:
     def heard(self, streams, first_seq, n_blocks, **changes):
         found = []
         for index in range(n_blocks):
-            streams, _ = fed(streams, self.amplified(first_seq + 100 * index, **changes))
-            found.append(streams.played.text if streams.played else "")
+            streams, _ = process_block(streams, self.amplified(first_seq + 100 * index, **changes))
+            found.append(streams.dither_measurement.text if streams.dither_measurement else "")
         return streams, found
 
     @pytest.mark.parametrize("late_by", [1, 5, 9])
@@ -720,7 +742,7 @@ class TestModesThatComeIntoTheLoop:
         streams, meanwhile = self.heard(streams, 1000, late_by)
         streams, after = self.heard(with_rtc(streams, self.RAISED), 1000 + 100 * late_by, 40)
         assert not any([*before, *meanwhile, *after])
-        assert streams.played.found_m == pytest.approx(5e-9, rel=0.01)
+        assert streams.dither_measurement.found_m == pytest.approx(5e-9, rel=0.01)
 
     def test_a_mode_that_no_status_tells_of_is_named_by_two_seconds(self, streams):
         _, found = self.heard(streams, 0, 20)
@@ -734,9 +756,9 @@ class TestModesThatComeIntoTheLoop:
 
 def test_an_rtc_whose_clock_goes_back_an_hour_is_looked_at_again_at_once(streams):
     streams, _ = play(streams, 0, 45)
-    streams, sums = taken(streams, told=True)
+    streams, sums = take_passive_sums(streams, has_windows=True)
     assert not isinstance(sums, str)
-    back = replace(streams, heard_ns_utc=streams.heard_ns_utc - 3600 * 10**9)
-    assert back.passive.since_ns_utc > back.heard_ns_utc + 3000 * 10**9
-    back, _ = taken(back, told=True)
-    assert back.passive.since_ns_utc <= back.heard_ns_utc
+    back = replace(streams, received_ns_utc=streams.received_ns_utc - 3600 * 10**9)
+    assert back.passive.since_ns_utc > back.received_ns_utc + 3000 * 10**9
+    back, _ = take_passive_sums(back, has_windows=True)
+    assert back.passive.since_ns_utc <= back.received_ns_utc

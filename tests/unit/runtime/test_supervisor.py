@@ -14,8 +14,8 @@ import pytest
 from service.archive import AuditEntry, Range
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.engine import followed
-from service.runtime.recording import Caller, Whence, taken_up
+from service.runtime.engine import follow_state
+from service.runtime.recording import Actor, Channel, taken_up
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -88,15 +88,15 @@ async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor
 
 
 async def test_the_audit_trail_says_who_why_from_where_and_what_was_answered(supervisor, archive):
-    caller = Caller(address="10.0.0.7", whence=Whence.PAGE)
+    actor = Actor(address="10.0.0.7", channel=Channel.PAGE)
     async with running(supervisor):
         order = cmd.SetMode(mode=Mode.AUTO, by="Ada", reason="clouds have gone")
-        answer = await supervisor.submit(order, caller)
-        await supervisor.submit(cmd.SetMode(mode=Mode.HOLD), caller)
+        answer = await supervisor.submit(order, actor)
+        await supervisor.submit(cmd.SetMode(mode=Mode.HOLD), actor)
         await until(lambda: len(orders(archive)) == 4)
     asked, answered, anonymous, _ = orders(archive)
     for entry in (asked, answered):
-        assert (entry.who, entry.address, entry.whence) == ("Ada", "10.0.0.7", "page")
+        assert (entry.who, entry.address, entry.channel) == ("Ada", "10.0.0.7", "page")
         assert (entry.why, entry.text) == ("clouds have gone", '{"mode":"auto"}')
     assert (asked.name, asked.answer) == ("SetMode", "")
     assert (answered.name, answered.answer) == ("SetMode.answered", answer)
@@ -104,7 +104,7 @@ async def test_the_audit_trail_says_who_why_from_where_and_what_was_answered(sup
 
 
 def orders(archive):
-    return [entry for entry in archive.audit_trail(Range(limit=1000)) if entry.whence]
+    return [entry for entry in archive.audit_trail(Range(limit=1000)) if entry.channel]
 
 
 async def test_a_command_that_cannot_be_carried_out_is_the_callers_to_hear_of(supervisor):
@@ -254,7 +254,7 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
 
     async with running(supervisor):
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
-        monkeypatch.setattr("service.runtime.engine.fed", broken)
+        monkeypatch.setattr("service.runtime.engine.process_block", broken)
         monkeypatch.setattr(
             bridge, "drain", lambda **_: [SimpleNamespace(n_frames=50, dt_ns=10**6)]
         )
@@ -263,7 +263,7 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "an inhomogeneous shape" in entry.text
         assert "telemetry was dropped" in entry.text
-        assert supervisor._engine.streams.rtc is not None
+        assert supervisor._engine.bank.rtc is not None
         assert supervisor.snapshot().ready
 
 
@@ -276,7 +276,7 @@ async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, br
         await until(lambda: "internal.error" in [e.name for e in supervisor._engine.state.log])
         monkeypatch.undo()
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
-        await until(lambda: supervisor._engine.streams.rtc is not None)
+        await until(lambda: supervisor._engine.bank.rtc is not None)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a ring that is bent" in entry.text
 
@@ -295,7 +295,7 @@ async def test_frames_are_looked_at_before_what_was_told_after_them(
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
         send(bridge._intake, 0)
         await until(lambda: bridge._intake.events() == [] and not bridge.drain())
-        monkeypatch.setattr("service.runtime.engine.fed", seen)
+        monkeypatch.setattr("service.runtime.engine.process_block", seen)
         monkeypatch.setattr(supervisor._engine, "hear", lambda told: order.append(told.id))
         send(bridge._intake, 10)
         applied(bridge._intake, "s1")
@@ -310,34 +310,34 @@ async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, br
     def slowly(streams, block):
         looking.set()
         assert go_on.wait(patience(20.0))
-        return replace(streams, heard_ns_utc=1), []
+        return replace(streams, received_ns_utc=1), []
 
     async with running(supervisor):
         blocks = [SimpleNamespace(n_frames=50, dt_ns=10**6)]
-        monkeypatch.setattr("service.runtime.engine.fed", slowly)
+        monkeypatch.setattr("service.runtime.engine.process_block", slowly)
         monkeypatch.setattr(bridge, "drain", lambda **_: [blocks.pop()] if blocks else [])
         await until(looking.is_set, 20.0)
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
         assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == "mode is auto"
-        assert supervisor._engine.streams.heard_ns_utc != 1
+        assert supervisor._engine.bank.received_ns_utc != 1
         go_on.set()
-        await until(lambda: supervisor._engine.streams.heard_ns_utc == 1, 20.0)
-        assert supervisor._engine.streams.rtc is not None  # what was heard meanwhile is followed
+        await until(lambda: supervisor._engine.bank.received_ns_utc == 1, 20.0)
+        assert supervisor._engine.bank.rtc is not None  # what was heard meanwhile is followed
 
 
 async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, monkeypatch):
     def broken(streams, state, policy):
-        if streams.heard_ns_utc == 1:
+        if streams.received_ns_utc == 1:
             raise ValueError("samples of two matrices")
-        return followed(streams, state, policy)
+        return follow_state(streams, state, policy)
 
     async with running(supervisor):
-        monkeypatch.setattr("service.runtime.engine.followed", broken)
+        monkeypatch.setattr("service.runtime.engine.follow_state", broken)
         async with (
-            supervisor._looking
+            supervisor._telemetry_lock
         ):  # what is lent to somebody is not what it was when it is back
-            supervisor._engine.streams = replace(supervisor._engine.streams, heard_ns_utc=1)
-        await until(lambda: supervisor._engine.streams.heard_ns_utc != 1)
+            supervisor._engine.bank = replace(supervisor._engine.bank, received_ns_utc=1)
+        await until(lambda: supervisor._engine.bank.received_ns_utc != 1)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a tick was dropped" in entry.text
         assert "samples of two matrices" in entry.text
@@ -414,9 +414,9 @@ async def test_what_could_not_be_written_is_written_once_it_can_be_and_only_once
     async with running(supervisor):
         with full_disk(archive):
             supervisor._post(ev.MatrixMade(record=record("cm-1"), wanted=False))
-            supervisor._post(ev.Noted(name="note", text="first"))
+            supervisor._post(ev.LogEvent(name="note", text="first"))
             await until(lambda: alarm_of(supervisor, "archive-failed"))
-            supervisor._post(ev.Noted(name="note", text="second"))
+            supervisor._post(ev.LogEvent(name="note", text="second"))
             await asyncio.sleep(0.2)
             assert archive.reconstructors.records() == ()
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
@@ -434,7 +434,7 @@ async def test_an_index_that_is_damaged_meanwhile_does_not_end_the_service(
     async with running(supervisor):
         with monkeypatch.context() as patch:
             patch.setattr(archive, "record", damaged)
-            supervisor._post(ev.Noted(name="note", text="first"))
+            supervisor._post(ev.LogEvent(name="note", text="first"))
             await until(lambda: alarm_of(supervisor, "archive-failed"))
             with pytest.raises(ArchiveError, match="move it away"):
                 await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
@@ -448,7 +448,7 @@ async def test_a_service_that_ends_while_the_disk_refuses_still_writes_what_wait
 ):
     async with running(supervisor):
         with full_disk(archive):
-            supervisor._post(ev.Noted(name="note", text="last words"))
+            supervisor._post(ev.LogEvent(name="note", text="last words"))
             await until(lambda: alarm_of(supervisor, "archive-failed"))
     assert ("note", "last words") in trail(archive, "service")
 
@@ -469,7 +469,7 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
     supervisor._engine.state = known
     effect = ev.SendMatrix(id="cm-1", n_modes=known.rtc.n_controlled, gains=None)
     with full_disk(archive):
-        supervisor._post(ev.Noted(name="why", text="it is sent"))
+        supervisor._post(ev.LogEvent(name="why", text="it is sent"))
         await supervisor._do(effect, known)
         assert sent == []
     await supervisor._do(effect, known)
@@ -540,7 +540,7 @@ async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
 async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
     supervisor, bridge, monkeypatch
 ):
-    monkeypatch.setattr("service.runtime.waiting.REVIVED_AFTER_S", 1.0)
+    monkeypatch.setattr("service.runtime.readiness.REVIVED_AFTER_S", 1.0)
     async with running(supervisor):
 
         def logged():

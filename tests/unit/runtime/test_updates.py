@@ -22,7 +22,7 @@ from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
-from service.tracking.worth import fewer_than
+from service.tracking.update_policy import fewer_than
 from service.wire import LoopRequest
 from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, conditions, small_instrument
@@ -132,8 +132,8 @@ class TestEdge:
     async def test_the_one_in_use_is_judged_by_the_same_measure(self, actions, just_beyond):
         """Or it would be replaced by its like again and again."""
         gain = float(just_beyond.gains[0])
-        known = replace(REGISTRATION, alpha=Misregistration(), optical_gain=None)
-        state = replace(STATE, registration=known, rtc=loop_of(gain))
+        registration = replace(REGISTRATION, alpha=Misregistration(), optical_gain=None)
+        state = replace(STATE, registration=registration, rtc=loop_of(gain))
         made = await make(actions, state, fewer=fewer_than(N_CONTROLLED))
         assert made.record.n_modes == N_CONTROLLED
         assert LIMIT_M < made.record.gate.edge_motion_m < HELD_LIMIT_M
@@ -223,9 +223,9 @@ class TestLoopOfTheGate:
     """The optical gains the gate and the expected loss are told."""
 
     def test_the_gate_gets_more_than_the_expected_gain_of_every_mode(self):
-        known = replace(REGISTRATION, optical_gains=MEASURED)
-        loop = loop_with(known)
-        expected = expected_gains(known, N_MODES)
+        registration = replace(REGISTRATION, optical_gains=MEASURED)
+        loop = loop_with(registration)
+        expected = expected_gains(registration, N_MODES)
         assert expected.shape == (N_MODES,)
         assert np.all(loop.optical_gain > 1.05 * expected[:N_CONTROLLED])
 

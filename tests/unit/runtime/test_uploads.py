@@ -25,12 +25,12 @@ from tests.system.pace import in_time
 
 pytestmark = pytest.mark.timeout(60)
 
-LIMITS = FitLimits(most_bytes=10_000_000, waiting=2, seconds=30.0)
+LIMITS = FitLimits(max_bytes=10_000_000, waiting=2, seconds=30.0)
 REQUEST = FitRequest(
     asked={},
     own_instrument="tiny",
     own_sha256="",
-    most_bytes=10_000_000,
+    max_bytes=10_000_000,
     threads=1,
     nice=0,
     memory_mb=4000,

@@ -6,19 +6,19 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from service.link.statistics import Fate, LinkStatistics, Tally
-from service.runtime.waiting import (
+from service.link.statistics import Counters, Disposition, LinkStatistics
+from service.runtime.readiness import (
     COMPLAINTS,
-    Facts,
     Losses,
+    ReadinessInputs,
+    ReadinessLog,
     Revival,
-    Told,
     complaints,
-    news_of_link,
+    detect_link_changes,
     state_message,
     waiting_for,
 )
-from service.tracking.alarms import Alarm, Party, Waiting
+from service.tracking.alarms import Alarm, Prerequisite, Responsible
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
 from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record, rtc
@@ -63,7 +63,7 @@ def link(*fates, **changes):
 
 
 def fate(outcome, n, kind="frames", text="", age_s=0.1):
-    return Fate(kind=kind, outcome=outcome, n=n, age_s=age_s, text=text)
+    return Disposition(kind=kind, outcome=outcome, n=n, age_s=age_s, text=text)
 
 
 WELL = (fate("used", 2000), fate("used", 10, "status"))
@@ -71,7 +71,9 @@ WELL = (fate("used", 2000), fate("used", 10, "status"))
 
 def waits(link, state=None, *, preparing=False):
     state = state or TrackerState(system="small")
-    return {w.name: w for w in waiting_for(Facts(state=state, link=link, preparing=preparing))}
+    return {
+        w.name: w for w in waiting_for(ReadinessInputs(state=state, link=link, preparing=preparing))
+    }
 
 
 # ---------------------------------------------------------------- complaints
@@ -125,27 +127,27 @@ def test_a_flood_of_statuses_is_named_with_its_rate():
 
 def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_last():
     state = TrackerState(system="small")
-    (made,) = news_of_link(link(fate("late", 900, text="x 1")), state, START_NS)
+    (made,) = detect_link_changes(link(fate("late", 900, text="x 1")), state, START_NS)
     alarm = Alarm(
         name=made.name, since_ns_utc=START_NS, text=made.text, seen_ns_utc=START_NS + SECOND
     )
     state = replace(state, alarms=(alarm,))
-    (again,) = news_of_link(link(fate("late", 950, text="x 2")), state, START_NS + SECOND)
+    (again,) = detect_link_changes(link(fate("late", 950, text="x 2")), state, START_NS + SECOND)
     assert again.text == made.text
-    (other,) = news_of_link(link(fate("shape", 950, text="y")), state, START_NS + SECOND)
+    (other,) = detect_link_changes(link(fate("shape", 950, text="y")), state, START_NS + SECOND)
     assert "shape" in other.text
-    assert news_of_link(link(*WELL), state, START_NS + 3 * SECOND) == []
-    (over,) = news_of_link(link(*WELL), state, START_NS + 5 * SECOND)
+    assert detect_link_changes(link(*WELL), state, START_NS + 3 * SECOND) == []
+    (over,) = detect_link_changes(link(*WELL), state, START_NS + 5 * SECOND)
     assert (over.name, over.over) == ("frames-unused", True)
     assert {made.name, over.name} <= set(COMPLAINTS)
 
 
 def test_what_came_is_counted_for_two_seconds_and_remembered_for_good():
-    tally = Tally()
+    tally = Counters()
     for k in range(100):
         tally.add("frames", "used", 10, 0.1 * k)
         tally.add("frames", "late", 3 * (k == 50), 0.1 * k, "why")
-    used, late = tally.fates(10.0)
+    used, late = tally.dispositions(10.0)
     assert 180 <= used.n <= 230
     assert (late.n, late.age_s, late.text) == (0, 5.0, "why")
     assert tally.of("frames") == {"used": 1000, "late": 3}
@@ -159,7 +161,7 @@ def test_nothing_is_waited_for_while_all_is_well():
         system="small",
         mode=Mode.AUTO,
         rtc=rtc(cm_id="a"),
-        proven=frozenset({"a"}),
+        verified_ids=frozenset({"a"}),
         reconstructors=(record("a", MatrixState.APPLIED),),
     )
     assert waits(link(*WELL), state) == {}
@@ -179,14 +181,14 @@ def test_nothing_is_waited_for_while_all_is_well():
 )
 def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
     wait = waits(found)[name]
-    assert (wait.party, wait.hinders) == (party, bool(hinders))
+    assert (wait.responsible, wait.blocks) == (party, bool(hinders))
     assert len(wait.text) > 20
 
 
 def test_what_the_rtc_says_of_itself_is_waited_for_in_its_words_while_it_is_there():
     state = TrackerState(system="small", rtc=rtc(trouble="aol1_imWFS2: its counter stands at 7"))
     wait = waits(link(*WELL), state)["rtc-trouble"]
-    assert (wait.party, wait.hinders) == ("rtc", True)
+    assert (wait.responsible, wait.blocks) == ("rtc", True)
     assert wait.text == "aol1_imWFS2: its counter stands at 7"
     assert "rtc-trouble" not in waits(link(*WELL, rtc_alive=False), state)
 
@@ -197,13 +199,17 @@ def test_a_first_status_is_given_three_seconds():
 
 def test_the_model_is_waited_for_first():
     found = waiting_for(
-        Facts(state=TrackerState(system="s"), link=link(rtc_alive=False), preparing=True)
+        ReadinessInputs(state=TrackerState(system="s"), link=link(rtc_alive=False), preparing=True)
     )
-    assert (found[0].name, found[0].party, found[0].hinders) == ("model", Party.WORKER, True)
+    assert (found[0].name, found[0].responsible, found[0].blocks) == (
+        "model",
+        Responsible.WORKER,
+        True,
+    )
 
 
 def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
-    state = TrackerState(system="s", rtc=rtc(cm_id=None), unfetched="no answer")
+    state = TrackerState(system="s", rtc=rtc(cm_id=None), read_back_error="no answer")
     wait = waits(link(*WELL), state)["matrix-name"]
     assert "cm_id is nil" in wait.text
     assert "no answer" in wait.text
@@ -214,17 +220,17 @@ def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
 @pytest.mark.parametrize(
     ("name", "party", "hinders"),
     [
-        ("basis-mismatch", Party.OPERATOR, True),
-        ("standing-by", Party.SERVICE, True),
-        ("wrong-matrix", Party.RTC, False),
-        ("dither", Party.RTC, False),
-        ("loop-open", Party.OPERATOR, False),
+        ("basis-mismatch", Responsible.OPERATOR, True),
+        ("standing-by", Responsible.SERVICE, True),
+        ("wrong-matrix", Responsible.RTC, False),
+        ("dither", Responsible.RTC, False),
+        ("loop-open", Responsible.OPERATOR, False),
     ],
 )
 def test_alarms_that_keep_the_service_from_its_job_are_waits(name, party, hinders):
     alarm = Alarm(name=name, since_ns_utc=0, text="as the alarm says")
     wait = waits(link(*WELL), TrackerState(system="s", alarms=(alarm,)))[name]
-    assert (wait.party, wait.hinders, wait.text) == (party, hinders, "as the alarm says")
+    assert (wait.responsible, wait.blocks, wait.text) == (party, hinders, "as the alarm says")
 
 
 def test_what_an_operator_has_to_do_is_named():
@@ -235,9 +241,9 @@ def test_what_an_operator_has_to_do_is_named():
         reconstructors=(record("a"), record("b", MatrixState.PUBLISHED)),
     )
     found = waits(link(*WELL), state)
-    parties = {name: found[name].party for name in ("mode", "dither-stopped", "approval")}
-    assert set(parties.values()) == {Party.OPERATOR}
-    assert found["acknowledgement"].party is Party.RTC
+    parties = {name: found[name].responsible for name in ("mode", "dither-stopped", "approval")}
+    assert set(parties.values()) == {Responsible.OPERATOR}
+    assert found["acknowledgement"].responsible is Responsible.RTC
 
 
 def test_who_is_to_approve_of_a_proposal_hears_when_another_one_replaces_it():
@@ -254,17 +260,20 @@ def test_who_is_to_approve_of_a_proposal_hears_when_another_one_replaces_it():
 
 
 def test_a_wait_is_on_record_once_it_lasts_and_not_again_and_again():
-    told, wait = Told(), Waiting(name="status", party=Party.RTC, text="none comes")
-    lines = [told.news((wait,), (), k * SECOND) for k in range(100)]
+    told, wait = (
+        ReadinessLog(),
+        Prerequisite(name="status", responsible=Responsible.RTC, text="none comes"),
+    )
+    lines = [told.due_lines((wait,), (), k * SECOND) for k in range(100)]
     assert [k for k, found in enumerate(lines) if found] == [2]
     assert lines[2] == ["rtc: none comes"]
     for k in range(100, 200):
         present = (wait,) if k % 10 else ()
-        lines.append(told.news(present, (), k * SECOND))
+        lines.append(told.due_lines(present, (), k * SECOND))
     assert len([k for k, found in enumerate(lines) if found and k > 99]) <= 2
     alarm = Alarm(name="status", since_ns_utc=0, text="")
-    fresh = Told()
-    assert not any(fresh.news((wait,), (alarm,), k * SECOND) for k in range(10))
+    fresh = ReadinessLog()
+    assert not any(fresh.due_lines((wait,), (alarm,), k * SECOND) for k in range(10))
 
 
 def test_a_silent_token_has_the_link_opened_anew_ever_less_often():
@@ -279,9 +288,11 @@ def test_a_silent_token_has_the_link_opened_anew_ever_less_often():
     "heard", [link(*WELL), link(fate("used", 5, "status")), link(fate("shape", 9)), link()]
 )
 def test_a_link_on_which_anything_comes_is_left_as_it_is(heard):
-    gone = replace(heard, rtc_alive=False, fates=())
+    gone = replace(heard, rtc_alive=False, dispositions=())
     revival = Revival()
-    assert not any(revival.due(heard if heard.fates else gone, float(t)) for t in range(1000))
+    assert not any(
+        revival.due(heard if heard.dispositions else gone, float(t)) for t in range(1000)
+    )
 
 
 def test_a_token_that_came_back_is_given_its_time():
@@ -299,7 +310,7 @@ def test_the_state_on_the_network_is_short_and_in_boundary_units():
     assert nothing.alpha is nothing.validity is None
     story.see()
     message = state_message(story.state, 5)
-    assert message.validity == story.state.registration.standing.validity
+    assert message.validity == story.state.registration.validity.level
     assert (message.mode, message.in_use, message.t_ns) == ("hold", "initial", 5)
     assert message.alpha == pytest.approx(ALPHA.to_boundary())
     assert message.sigma["shift_x_subap"] == pytest.approx(np.hypot(0.002, 0.003))
@@ -368,10 +379,10 @@ def test_a_complaint_of_losses_ends_only_with_half_as_many():
 def test_lost_frames_are_an_alarm_that_ends_by_itself():
     state = TrackerState(system="small")
     text = Counting().pass_(10, lost=50)
-    (made,) = news_of_link(link(*WELL), state, START_NS, {"frames-lost": text})
+    (made,) = detect_link_changes(link(*WELL), state, START_NS, {"frames-lost": text})
     assert made.name == "frames-lost"
     alarm = Alarm(name=made.name, since_ns_utc=0, text=made.text, seen_ns_utc=START_NS)
     state = replace(state, alarms=(alarm,))
-    assert news_of_link(link(*WELL), state, START_NS + 2 * SECOND) == []
-    (over,) = news_of_link(link(*WELL), state, START_NS + 4 * SECOND)
+    assert detect_link_changes(link(*WELL), state, START_NS + 2 * SECOND) == []
+    (over,) = detect_link_changes(link(*WELL), state, START_NS + 4 * SECOND)
     assert (over.name, over.over) == ("frames-lost", True)

@@ -194,7 +194,7 @@ def test_a_gain_beyond_stability_is_refused_however_good_the_matrix(bench):
 
 def test_the_watchdog_says_nothing_of_nothing(bench):
     empty = passive.Passive(n_modes=N_CONTROLLED, memory_frames=1000.0)
-    assert bench.watch(empty, Misregistration()) is None
+    assert bench.fit_passive(empty, Misregistration()) is None
 
 
 def test_a_job_outside_a_worker_process_is_a_programming_error():

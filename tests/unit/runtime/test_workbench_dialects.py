@@ -138,7 +138,7 @@ class Mistold:
 )
 def test_another_listing_of_the_slopes_than_told_is_named_by_the_rtcs_own_matrix(axes, named):
     rtc = Mistold(**axes)
-    dialect = rtc.told.listen(rtc.own, None)
+    dialect = rtc.told.read_slope_convention(rtc.own, None)
     assert named in dialect.wrong
     assert dialect.found == rtc.setting
     assert not dialect.adopted
@@ -172,7 +172,7 @@ def test_slopes_two_frames_late_are_not_taken_for_slopes_of_the_other_sign():
 
 def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over():
     rtc = Mistold(order="yx", flip_y=True, sign_x=-1)
-    dialect = rtc.auto.listen(rtc.own, None)
+    dialect = rtc.auto.read_slope_convention(rtc.own, None)
     assert dialect.adopted
     assert dialect.found == rtc.setting
     made = rtc.auto.make(conditions(ALPHA_SMALL, np.diag(SIGMA**2), loop_settings(), 0.95))
@@ -183,7 +183,7 @@ def test_an_orientation_left_open_is_found_in_the_rtcs_own_matrix_and_taken_over
 def test_a_matrix_that_no_orientation_explains_leaves_nothing_to_take_over():
     rtc = Mistold()
     noise = np.random.default_rng(1).normal(size=rtc.own.shape).astype(np.float32)
-    dialect = rtc.auto.listen(noise * np.abs(rtc.own).mean(), None)
+    dialect = rtc.auto.read_slope_convention(noise * np.abs(rtc.own).mean(), None)
     assert "no orientation explains" in dialect.wrong
     assert dialect.found is None
 
@@ -194,7 +194,7 @@ def test_a_matrix_that_no_orientation_explains_leaves_nothing_to_take_over():
 )
 def test_commands_in_another_unit_are_named_by_the_rtcs_own_matrix(metres, named):
     rtc = Mistold()
-    dialect = rtc.told.listen((rtc.own / metres).astype(np.float32), None)
+    dialect = rtc.told.read_slope_convention((rtc.own / metres).astype(np.float32), None)
     assert named in dialect.wrong
 
 
@@ -210,6 +210,6 @@ def test_commands_in_another_unit_are_named_by_the_answer_to_the_dither():
 def test_what_is_as_told_is_not_complained_of():
     rtc = Mistold()
     for bench in (rtc.told, rtc.auto):
-        assert not bench.listen(rtc.own, None).wrong
+        assert not bench.read_slope_convention(rtc.own, None).wrong
         found = bench.fit(dithered_window(Sensor(rtc.seen), ALPHA_SMALL), open_loop(rtc.own), None)
         assert np.all(np.abs(found.alpha.vector - ALPHA_SMALL.vector) < 0.01)

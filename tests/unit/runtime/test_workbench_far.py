@@ -6,7 +6,7 @@ import pytest
 from service.control.dither import FINER, SMOOTH, lines_of, modes_of
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan
-from service.estimation.openloop import FarEstimate
+from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
 from service.runtime.worker import OpticsWorker
@@ -57,18 +57,18 @@ def window(bench, reach=SMOOTH, *, seed=1, noise=1e-3):
 
 def test_two_sets_of_modes_find_the_same_place_one_after_the_other(bench):
     first = bench.find(window(bench), None, None)
-    assert isinstance(first, FarEstimate)
+    assert isinstance(first, WideCaptureEstimate)
     assert np.all(np.abs(first.estimate.alpha.vector - FAR.vector) < SMOOTH.floor)
     second = bench.find(window(bench, FINER), first.estimate.alpha, None)
-    assert isinstance(second, FarEstimate)
+    assert isinstance(second, WideCaptureEstimate)
     assert np.all(np.abs(second.estimate.alpha.vector - FAR.vector) < FINER.floor)
 
 
 def test_light_saves_steps_and_changes_nothing(bench):
     flux = counts_of(small_instrument(), (-1.2, 0.8)).astype("<f4").tobytes()
     lit, dark = bench.find(window(bench), None, flux), bench.find(window(bench), None, None)
-    assert isinstance(lit, FarEstimate)
-    assert isinstance(dark, FarEstimate)
+    assert isinstance(lit, WideCaptureEstimate)
+    assert isinstance(dark, WideCaptureEstimate)
     difference = np.abs(lit.estimate.alpha.vector - dark.estimate.alpha.vector)
     # both are steps to the same minimum of the same window, each ended when it is shorter than this
     assert np.all(difference < [2e-3, 2e-3, 1e-4, 1e-4])

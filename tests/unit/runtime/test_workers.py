@@ -200,16 +200,16 @@ async def test_a_worker_that_stands_still_is_named_then_killed_and_replaced(
     before = await workers.call(process_id)
     os.kill(before, signal.SIGSTOP)
     job = asyncio.create_task(workers.call(process_id))
-    while not workers.trouble:  # noqa: ASYNC110 - nobody tells
+    while not workers.problem:  # noqa: ASYNC110 - nobody tells
         await asyncio.sleep(0.05)
-    assert "has stood still for" in workers.trouble
+    assert "has stood still for" in workers.problem
     with monkeypatch.context() as impatient:
         impatient.setattr(crew_module, "HUNG_S", 0.6)
         with pytest.raises(WorkerError, match=r"stood still for \d+ s in process_id and was kil"):
             await job
-    assert "was killed" in workers.trouble
+    assert "was killed" in workers.problem
     assert await workers.call(process_id) != before
-    assert workers.trouble == ""
+    assert workers.problem == ""
     assert (workers.n_lost, len(hired)) == (1, 2)
 
 
@@ -237,5 +237,5 @@ async def test_a_job_that_rightly_takes_long_is_let_finish_in_the_end(workers, m
 async def test_a_job_that_waits_for_the_disk_a_moment_is_not_a_hung_one(shared, monkeypatch):
     monkeypatch.setattr("service.runtime.workers.STILL_S", 0.6)
     await shared.call(napping)
-    assert shared.trouble == ""
+    assert shared.problem == ""
     assert shared.n_lost == 0

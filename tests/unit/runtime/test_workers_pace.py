@@ -3,7 +3,7 @@
 import pytest
 
 from service.runtime import workers as workers_module
-from service.runtime.workers import PaceMeter
+from service.runtime.workers import WorkerLoadMeter
 from service.tracking.alarms import Alarm
 from service.tracking.state import TrackerState
 
@@ -43,7 +43,7 @@ def work(clocks, meter, seconds, *, busy=0.3, cpu=0.25, late=False):
         clocks.busy_s += busy
         clocks.cpu_s["fit"] = clocks.cpu_s.get("fit", 0.0) + 0.8 * cpu
         clocks.cpu_s["margin"] = clocks.cpu_s.get("margin", 0.0) + 0.2 * cpu
-        meter.heard(0.5)
+        meter.count_frames(0.5)
         if second % 2:
             meter.fitted(2.0)
             if late:
@@ -52,35 +52,35 @@ def work(clocks, meter, seconds, *, busy=0.3, cpu=0.25, late=False):
 
 
 def test_costs_are_told_for_each_second_of_telemetry_and_by_job(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     work(clocks, meter, 10)
-    pace = meter.pace
-    assert pace.worker_per_s == pytest.approx(0.25 / 0.5)
-    assert pace.by_job == pytest.approx({"fit": 0.4, "margin": 0.1})
-    assert list(pace.by_job) == ["fit", "margin"]
-    assert pace.service_per_s == pytest.approx(0.08)
-    assert (pace.busy_ratio, pace.window_s, pace.windows_late) == (pytest.approx(0.3), 2.0, 0)
+    load = meter.worker_load
+    assert load.worker_per_s == pytest.approx(0.25 / 0.5)
+    assert load.by_job == pytest.approx({"fit": 0.4, "margin": 0.1})
+    assert list(load.by_job) == ["fit", "margin"]
+    assert load.service_per_s == pytest.approx(0.08)
+    assert (load.busy_ratio, load.window_s, load.windows_late) == (pytest.approx(0.3), 2.0, 0)
 
 
 def test_it_is_of_the_last_minute(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     work(clocks, meter, 100, cpu=0.9)
     work(clocks, meter, 61, cpu=0.1)
-    assert meter.pace.worker_per_s == pytest.approx(0.2)
+    assert meter.worker_load.worker_per_s == pytest.approx(0.2)
 
 
 def test_without_telemetry_a_cost_per_second_of_it_is_not_known(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     clocks.now_s = 5.0
     meter.look()
-    assert meter.pace.worker_per_s is None
-    assert meter.pace.window_s is None
+    assert meter.worker_load.worker_per_s is None
+    assert meter.worker_load.window_s is None
 
 
 def test_a_worker_that_does_not_keep_up_is_named_with_cause_and_cure(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     work(clocks, meter, 30, busy=0.97, cpu=0.9, late=True)
-    (trouble,) = meter.news(QUIET)
+    (trouble,) = meter.detect_changes(QUIET)
     assert (trouble.name, trouble.over) == ("worker-behind", False)
     assert "1.80 s of processor time for each second of telemetry (fit 1.44, margin" in trouble.text
     assert "the machine is too slow" in trouble.text
@@ -88,38 +88,38 @@ def test_a_worker_that_does_not_keep_up_is_named_with_cause_and_cure(clocks):
 
 
 def test_a_loaded_machine_is_told_from_a_slow_one(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     work(clocks, meter, 30, busy=0.97, cpu=0.2, late=True)
-    (trouble,) = meter.news(QUIET)
+    (trouble,) = meter.detect_changes(QUIET)
     assert "the machine is loaded: of a second at work it gets 0.2 s" in trouble.text
 
 
 def test_a_matrix_that_takes_some_seconds_is_no_reason_for_an_alarm(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     work(clocks, meter, 6, busy=1.0, late=True)
-    assert not meter.news(QUIET)
+    assert not meter.detect_changes(QUIET)
     work(clocks, meter, 30)
-    assert not meter.news(QUIET)
+    assert not meter.detect_changes(QUIET)
 
 
 def test_the_alarm_lasts_until_the_worker_is_at_ease_again(clocks):
-    meter = PaceMeter(clocks)
+    meter = WorkerLoadMeter(clocks)
     work(clocks, meter, 60, busy=0.97, cpu=0.9, late=True)
-    assert meter.news(QUIET)
+    assert meter.detect_changes(QUIET)
     work(clocks, meter, 10, busy=0.8, late=True)
-    assert not meter.news(alarmed("worker-behind"))
+    assert not meter.detect_changes(alarmed("worker-behind"))
     work(clocks, meter, 60, busy=0.8)
-    (over,) = meter.news(alarmed("worker-behind"))
+    (over,) = meter.detect_changes(alarmed("worker-behind"))
     assert over.over
 
 
 def test_a_lost_worker_is_an_alarm_until_another_has_done_a_job(clocks):
-    meter = PaceMeter(clocks)
-    clocks.trouble = "the worker process died during fit"
-    (trouble,) = meter.news(QUIET)
+    meter = WorkerLoadMeter(clocks)
+    clocks.problem = "the worker process died during fit"
+    (trouble,) = meter.detect_changes(QUIET)
     assert (trouble.name, trouble.over) == ("worker-lost", False)
     assert "died during fit" in trouble.text
-    assert not meter.news(alarmed("worker-lost"))
-    clocks.trouble = ""
-    (over,) = meter.news(alarmed("worker-lost"))
+    assert not meter.detect_changes(alarmed("worker-lost"))
+    clocks.problem = ""
+    (over,) = meter.detect_changes(alarmed("worker-lost"))
     assert over.over

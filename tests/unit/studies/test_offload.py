@@ -68,7 +68,7 @@ def test_from_30_percent_and_half_a_degree_it_is_home_in_five_moves(tmp_path):
     assert logged(night, "instrument-mismatch") == []
     assert len(night.swaps) >= 2
     moved = way(night)
-    assert 1 <= night.state.move.n_moves <= 5, logged(night, "offload.asked")
+    assert 1 <= night.state.offload.n_moves <= 5, logged(night, "offload.asked")
     assert np.all(np.abs(moved[-1]) <= [0.02, 0.02, 0.02, 0.002])
     overshoot = (moved * -np.sign(moved[0])).max(axis=0) / np.abs(moved[0])
     assert overshoot.max() <= 0.1

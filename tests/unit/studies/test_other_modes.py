@@ -186,7 +186,7 @@ def test_where_all_modes_of_the_mirror_are_to_be_controlled_the_rotation_is_righ
     bench.write_text(EVERY_MODE)
     night = OtherNight(Plan(instrument=str(bench), n_controlled=100, n_target=143, seed=2))
     night.pass_(8.0)
-    known = night.state.registration
-    off = np.abs(known.alpha.vector - night.dome.moments[-1].alpha.vector)
-    assert np.all(off < 3.0 * known.sigma)
+    registration = night.state.registration
+    off = np.abs(registration.alpha.vector - night.dome.moments[-1].alpha.vector)
+    assert np.all(off < 3.0 * registration.sigma)
     assert np.rad2deg(off[2]) < 0.1

@@ -113,7 +113,7 @@ class DitheredNight(Story):
             misfit=1.0,
             step=np.zeros(4),
         )
-        return ev.Watched(estimate=found, t_ns_utc=self.now_ns)
+        return ev.PassiveFitted(estimate=found, t_ns_utc=self.now_ns)
 
     @property
     def share_on(self):

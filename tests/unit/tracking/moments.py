@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import Note, Severity
+from service.tracking.alarms import AlarmRecord, Severity
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import POLICY, Story, moved, rtc
@@ -82,8 +82,10 @@ def suspected():
 def diverging():
     """An alarm forbids to send anything."""
     story = proposed()
-    story.tell(ev.Trouble(name="loop-diverging", text="found"))
-    story.tell(ev.Trouble(name="command-unit", text="commands are a million times too large"))
+    story.tell(ev.ConditionChanged(name="loop-diverging", text="found"))
+    story.tell(
+        ev.ConditionChanged(name="command-unit", text="commands are a million times too large")
+    )
     return story
 
 
@@ -121,8 +123,8 @@ def seen():
 def gone():
     """An alarm went, and nobody had seen it."""
     story = in_use()
-    note = Note(name="margin", worst=Severity.SERIOUS, over_ns_utc=1)
-    story.state = replace(story.state, notes=(note,))
+    record = AlarmRecord(name="margin", worst=Severity.SERIOUS, over_ns_utc=1)
+    story.state = replace(story.state, alarm_records=(record,))
     return story
 
 
@@ -151,9 +153,9 @@ def meant(state, order):
     """The command that an operator would give now; None: there is nothing that it could name."""
     proposals = [r.id for r in state.reconstructors if r.state is MatrixState.PROPOSED]
     used = [r.id for r in state.reconstructors if r.was_used]
-    work = state.measuring or state.gathering
-    unseen = [n.name for n in state.notes if n.worst is not None and n.acknowledged is None]
-    muted = [note.name for note in state.notes if note.muted is not None]
+    work = state.measuring or state.noisy_measurement
+    unseen = [n.name for n in state.alarm_records if n.worst is not None and n.acknowledged is None]
+    muted = [note.name for note in state.alarm_records if note.muted is not None]
     named = {
         "approve": (cmd.Approve, proposals),
         "reject": (cmd.Reject, proposals),

@@ -7,7 +7,7 @@ import numpy as np
 from pyrcal.client.remote import REQUESTS
 from service.control.gate import GateVerdict
 from service.errors import CommandError
-from service.estimation.lockin import WindowEstimate
+from service.estimation.lockin import LockInEstimate
 from service.model.misregistration import Misregistration
 from service.tracker import step
 from service.tracking import events as ev
@@ -17,7 +17,7 @@ from service.tracking.mode_limits import ModeProof
 from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import (
     Acknowledgement,
     AckState,
@@ -169,7 +169,7 @@ def estimate(alpha=ALPHA, *, t_ns=START_NS, session="s1", **changes):
         "cm_id": "initial",
         "session": session,
     }
-    return WindowEstimate(**(values | changes))
+    return LockInEstimate(**(values | changes))
 
 
 def moved(alpha=ALPHA, **by):
@@ -179,9 +179,9 @@ def moved(alpha=ALPHA, **by):
 
 def turned(state, act, *args, now_ns=START_NS, **kwargs):
     """The state after something was done to it while an event was worked out."""
-    turn = Turn(state, ev.Tick(), POLICY, now_ns)
-    act(turn, *args, **kwargs)
-    return turn.state
+    context = StepContext(state, ev.Tick(), POLICY, now_ns)
+    act(context, *args, **kwargs)
+    return context.state
 
 
 ALL_SHOWN = ModeProof(proven=frozenset(range(N_MODES)))
@@ -247,11 +247,14 @@ class Story:
 
     def make(self, matrix_id, state=MatrixState.PROPOSED, *, wanted=False, **changes):
         """Hand in a reconstructor, made for the current registration."""
-        known, view = self.state.registration, self.state.rtc
-        changes = {"created_ns_utc": self.now_ns, "alpha": known and known.alpha} | changes
-        if view is not None and known is not None:
+        registration, view = self.state.registration, self.state.rtc
+        changes = {
+            "created_ns_utc": self.now_ns,
+            "alpha": registration and registration.alpha,
+        } | changes
+        if view is not None and registration is not None:
             n_modes = changes.get("n_modes", 400)
-            changes = {"judged": judged(known, view, n_modes)} | changes
+            changes = {"judged": judged(registration, view, n_modes)} | changes
         made = record(matrix_id, state, **changes)
         return self.tell(ev.MatrixMade(record=made, wanted=wanted))
 

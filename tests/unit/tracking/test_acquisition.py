@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.estimation.openloop import FarEstimate
+from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition import PATIENCE_S
 from service.tracking.acquisition_stages import (
+    MAX_ATTEMPTS,
+    MAX_MISSES,
     MISSES_BEFORE,
     MISSES_DESPITE,
-    MOST_ATTEMPTS,
-    MOST_MISSES,
     OUT_OF_HAND_S,
-    far_dither,
+    wide_capture_dither,
 )
 from service.tracking.dither_request import lock_in_plan
 from service.tracking.products import MatrixState
 from service.tracking.state import AcquisitionStage, Mode
-from service.tracking.worth import fewer_than
+from service.tracking.update_policy import fewer_than
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import (
     POLICY,
@@ -40,8 +40,8 @@ ACQUIRES = replace(POLICY, acquires=True)
 FAR = Misregistration(
     shift_x_subap=1.2, shift_y_subap=-0.9, rotation_rad=np.deg2rad(4.0), magnification=0.97
 )
-DIVERGING = ev.Trouble(name="loop-diverging", text="found")
-CALM = ev.Trouble(name="loop-diverging", text="gone", over=True)
+DIVERGING = ev.ConditionChanged(name="loop-diverging", text="found")
+CALM = ev.ConditionChanged(name="loop-diverging", text="gone", over=True)
 
 
 class Acquiring(Story):
@@ -93,8 +93,8 @@ class Acquiring(Story):
             modes=dither.request.modes,
             covariance=np.diag([sigma, sigma, sigma / 30, sigma / 10]) ** 2,
         )
-        found = FarEstimate(estimate=fitted, unexplained=0.05, n_starts=1)
-        effects = self.tell(ev.FarFitted(found=found), 3.0)
+        found = WideCaptureEstimate(estimate=fitted, unexplained=0.05, n_starts=1)
+        effects = self.tell(ev.WideCaptureFitted(found=found), 3.0)
         self.still_open(dither=replace(dither, start_seq=5000))
         self.still_open()
         return effects
@@ -307,7 +307,11 @@ class TestNothingWrong:
         story.tell(cmd.Acquire())
         story.open()
         late = estimate(FAR, session="s1", modes=story.state.dither.request.modes)
-        story.tell(ev.FarFitted(found=FarEstimate(estimate=late, unexplained=0.0, n_starts=1)))
+        story.tell(
+            ev.WideCaptureFitted(
+                found=WideCaptureEstimate(estimate=late, unexplained=0.0, n_starts=1)
+            )
+        )
         assert story.stage is AcquisitionStage.COARSE
 
     def test_a_window_of_other_modes_is_not_used(self):
@@ -315,7 +319,11 @@ class TestNothingWrong:
         story.tell(cmd.Acquire())
         story.open()
         other = estimate(FAR, session="s2", modes=(1, 2, 3))
-        story.tell(ev.FarFitted(found=FarEstimate(estimate=other, unexplained=0.0, n_starts=1)))
+        story.tell(
+            ev.WideCaptureFitted(
+                found=WideCaptureEstimate(estimate=other, unexplained=0.0, n_starts=1)
+            )
+        )
         assert story.stage is AcquisitionStage.COARSE
 
     def test_nothing_known_before_is_relied_on(self):
@@ -387,10 +395,10 @@ class TestNothingWrong:
 class TestTrouble:
     def test_a_loop_that_slips_is_opened_again_and_closed_on_fewer_modes(self):
         story = Acquiring().to_widening()
-        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         assert story.stage is AcquisitionStage.OPENING
         assert story.asked(LoopRequest)[-1].loop is Loop.OPEN
-        story.tell(ev.Trouble(name="edge-slip", text="gone", over=True))
+        story.tell(ev.ConditionChanged(name="edge-slip", text="gone", over=True))
         story.open()
         story.see_afar()
         story.see_afar()
@@ -404,26 +412,26 @@ class TestTrouble:
         story.widen(400)
         story.see(FAR, n_windows=3)
         assert story.stage is AcquisitionStage.TRACKING
-        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         story.wait(3)
         assert story.stage is AcquisitionStage.OPENING
-        assert story.state.acquisition.most_modes == 200
+        assert story.state.acquisition.max_modes == 200
         limit = story.state.mode_limit
         assert (limit.n_modes, limit.reason) == (200, "edge-slip with 400 modes")
 
     def test_that_a_loop_slips_on_the_rtcs_own_matrix_says_nothing_of_the_modes(self):
         story = Acquiring(Mode.AUTO)
-        story.tell(ev.Trouble(name="edge-slip", text="found"))
+        story.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         story.wait(3)
         assert story.stage is AcquisitionStage.OPENING
-        assert story.state.acquisition.most_modes is None
+        assert story.state.acquisition.max_modes is None
         assert story.state.mode_limit is None
 
     def test_windows_that_lead_nowhere_begin_it_anew_and_end_it_after_a_few_attempts(self):
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        for _ in range(MOST_ATTEMPTS * MOST_MISSES):
+        for _ in range(MAX_ATTEMPTS * MAX_MISSES):
             assert story.state.acquisition.under_way
             story.miss_afar()
             story.still_open()
@@ -435,7 +443,7 @@ class TestTrouble:
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        for _ in range(2 * MOST_MISSES):
+        for _ in range(2 * MAX_MISSES):
             story.miss_afar("the worker is too slow: a window was given up", RefusalKind.OTHER)
         assert story.state.acquisition.attempt == 1
 
@@ -587,9 +595,9 @@ def test_the_loop_open_alarm_is_kept_quiet_meanwhile():
 
 
 def test_the_far_dither_is_as_strong_as_settings_and_rtc_allow():
-    dither = far_dither(AcquisitionStage.COARSE, rtc(max_dither_m=2e-8), ACQUIRES, 0)
+    dither = wide_capture_dither(AcquisitionStage.COARSE, rtc(max_dither_m=2e-8), ACQUIRES, 0)
     assert set(dither.request.amplitude_m) == {2e-8}
-    dither = far_dither(AcquisitionStage.COARSE, rtc(), ACQUIRES, 0)
+    dither = wide_capture_dither(AcquisitionStage.COARSE, rtc(), ACQUIRES, 0)
     assert set(dither.request.amplitude_m) == {5e-8}
 
 
@@ -597,12 +605,12 @@ def test_the_far_dither_is_as_strong_as_settings_and_rtc_allow():
 @pytest.mark.parametrize("stage", [AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING])
 def test_its_dithers_can_be_read_at_any_frame_rate(rate_hz, stage):
     view = rtc(frame_rate_hz=rate_hz)
-    dither = far_dither(stage, view, POLICY, 0)
+    dither = wide_capture_dither(stage, view, POLICY, 0)
     assert lock_in_plan(dither, view, 2.0).n_frames == round(2.0 * rate_hz)
 
 
 def test_a_status_whose_rate_differs_by_parts_per_million_reads_the_dither_all_the_same():
-    dither = far_dither(AcquisitionStage.COARSE, rtc(frame_rate_hz=300.0), POLICY, 0)
+    dither = wide_capture_dither(AcquisitionStage.COARSE, rtc(frame_rate_hz=300.0), POLICY, 0)
     assert lock_in_plan(dither, rtc(frame_rate_hz=300.0007), 2.0)
 
 
@@ -610,7 +618,7 @@ def test_one_whose_dither_cannot_be_read_ends_and_says_why():
     story = Acquiring()
     story.tell(cmd.Acquire())
     story.open()
-    story.tell(ev.Noted(name="dither.unusable", text="600 frames cut a period"))
+    story.tell(ev.LogEvent(name="dither.unusable", text="600 frames cut a period"))
     assert story.stage is AcquisitionStage.FAILED
     assert "600 frames cut a period" in story.text
 

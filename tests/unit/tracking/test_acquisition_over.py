@@ -14,7 +14,7 @@ from tests.unit.tracking.situations import foreign, moved
 from tests.unit.tracking.test_acquisition import CALM, DIVERGING, FAR, Acquiring
 from tests.unit.tracking.test_acquisition_restart import Again
 
-SLIPPED = ev.Trouble(name="edge-slip", text="found")
+SLIPPED = ev.ConditionChanged(name="edge-slip", text="found")
 
 
 class Failed(Acquiring):
@@ -78,7 +78,7 @@ def test_windows_that_contradict_one_another_are_not_enough():
     story = Failed().close_on_their_own()
     story.see()
     story.see(moved(shift_x_subap=0.4))
-    assert story.state.registration.candidate is not None
+    assert story.state.registration.suspected_jump is not None
     assert story.stage is AcquisitionStage.FAILED
 
 

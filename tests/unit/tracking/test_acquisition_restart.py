@@ -6,7 +6,7 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_stages import MOST_ATTEMPTS
+from service.tracking.acquisition_stages import MAX_ATTEMPTS
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
@@ -200,7 +200,7 @@ def test_a_loop_that_had_not_been_opened_yet_is_left_closed():
 
 
 def test_it_is_not_begun_anew_for_ever(opened):
-    for _ in range(MOST_ATTEMPTS - 1):
+    for _ in range(MAX_ATTEMPTS - 1):
         opened = Again(opened).find()
         opened.still_open()
         assert opened.stage is AcquisitionStage.COARSE
@@ -332,7 +332,7 @@ class TestGap:
         assert len(story.asked(LoopRequest)) == n_asked
 
     def test_a_link_that_fails_again_and_again_ends_it(self, opened):
-        for _ in range(MOST_ATTEMPTS):
+        for _ in range(MAX_ATTEMPTS):
             assert opened.stage is AcquisitionStage.COARSE
             opened.tell(ev.RtcVanished())
             opened.still_open()

@@ -9,8 +9,8 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import under_way
 from service.tracking.products import MatrixState, MeasureState, ModeSet
+from service.tracking.running_operations import under_way
 from service.tracking.state import AcquisitionStage, Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern
 from tests.unit.tracking.situations import POLICY, Story
@@ -57,7 +57,7 @@ def measuring_sines():
 def waiting_for_a_noisy_one():
     world = own_dither()
     world.tell(cmd.MeasureNoisy(id="noisy-1", duration_s=30.0))
-    assert world.state.gathering.state is MeasureState.WAITING
+    assert world.state.noisy_measurement.state is MeasureState.WAITING
     return world
 
 
@@ -65,7 +65,7 @@ def gathering():
     world = idle()
     world.tell(cmd.MeasureNoisy(id="noisy-1", modes=ModeSet.CONTROLLED, duration_s=30.0))
     world.pass_(3.0)
-    assert world.state.gathering.state is MeasureState.RUNNING
+    assert world.state.noisy_measurement.state is MeasureState.RUNNING
     return world
 
 
@@ -315,7 +315,7 @@ def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_
     world.pass_(20.0)
     world.tell(cmd.MeasureNoisy(id="noisy-1", duration_s=60.0))
     world.pass_(5.0)
-    world.tell(ev.Trouble(name="loop-diverging", text="found"))
+    world.tell(ev.ConditionChanged(name="loop-diverging", text="found"))
     world.pass_(4.0)
     assert world.state.acquisition.under_way
     (noisy,) = world.state.noisy

@@ -5,7 +5,7 @@ from dataclasses import replace
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import OVER_BUDGET
-from service.tracking.dither_request import Choice, Dither, plan_dither, why_unusable
+from service.tracking.dither_request import Dither, DitherParameters, plan_dither, why_unusable
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     POLICY,
@@ -18,7 +18,7 @@ from tests.unit.tracking.situations import (
     stopping,
 )
 
-CHOICE = Choice(total_m=8e-9, window_s=2.0, n_windows=59)
+CHOICE = DitherParameters(total_m=8e-9, window_s=2.0, n_windows=59)
 RUNNING = replace(plan_dither(rtc(), POLICY, START_NS, choice=CHOICE), start_seq=4000)
 
 

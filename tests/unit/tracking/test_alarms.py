@@ -9,7 +9,7 @@ from service.estimation.windows import RefusalKind, WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import ALARMS, Act, Kind, Severity
+from service.tracking.alarms import ALARMS, AlarmDefinition, Interlock, Severity
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, LoopRequest
@@ -28,7 +28,7 @@ def settled(name, **story):
     told = Story(Mode.AUTO, **story).meet()
     told.see(n_windows=3)
     told.effects.clear()
-    told.tell(ev.Trouble(name=name, text="found"))
+    told.tell(ev.ConditionChanged(name=name, text="found"))
     return told
 
 
@@ -63,7 +63,7 @@ def test_one_that_is_being_judged_when_it_comes_is_not_sent_either(name):
     of_old = replace(made(story).judged, leak=0.9)
     effects = story.tell(ev.MatrixMade(record=made(story, judged=of_old), wanted=False))
     (asked,) = of_kind(effects, ev.JudgeProposal)
-    story.tell(ev.Trouble(name=name, text="found"))
+    story.tell(ev.ConditionChanged(name=name, text="found"))
     now = judged(story.state.registration, story.state.rtc)
     passed = ev.ProposalJudged(id="cm-1", verdict=made(story).gate, judged=now, wanted=asked.wanted)
     assert not of_kind(story.tell(passed), ev.SendMatrix)
@@ -87,16 +87,18 @@ def test_not_even_an_operator_sends_to_an_rtc_that_may_be_another(name):
 
 
 def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back(monkeypatch):
-    forbids = frozenset({Act.DECIDE, Act.SEND_NEW})
+    forbids = frozenset({Interlock.DECIDE, Interlock.SEND_NEW})
     because = "the model was wrong"
-    kind = Kind(severity=Severity.SERIOUS, means="-", do="-", forbids=forbids, because=because)
+    kind = AlarmDefinition(
+        severity=Severity.SERIOUS, means="-", do="-", blocks=forbids, because=because
+    )
     monkeypatch.setitem(ALARMS, "wrong-model", kind)
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=3)
     story.make("cm-1", wanted=True, sha256="1" * 64)
     story.acknowledge("cm-1")
     story.use("cm-2")
-    story.tell(ev.Trouble(name="wrong-model", text="found"))
+    story.tell(ev.ConditionChanged(name="wrong-model", text="found"))
     story.effects.clear()
     story.tell(ev.MatrixMade(record=made(story, "cm-3", sha256="3" * 64), wanted=True))
     assert not story.asked(ev.SendMatrix)
@@ -108,7 +110,7 @@ def test_every_alarm_is_in_the_table_and_says_what_it_refuses():
     names = {value for name, value in vars(alarms).items() if name.isupper() and name != "ALARMS"}
     assert names == set(ALARMS)
     for name, kind in ALARMS.items():
-        assert bool(kind.because) == bool(kind.forbids), name
+        assert bool(kind.because) == bool(kind.blocks), name
 
 
 def test_a_name_that_is_in_no_table_forbids_nothing():

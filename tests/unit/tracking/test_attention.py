@@ -9,8 +9,8 @@ from service.archive.records import TrackingFile
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import ALARMS, Act, Attention, Severity, forbidding
-from service.tracking.attention import muted, stale, worst
+from service.tracking.alarm_records import muted, stale, worst
+from service.tracking.alarms import ALARMS, AlarmState, Interlock, Severity, blocking_alarm
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import TrackerState
 from tests.unit.tracking.situations import POLICY, Story, judged, verdict
@@ -26,11 +26,11 @@ def story():
 
 
 def raised(story, name, *, over=False):
-    story.tell(ev.Trouble(name=name, text=f"{name} found", over=over))
+    story.tell(ev.ConditionChanged(name=name, text=f"{name} found", over=over))
 
 
 def note(story, name):
-    return next((note for note in story.state.notes if note.name == name), None)
+    return next((note for note in story.state.alarm_records if note.name == name), None)
 
 
 def restarted(story, tmp_path):
@@ -51,7 +51,7 @@ def small(story):
 
 def test_one_that_goes_unseen_is_stale_until_somebody_has_seen_it(story):
     raised(story, "edge-slip")
-    assert note(story, "edge-slip").attention is Attention.ACTIVE
+    assert note(story, "edge-slip").alarm_state is AlarmState.ACTIVE
     raised(story, "edge-slip", over=True)
     (left,) = stale(story.state)
     assert (left.text, left.worst) == ("edge-slip found", Severity.CRITICAL)
@@ -70,11 +70,11 @@ def test_one_that_is_acknowledged_stays_while_it_lasts_and_is_then_done_with(sto
     seen = note(story, "edge-slip").acknowledged
     assert (seen.by, seen.reason, seen.t_ns_utc) == ("Ada", "seen", story.now_ns)
     raised(story, "edge-slip")
-    assert note(story, "edge-slip").attention is Attention.ACKNOWLEDGED
+    assert note(story, "edge-slip").alarm_state is AlarmState.ACKNOWLEDGED
     raised(story, "edge-slip", over=True)
-    assert story.state.notes == ()
+    assert story.state.alarm_records == ()
     raised(story, "edge-slip")
-    assert note(story, "edge-slip").attention is Attention.ACTIVE
+    assert note(story, "edge-slip").alarm_state is AlarmState.ACTIVE
 
 
 def test_the_worst_is_kept_and_what_becomes_worse_is_acknowledged_again(story):
@@ -89,10 +89,10 @@ def test_the_worst_is_kept_and_what_becomes_worse_is_acknowledged_again(story):
     assert note(story, "margin").worst is Severity.SERIOUS
     story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.SERIOUS, **ADA))
     margin(1.02)
-    assert note(story, "margin").attention is Attention.ACTIVE
+    assert note(story, "margin").alarm_state is AlarmState.ACTIVE
     margin(0.97)
     assert note(story, "margin").worst is worst(story.state) is Severity.CRITICAL
-    assert next(a for a in story.state.alarms if a.name == "margin").kind is ALARMS["margin"]
+    assert next(a for a in story.state.alarms if a.name == "margin").definition is ALARMS["margin"]
     with pytest.raises(CommandError, match="margin has been critical, and serious was seen of it"):
         story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.SERIOUS))
     story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.CRITICAL))
@@ -105,7 +105,7 @@ def judged_now(story):
 def test_what_an_operators_order_ends_has_been_seen(story):
     story.tell(cmd.StopEverything())
     story.tell(cmd.Resume(**ADA))
-    assert story.state.notes == ()
+    assert story.state.alarm_records == ()
 
 
 def test_what_makes_no_sense_is_refused_in_a_sentence(story):
@@ -125,17 +125,17 @@ def test_a_muted_one_forbids_what_it_forbids_and_comes_back_by_itself(story):
     story.tell(cmd.MuteAlarm(name="matrix-mismatch", for_s=60.0, **ADA))
     raised(story, "matrix-mismatch")
     (quiet,) = muted(story.state)
-    assert (quiet.name, quiet.attention) == ("matrix-mismatch", Attention.ACTIVE)
-    assert forbidding(story.state, Act.SEND_NEW).name == "matrix-mismatch"
+    assert (quiet.name, quiet.alarm_state) == ("matrix-mismatch", AlarmState.ACTIVE)
+    assert blocking_alarm(story.state, Interlock.SEND_NEW).name == "matrix-mismatch"
     story.wait(61)
     assert muted(story.state) == ()
-    assert note(story, "matrix-mismatch").attention is Attention.ACTIVE
+    assert note(story, "matrix-mismatch").alarm_state is AlarmState.ACTIVE
 
 
 def test_one_muted_before_it_comes_can_be_unmuted(story):
     story.tell(cmd.MuteAlarm(name="rtc-vanished", for_s=60.0))
     story.tell(cmd.UnmuteAlarm(name="rtc-vanished"))
-    assert story.state.notes == ()
+    assert story.state.alarm_records == ()
 
 
 def test_a_restart_changes_nothing_of_what_was_seen_and_what_was_not(small, tmp_path):
@@ -148,9 +148,9 @@ def test_a_restart_changes_nothing_of_what_was_seen_and_what_was_not(small, tmp_
     assert {left.name for left in stale(again.state)} == {"margin", "loop-open"}
     assert [quiet.name for quiet in muted(again.state)] == ["second-rtc"]
     raised(again, "edge-slip")
-    assert note(again, "edge-slip").attention is Attention.ACKNOWLEDGED
+    assert note(again, "edge-slip").alarm_state is AlarmState.ACKNOWLEDGED
     raised(again, "loop-open")
-    assert note(again, "loop-open").attention is Attention.ACTIVE
+    assert note(again, "loop-open").alarm_state is AlarmState.ACTIVE
 
 
 def test_what_was_acknowledged_and_is_not_raised_again_after_a_restart_is_over(small, tmp_path):
@@ -175,8 +175,8 @@ def test_a_file_of_before_there_were_acknowledgements_is_read(small, tmp_path):
 
 def test_what_lasts_without_news_costs_the_disk_nothing(story):
     raised(story, "frames-unused")
-    before = story.state.notes
+    before = story.state.alarm_records
     for k in range(5):
-        story.tell(ev.Trouble(name="frames-unused", text=f"{k} frames"))
+        story.tell(ev.ConditionChanged(name="frames-unused", text=f"{k} frames"))
         story.wait(1)
-    assert story.state.notes is before
+    assert story.state.alarm_records is before

@@ -41,4 +41,4 @@ def test_what_makes_no_sense_in_any_state_is_no_command(kind, said, why):
 def test_a_pointing_is_a_direction():
     command = cmd.SetPointing(elevation_deg=61.5, azimuth_deg=-20.0, by="the mount")
     assert command.pointing == Pointing(elevation_deg=61.5, azimuth_deg=-20.0)
-    assert command.said()["by"] == "the mount"
+    assert command.as_fields()["by"] == "the mount"

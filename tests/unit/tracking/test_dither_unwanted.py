@@ -6,11 +6,11 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import GONE_WITHIN_S
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither import CALM_S, TELL_EVERY_S
 from service.tracking.dither_request import DitherPhase, total_m
 from service.tracking.products import MeasureState
+from service.tracking.running_operations import GONE_WITHIN_S
 from service.tracking.state import AcquisitionStage
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
@@ -64,11 +64,11 @@ class TestOffByTheOperator:
         asked = of_kind(playing(story, dither, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
         assert NOT_STOPPED in story.alarms
-        assert story.state.dithering.phase is DitherPhase.OFF
-        assert dither.id in story.state.dithering.reason
+        assert story.state.dither_policy.phase is DitherPhase.OFF
+        assert dither.id in story.state.dither_policy.reason
         assert not silent(story, 60)
         assert NOT_STOPPED not in story.alarms
-        assert story.state.dithering.reason == "stopped by the operator"
+        assert story.state.dither_policy.reason == "stopped by the operator"
 
     def test_a_start_that_overtakes_the_stop_is_stopped_too(self, story):
         dither = story.state.dither
@@ -104,20 +104,20 @@ class TestOffByTheOperator:
         story.tell(cmd.StopDither())
         playing(story, dither, 2700)  # four and a half of its memories
         expected = pytest.approx(total_m(dither.request), rel=0.01)
-        assert story.state.dithering.mean_cost_m == expected
+        assert story.state.dither_policy.mean_cost_m == expected
 
     @pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip"])
     def test_a_loop_out_of_hand_keeps_none_on_the_mirror(self, story, alarm):
         dither = story.state.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
-        story.tell(ev.Trouble(name=alarm, text="x"))
+        story.tell(ev.ConditionChanged(name=alarm, text="x"))
         assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_nobody_knows_whose_it_is_while_two_rtcs_send(self, story):
         dither = story.state.dither
         story.tell(cmd.StopDither())
-        story.tell(ev.Trouble(name="second-rtc", text="x"))
+        story.tell(ev.ConditionChanged(name="second-rtc", text="x"))
         assert not playing(story, dither, 4)
 
     def test_the_alarm_ends_with_the_rtc(self, story):
@@ -169,7 +169,7 @@ class TestTooStrong:
         playing(story, loud)
         assert not of_kind(silent(story, round(CALM_S) - 2), DitherRequest)
         assert OVER_BUDGET in story.alarms
-        assert "too strong" in story.state.dithering.reason
+        assert "too strong" in story.state.dither_policy.reason
         assert of_kind(silent(story, 4), DitherRequest)
         accept(story, story.state.dither)
         assert OVER_BUDGET in story.alarms

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from service.errors import CommandError
-from service.estimation.openloop import FarEstimate
+from service.estimation.openloop import WideCaptureEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -47,8 +47,8 @@ class Late(Story):
 
     @property
     def doubted(self):
-        known = self.state.registration
-        return bool(known.doubt) or known.standing.validity is Validity.INVALID
+        registration = self.state.registration
+        return bool(registration.doubt) or registration.validity.level is Validity.INVALID
 
     def at(self, s):
         """The service's and the RTC's clock are there."""
@@ -64,7 +64,7 @@ class Late(Story):
     def look(self, end_s, alpha, *, done_s=None):
         self.at(end_s if done_s is None else done_s)
         end_ns = self.zero_ns + round(end_s * SECOND)
-        return self.tell(ev.Watched(estimate=watched(alpha, SCATTER), t_ns_utc=end_ns))
+        return self.tell(ev.PassiveFitted(estimate=watched(alpha, SCATTER), t_ns_utc=end_ns))
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ class TestLookThatBarks:
         night.window(14)
         night.look(9, ELSEWHERE, done_s=15)
         assert not night.doubted
-        assert "dithered window" in night.state.unwatched
+        assert "dithered window" in night.state.passive_unavailable_reason
 
     def test_a_clock_that_was_set_back_keeps_no_doubt_for_an_hour(self, night):
         night.look(3600, ELSEWHERE)
@@ -163,9 +163,9 @@ class TestLoopOutOfHand:
     def test_a_window_of_it_counts_for_nothing_once_it_is_over_either(self, night):
         before = night.state.windows_accepted
         night.at(10)
-        night.tell(ev.Trouble(name="loop-diverging", text="found"))
+        night.tell(ev.ConditionChanged(name="loop-diverging", text="found"))
         night.at(14)
-        night.tell(ev.Trouble(name="loop-diverging", text="calm", over=True))
+        night.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
         night.window(13, fitted_s=15)
         assert night.state.windows_accepted == before
         assert "diverging" in night.state.log[-1].text
@@ -175,21 +175,21 @@ class TestLoopOutOfHand:
     def test_the_frames_say_until_when(self, night):
         before = night.state.windows_accepted
         night.at(10)
-        night.tell(ev.Trouble(name="edge-slip", text="found"))
+        night.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         over_ns = night.zero_ns + round(14.8 * SECOND)
         night.at(14)
-        night.tell(ev.Trouble(name="edge-slip", text="back", over=True, t_ns_utc=over_ns))
+        night.tell(ev.ConditionChanged(name="edge-slip", text="back", over=True, t_ns_utc=over_ns))
         night.window(16, began_ns_utc=night.zero_ns + round(14.2 * SECOND))
         assert night.state.windows_accepted == before
 
     def test_a_look_at_it_counts_for_nothing_either(self, night):
         night.at(10)
-        night.tell(ev.Trouble(name="loop-diverging", text="found"))
+        night.tell(ev.ConditionChanged(name="loop-diverging", text="found"))
         night.at(14)
-        night.tell(ev.Trouble(name="loop-diverging", text="calm", over=True))
+        night.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
         night.look(13, ELSEWHERE, done_s=15)
         assert not night.doubted
-        assert "not used" in night.state.unwatched
+        assert "not used" in night.state.passive_unavailable_reason
 
 
 def test_a_look_at_a_session_that_is_over_counts_for_nothing(night):
@@ -197,7 +197,7 @@ def test_a_look_at_a_session_that_is_over_counts_for_nothing(night):
     night.tell(ev.SessionStarted(session="s2"))
     night.tell(rtc(session="s2", t_ns=night.now_ns))
     end_ns = night.zero_ns + 9 * SECOND
-    night.tell(ev.Watched(estimate=watched(ELSEWHERE), t_ns_utc=end_ns), 1.0)
+    night.tell(ev.PassiveFitted(estimate=watched(ELSEWHERE), t_ns_utc=end_ns), 1.0)
     assert not night.state.registration.doubt
 
 
@@ -296,9 +296,9 @@ def test_what_was_seen_from_afar_before_an_acquisition_began_anew_counts_for_not
     dither = night.state.dither
     found = estimate(ALPHA, t_ns=night.zero_ns + 9 * SECOND, modes=dither.request.modes)
     found = replace(found, covariance=np.diag([0.01, 0.01, 3e-4, 1e-3]) ** 2)
-    far = FarEstimate(estimate=found, unexplained=0.05, n_starts=1)
-    night.tell(ev.FarFitted(found=far))
+    far = WideCaptureEstimate(estimate=found, unexplained=0.05, n_starts=1)
+    night.tell(ev.WideCaptureFitted(found=far))
     assert night.state.acquisition.alpha is None
     later = replace(found, t_ns_utc=night.zero_ns + 14 * SECOND)
-    night.tell(ev.FarFitted(found=replace(far, estimate=later)), 5.0)
+    night.tell(ev.WideCaptureFitted(found=replace(far, estimate=later)), 5.0)
     assert night.state.acquisition.alpha is not None

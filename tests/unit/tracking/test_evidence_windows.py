@@ -143,7 +143,7 @@ def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):
     ("alarm", "word"), [("loop-diverging", "diverging"), ("edge-slip", "slipped")]
 )
 def test_telemetry_of_a_loop_out_of_hand_is_no_measurement(story, alarm, word):
-    story.tell(ev.Trouble(name=alarm, text="it is"))
+    story.tell(ev.ConditionChanged(name=alarm, text="it is"))
     story.see()
     assert story.state.registration is None
     assert word in story.state.log[-1].text
@@ -169,10 +169,10 @@ def test_by_day_a_mirror_seen_twice_shows_twice_the_gain_and_the_window_counts()
 
 def test_a_window_in_flight_when_the_commands_go_off_the_loop_is_not_good():
     story = Story().meet()
-    story.tell(ev.Trouble(name="commands-off-loop", text="saturated"))
+    story.tell(ev.ConditionChanged(name="commands-off-loop", text="saturated"))
     story.see()
     assert story.state.registration is None
     assert "off the loop equation" in story.state.log[-1].text
-    story.tell(ev.Trouble(name="commands-off-loop", text="again", over=True))
+    story.tell(ev.ConditionChanged(name="commands-off-loop", text="again", over=True))
     story.see()
     assert story.state.registration is not None

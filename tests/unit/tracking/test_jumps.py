@@ -72,7 +72,7 @@ class Sky:
             step=np.zeros(4),
         )
         self.story.tell(rtc(t_ns=self.story.now_ns))
-        self.story.tell(ev.Watched(estimate=found, t_ns_utc=self.story.now_ns))
+        self.story.tell(ev.PassiveFitted(estimate=found, t_ns_utc=self.story.now_ns))
 
     def flags(self):
         """When what was told of jumps."""

@@ -9,7 +9,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.tracking.worth import (
+from service.tracking.update_policy import (
     FIRST_WAIT_S,
     LADDER,
     LONGEST_WAIT_S,
@@ -205,14 +205,14 @@ class Declined(Night):
 
     def make_for_nobody(self, effect):
         self.made += 1
-        known = self.state.registration
+        registration = self.state.registration
         made = record(
             f"cm-{self.made}",
             n_modes=effect.n_modes,
             created_ns_utc=self.now_ns,
-            alpha=known.alpha,
-            sigma=known.sigma,
-            judged=judged(known, self.state.rtc, effect.n_modes),
+            alpha=registration.alpha,
+            sigma=registration.sigma,
+            judged=judged(registration, self.state.rtc, effect.n_modes),
         )
         return self.tell(ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes))
 

@@ -11,7 +11,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_modes import PROVING_RANGE
 from service.tracking.mode_limits import ModeProof
-from service.tracking.mode_proof import TRIES, most_modes, proven_modes
+from service.tracking.mode_proof import TRIES, n_proven_modes, proven_modes
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
@@ -127,7 +127,7 @@ def test_modes_of_the_rtcs_matrix_that_were_not_recognised_are_shown_too():
     world = Shown()
     strange = ev.ModesRecognised(id="initial", strange=(7, 8), text="two are not recognised")
     world.tell(strange)
-    assert most_modes(world.state, 450) == 7
+    assert n_proven_modes(world.state, 450) == 7
     world.pass_(30.0)
     assert {7, 8} <= {mode for modes in world.shown for mode in modes}
     assert 400 in world.made
@@ -146,7 +146,7 @@ def test_what_has_been_in_use_can_be_sent_again_whatever_is_proven():
     world = Shown().pass_(60.0)
     world.state = replace(world.state, mode_proof=ModeProof())
     world.tell(cmd.Rollback())
-    assert of_kind(world.effects[-3:], ev.CopyMatrix)
+    assert of_kind(world.effects[-3:], ev.RepublishMatrix)
 
 
 def test_dithers_that_show_nothing_are_given_up_for_a_while():
@@ -216,7 +216,7 @@ def test_a_mode_that_the_loop_runs_with_is_not_accused_by_its_dither():
             gain_sigma=np.full(4, 0.02),
         )
         world.tell(ev.WindowFitted(estimate=seen))
-    assert most_modes(world.state, 450) == 450
+    assert n_proven_modes(world.state, 450) == 450
     assert alarms.MODES_CONTRARY not in world.alarms
 
 

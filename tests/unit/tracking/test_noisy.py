@@ -83,7 +83,7 @@ def test_random_signs_on_all_controlled_modes_are_asked_for(story):
     )
     assert np.sqrt(np.sum(np.square(dither.amplitude_m))) == pytest.approx(5e-9)
     assert state_of(story) is MeasureState.ASKED
-    assert story.state.gathering.seed == dither.seed
+    assert story.state.noisy_measurement.seed == dither.seed
 
 
 def test_the_services_own_dither_makes_way_and_none_of_its_own_follows(dithering):
@@ -123,7 +123,7 @@ def test_the_end_of_the_dither_is_the_beginning_of_the_fit(story):
 def finished(story):
     begun(story)
     status(story, dither_id=None, seq=1100 + 31_000)
-    record = replace(story.state.gathering, state=MeasureState.STORED, finding=FINDING)
+    record = replace(story.state.noisy_measurement, state=MeasureState.STORED, finding=FINDING)
     story.tell(ev.MatrixMeasured(record=record))
     return story
 
@@ -131,7 +131,7 @@ def finished(story):
 def test_what_is_archived_is_stored_and_the_service_dithers_on(story):
     finished(story)
     assert state_of(story) is MeasureState.STORED
-    assert story.state.gathering is None
+    assert story.state.noisy_measurement is None
     assert "signal / noise of an element 1.40" in story.state.log[-1].text
 
 
@@ -201,7 +201,7 @@ def test_what_cannot_be_measured_is_refused(story, changes, words):
 
 def test_more_than_the_budget_must_be_meant(story):
     story.tell(replace(ASK, total_amplitude_m=11e-9, over_budget=True))
-    assert story.state.gathering.total_m == pytest.approx(11e-9)
+    assert story.state.noisy_measurement.total_m == pytest.approx(11e-9)
 
 
 def test_one_at_a_time_and_never_the_same_id(story):

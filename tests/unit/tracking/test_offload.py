@@ -14,7 +14,7 @@ from service.runtime.recording import is_urgent
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.policy import Offloading
-from service.tracking.registration import MoveState, Validity
+from service.tracking.registration import OffloadState, Validity
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode, TrackerState
 from service.wire import OffloadRequest, Reply
@@ -23,8 +23,8 @@ from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, 
 LIMITS = Offloading(
     share=0.5,
     near=np.array([0.02, 0.02, 0.02, 0.002]) / BOUNDARY_SCALE,
-    most_step=np.array([0.1, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE,
-    reach=np.array([1.0, 1.0, 1.0, 0.0]) / BOUNDARY_SCALE,
+    max_step=np.array([0.1, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE,
+    travel=np.array([1.0, 1.0, 1.0, 0.0]) / BOUNDARY_SCALE,
     settle_s=3.0,
 )
 """The magnification of this device cannot be moved."""
@@ -104,15 +104,15 @@ def test_the_filter_is_told_and_a_window_there_is_no_jump():
     known = story.state.registration
     np.testing.assert_allclose(known.alpha.vector, AFTER.vector, atol=3e-3)
     assert known.n_windows == 0
-    assert known.standing.validity is Validity.STALE
-    assert story.state.move.state is MoveState.MOVED
+    assert known.validity.level is Validity.STALE
+    assert story.state.offload.state is OffloadState.MOVED
     story.wait(4.0)
     story.see(AFTER, n_windows=2)
     assert story.state.registration.n_windows == 2
     assert not [name for name in story.logged if "jump" in name]
     # and the rest of the way is asked for
     assert len(story.asked(OffloadRequest)) == 2
-    assert story.state.move.n_moves == 1
+    assert story.state.offload.n_moves == 1
 
 
 def test_telemetry_of_the_move_itself_measures_nothing():
@@ -135,8 +135,8 @@ def test_without_a_reply_it_may_have_moved_or_not():
     known = story.state.registration
     np.testing.assert_array_equal(known.alpha.vector, before.alpha.vector)
     assert np.sqrt(known.covariance[0, 0]) >= 0.06
-    assert story.state.move.state is MoveState.FAILED
-    assert story.state.move.n_moves == 0
+    assert story.state.offload.state is OffloadState.FAILED
+    assert story.state.offload.n_moves == 0
     assert "offload.failed" in story.logged
 
 
@@ -145,7 +145,7 @@ def test_a_device_that_refuses_is_asked_again_later_and_alpha_stands():
     before = story.state.registration
     answer(story, accepted=False, reason="busy: the stage is parked")
     np.testing.assert_array_equal(story.state.registration.alpha.vector, before.alpha.vector)
-    assert story.state.move.text == "busy: the stage is parked"
+    assert story.state.offload.text == "busy: the stage is parked"
     story.see(n_windows=4)
     assert len(story.asked(OffloadRequest)) == 1
     story.see(n_windows=14)
@@ -153,7 +153,7 @@ def test_a_device_that_refuses_is_asked_again_later_and_alpha_stands():
 
 
 def test_the_reach_of_the_device_is_never_left():
-    short = replace(LIMITS, reach=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
+    short = replace(LIMITS, travel=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
     story = a_story(policy=replace(MOVES, offloading=short))
     (asked,) = story.asked(OffloadRequest)
     assert asked.shift_x_subap == pytest.approx(-0.04)
@@ -176,12 +176,12 @@ def restarted(story, tmp_path):
 
 
 def test_the_reach_is_not_left_though_the_service_restarts_between_two_moves(tmp_path):
-    short = replace(LIMITS, reach=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
+    short = replace(LIMITS, travel=np.array([0.04, 0.03, 0.0, 0.0]) / BOUNDARY_SCALE)
     story = a_story(policy=replace(MOVES, offloading=short))
     answer(story)
     again = restarted(story, tmp_path)
-    np.testing.assert_allclose(again.state.move.total, story.state.move.total)
-    assert again.state.move.n_moves == 1
+    np.testing.assert_allclose(again.state.offload.total, story.state.offload.total)
+    assert again.state.offload.n_moves == 1
     again.meet(cm_id="cm-1")
     again.see(moved(shift_x_subap=-0.04, shift_y_subap=0.03), n_windows=20)
     assert again.asked(OffloadRequest) == []
@@ -189,9 +189,9 @@ def test_the_reach_is_not_left_though_the_service_restarts_between_two_moves(tmp
 
 def test_a_move_that_nobody_had_answered_when_the_service_ended_may_have_been_made(tmp_path):
     story = a_story()
-    assert is_urgent(replace(story.state, move=None), story.state)
+    assert is_urgent(replace(story.state, offload=None), story.state)
     again = restarted(story, tmp_path)
-    assert again.state.move.state is MoveState.FAILED
+    assert again.state.offload.state is OffloadState.FAILED
     before, after = (one.state.registration.covariance[0, 0] for one in (story, again))
     assert after >= before + 0.06**2
 
@@ -219,17 +219,17 @@ def test_a_file_from_before_the_end_of_a_move_was_saved_is_read(tmp_path):
     file = TrackingFile(tmp_path / "tracking.json")
     file.write(saved_of(story.state, story.now_ns))
     values = json.loads((tmp_path / "tracking.json").read_text())
-    del values["move"]["still_ns_utc"]
+    del values["offload"]["still_ns_utc"]
     (tmp_path / "tracking.json").write_text(json.dumps(values))
-    assert file.read().move.still_ns_utc == 0
+    assert file.read().offload.still_ns_utc == 0
 
 
 def test_what_else_happens_meanwhile_does_not_make_the_image_stand_still():
     story = a_story()
     story.tell(rtc(cm_id="cm-1", t_ns=story.now_ns))
     answer(story)
-    story.tell(ev.Trouble(name="loop-diverging", text="it does"))
-    story.tell(ev.Trouble(name="loop-diverging", text="", over=True))
+    story.tell(ev.ConditionChanged(name="loop-diverging", text="it does"))
+    story.tell(ev.ConditionChanged(name="loop-diverging", text="", over=True))
     story.see(ALPHA)
     assert story.state.windows_refused == 1
 
@@ -238,12 +238,12 @@ def test_a_service_that_moves_nothing_forgets_where_the_device_was(tmp_path):
     story = a_story()
     answer(story)
     story.policy = STAYS
-    assert restarted(story, tmp_path).state.move is None
+    assert restarted(story, tmp_path).state.offload is None
 
 
 def test_the_image_is_not_led_away_from_the_matrix_in_use():
     """It was made for where the mirror is: a second step waits for the next matrix."""
-    small = replace(LIMITS, most_step=np.array([0.03, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE)
+    small = replace(LIMITS, max_step=np.array([0.03, 0.03, 0.2, 0.005]) / BOUNDARY_SCALE)
     story = a_story(policy=replace(MOVES, offloading=small))
     assert len(story.asked(OffloadRequest)) == 1
     answer(story)
@@ -257,4 +257,4 @@ def test_the_reply_may_say_from_which_frame_on_the_image_stands_still():
     story.meet(seq=10_000)
     now_ns = story.state.rtc.t_ns
     answer(story, start_seq=17_000)
-    assert story.state.move.still_ns_utc == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)
+    assert story.state.offload.still_ns_utc == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)

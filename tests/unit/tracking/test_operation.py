@@ -6,8 +6,8 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import Occupation, Operation, operating
 from service.tracking.alarms import Alarm
+from service.tracking.running_operations import CurrentOperation, ServiceState, operating
 from service.tracking.state import Acquisition, AcquisitionStage, Mode
 from service.wire import Loop
 from tests.unit.tracking.situations import Story, rtc
@@ -22,7 +22,7 @@ def story():
 
 def found(state, hindered="", now_ns=0):
     here = operating(state, hindered, now_ns)
-    return here.operation, here.occupation, here.because
+    return here.service_state, here.current_operation, here.because
 
 
 def alarmed(state, *names):
@@ -37,38 +37,38 @@ def test_a_closed_loop_with_a_known_registration_is_tracked(story):
 
 def test_without_a_closed_loop_it_is_ready_and_says_what_for(story):
     gone = replace(story.state, rtc=None, alarms=())
-    assert found(gone) == (Operation.READY, Occupation.IDLE, "no RTC is there")
+    assert found(gone) == (ServiceState.READY, CurrentOperation.IDLE, "no RTC is there")
     opened = replace(story.state, rtc=rtc(loop=Loop.OPEN), alarms=())
-    assert found(opened) == (Operation.READY, Occupation.IDLE, "the loop is open")
+    assert found(opened) == (ServiceState.READY, CurrentOperation.IDLE, "the loop is open")
 
 
 def test_what_is_not_known_yet_is_not_tracked():
     fresh = Story(Mode.AUTO).meet()
-    assert found(fresh.state)[:2] == (Operation.OPERATIONAL, Occupation.IDLE)
+    assert found(fresh.state)[:2] == (ServiceState.OPERATIONAL, CurrentOperation.IDLE)
 
 
 def test_what_has_the_mirror_is_what_it_does_whatever_the_loop(story):
     acquiring = Acquisition(stage=AcquisitionStage.COARSE, text="looking")
     looking = replace(story.state, rtc=rtc(loop=Loop.OPEN), acquisition=acquiring)
-    assert found(looking)[:2] == (Operation.OPERATIONAL, Occupation.ACQUIRING)
+    assert found(looking)[:2] == (ServiceState.OPERATIONAL, CurrentOperation.ACQUIRING)
     stopped = replace(story.state, stopped_because="Ada stopped it")
-    assert found(stopped)[:2] == (Operation.READY, Occupation.HOLD)
+    assert found(stopped)[:2] == (ServiceState.READY, CurrentOperation.HOLD)
     assert "Ada stopped it" in found(stopped)[2]
-    assert found(replace(story.state, mode=Mode.HOLD))[1] is Occupation.HOLD
+    assert found(replace(story.state, mode=Mode.HOLD))[1] is CurrentOperation.HOLD
 
 
 def test_the_worst_alarm_and_what_hinders_say_whether_it_does_its_work(story):
     state = story.state
-    assert found(alarmed(state, "loop-open"))[0] is Operation.OPERATIONAL
+    assert found(alarmed(state, "loop-open"))[0] is ServiceState.OPERATIONAL
     serious = alarmed(state, "loop-open", "margin")
-    assert found(serious) == (Operation.DEGRADED, Occupation.TRACKING, "margin found")
-    assert found(serious, "no worker")[::2] == (Operation.NOT_READY, "no worker")
+    assert found(serious) == (ServiceState.DEGRADED, CurrentOperation.TRACKING, "margin found")
+    assert found(serious, "no worker")[::2] == (ServiceState.NOT_READY, "no worker")
     critical = alarmed(state, "margin", "edge-slip")
-    assert found(critical, "no worker")[::2] == (Operation.ERROR, "edge-slip found")
+    assert found(critical, "no worker")[::2] == (ServiceState.ERROR, "edge-slip found")
 
 
 def test_a_muted_alarm_is_the_matter_all_the_same(story):
-    story.tell(ev.Trouble(name="edge-slip", text="found"))
+    story.tell(ev.ConditionChanged(name="edge-slip", text="found"))
     before = found(story.state, now_ns=story.now_ns)
     story.tell(cmd.MuteAlarm(name="edge-slip", for_s=60.0))
     assert found(story.state, now_ns=story.now_ns) == before

@@ -68,7 +68,7 @@ class TestApproval:
 
     @pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch", "instrument-mismatch"])
     def test_nothing_is_sent_to_an_rtc_that_may_be_the_wrong_one(self, story, name):
-        story.tell(ev.Trouble(name=name, text="two of them"))
+        story.tell(ev.ConditionChanged(name=name, text="two of them"))
         refused(story, cmd.Approve(id="cm-1"), "cm-1 cannot be sent: two of them")
 
 
@@ -106,7 +106,7 @@ class TestGoingBack:
         return story.use("cm-1").use("cm-2", 500)
 
     def test_a_rollback_copies_the_last_one_superseded_and_holds(self, story):
-        (copied,) = of_kind(story.tell(cmd.Rollback()), ev.CopyMatrix)
+        (copied,) = of_kind(story.tell(cmd.Rollback()), ev.RepublishMatrix)
         assert copied.source == "cm-1"
         assert story.state.mode is Mode.HOLD
 
@@ -121,7 +121,7 @@ class TestGoingBack:
         assert not of_kind(story.make("cm-3", MatrixState.REFUSED, wanted=True), ev.SendMatrix)
 
     def test_but_an_operator_goes_back_anyway(self, story):
-        (copied,) = of_kind(story.tell(cmd.Rollback(anyway=True)), ev.CopyMatrix)
+        (copied,) = of_kind(story.tell(cmd.Rollback(anyway=True)), ev.RepublishMatrix)
         assert copied.anyway
         why = "the operator goes back to cm-1, though the gate refuses it"
         back = record("cm-3", parent="cm-1", gate=None, judged=None, reason=why)
@@ -137,7 +137,7 @@ class TestGoingBack:
         summed = tuple(replace(r, sha256="ab") if r.id == "cm-1" else r for r in shelf)
         story.state = replace(story.state, reconstructors=summed)
         story.see(moved(shift_x_subap=0.15))
-        assert story.state.registration.candidate is not None
+        assert story.state.registration.suspected_jump is not None
         story.tell(cmd.Rollback())
         made = story.make("cm-3", wanted=True, parent="cm-1", sha256="ab")
         assert of_kind(made, ev.SendMatrix)
@@ -150,7 +150,7 @@ class TestGoingBack:
         assert len(story.asked(ev.MakeMatrix)) == before
 
     def test_any_known_reconstructor_can_be_published_again(self, story):
-        (copied,) = of_kind(story.tell(cmd.Publish(id="initial")), ev.CopyMatrix)
+        (copied,) = of_kind(story.tell(cmd.Publish(id="initial")), ev.RepublishMatrix)
         assert copied.source == "initial"
         assert story.state.mode is Mode.HOLD
 
@@ -161,7 +161,7 @@ class TestGoingBack:
         story.make("cm-3", MatrixState.REFUSED)
         story.state = replace(story.state, registration=None)
         refused(story, cmd.Publish(id="cm-3"), "α is not known yet")
-        assert of_kind(story.tell(cmd.Publish(id="cm-1")), ev.CopyMatrix)
+        assert of_kind(story.tell(cmd.Publish(id="cm-1")), ev.RepublishMatrix)
 
     def test_what_the_gate_could_not_judge_is_sent_and_said_to_be(self, story):
         story.state = replace(story.state, registration=None)

@@ -88,7 +88,7 @@ class TestTheDither:
         again.meet()
         again.wait(60)
         assert not again.asked(DitherRequest)
-        assert again.state.dithering.reason == "stopped by the operator"
+        assert again.state.dither_policy.reason == "stopped by the operator"
         assert "before the restart; start the dither" in again.state.log[0].text
         assert of_kind(again.tell(cmd.StartDither()), DitherRequest)
         assert not restarted(again).state.dither_stopped

@@ -10,9 +10,7 @@ from service.tracking.state import TrackerState
 
 NAMES = {field.name for field in fields(TrackerState)}
 PACKAGE = Path(tracking.__file__).parent
-STATES = ("turn.state", "self.state", "state")
-CALLED = {"known": "registration"}
-"""Fields that a turn has under another name."""
+STATES = ("context.state", "self.state", "state")
 
 
 def written(tree):
@@ -20,8 +18,8 @@ def written(tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign):
             for target in node.targets:
-                if isinstance(target, ast.Attribute) and ast.unparse(target.value) == "turn":
-                    yield CALLED.get(target.attr, target.attr)
+                if isinstance(target, ast.Attribute) and ast.unparse(target.value) == "context":
+                    yield target.attr
         elif isinstance(node, ast.Call) and ast.unparse(node.func) == "replace":
             of_state = ast.unparse(node.args[0]) in STATES
             yield from (keyword.arg for keyword in node.keywords if of_state)
@@ -29,10 +27,10 @@ def written(tree):
 
 def test_every_field_of_the_state_is_written_by_one_module():
     owners = defaultdict(set)
-    through_the_turn = {"acquisition", "dither", "dithering", "registration"}
+    through_the_context = {"acquisition", "dither", "dither_policy", "registration"}
     for path in PACKAGE.glob("*.py"):
         for name in written(ast.parse(path.read_text(encoding="utf-8"))):
-            if name in NAMES and not (path.stem == "turn" and name in through_the_turn):
+            if name in NAMES and not (path.stem == "turn" and name in through_the_context):
                 owners[name].add(path.stem)
     assert {name: modules for name, modules in owners.items() if len(modules) > 1} == {}
     assert NAMES - set(owners) == {"system"}

@@ -10,7 +10,7 @@ from service.tracking.loop import extended_gains
 from service.tracking.products import MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
-from service.tracking.worth import more_to_try
+from service.tracking.update_policy import more_to_try
 from service.wire import LoopRequest
 from tests.unit.tracking.dithered import DitheredNight
 from tests.unit.tracking.situations import ALPHA, N_MODES, POLICY, Story, moved, of_kind, rtc
@@ -34,7 +34,7 @@ def test_alpha_is_dithered_for_and_followed_as_in_any_closed_loop():
     night = DitheredNight(POLICY, gains=ONE_STILL, loop="partial")
     night.live(200)
     assert night.share_on > 0.9
-    assert night.state.registration.standing.validity is Validity.FRESH
+    assert night.state.registration.validity.level is Validity.FRESH
     assert not night.alarms
 
 

@@ -6,10 +6,10 @@ import pytest
 from service.errors import ModelError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither_request import Choice, lock_in_plan, plan_dither
+from service.tracking.dither_request import DitherParameters, lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.tracking.worth import outdated
+from service.tracking.update_policy import outdated
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     N_MODES,
@@ -38,13 +38,13 @@ def story():
     return Story(Mode.AUTO).meet()
 
 
-CHOICE = Choice(total_m=8e-9, window_s=2.0, n_windows=59)
+CHOICE = DitherParameters(total_m=8e-9, window_s=2.0, n_windows=59)
 
 OPEN = ({"loop": "open"}, {"loop": "partial", "gains": (0.0,) * N_MODES})
 """With all gains 0 no mode is in the loop, whatever the RTC calls that."""
 
 
-CHOICE = Choice(total_m=8e-9, window_s=2.0, n_windows=59)
+CHOICE = DitherParameters(total_m=8e-9, window_s=2.0, n_windows=59)
 
 OPEN = ({"loop": "open"}, {"loop": "partial", "gains": (0.0,) * N_MODES})
 """With all gains 0 no mode is in the loop, whatever the RTC calls that."""
@@ -82,12 +82,12 @@ class TestDither:
     @pytest.mark.parametrize("name", PARALYSING)
     def test_not_while_an_alarm_forbids_everything(self, name):
         story = Story()
-        story.tell(ev.Trouble(name=name, text="found"))
+        story.tell(ev.ConditionChanged(name=name, text="found"))
         story.meet()
-        story.tell(ev.Trouble(name=name, text="found"))
+        story.tell(ev.ConditionChanged(name=name, text="found"))
         story.wait(10)
         assert set(map(type, story.effects)) <= {ev.FetchMatrix}
-        story.tell(ev.Trouble(name=name, text="gone", over=True))
+        story.tell(ev.ConditionChanged(name=name, text="gone", over=True))
         assert story.asked(ev.FetchMatrix) or story.asked(DitherRequest)
 
     def test_one_left_behind_before_a_restart_is_stopped_first(self):
@@ -246,7 +246,7 @@ class TestUpdate:
     @pytest.mark.parametrize("name", PARALYSING)
     def test_nothing_is_made_while_an_alarm_forbids_it(self, story, name):
         story.see()
-        story.tell(ev.Trouble(name=name, text="found"))
+        story.tell(ev.ConditionChanged(name=name, text="found"))
         assert not story.see(n_windows=3)
 
     def test_in_hold_nothing_is_made_by_itself(self):

@@ -62,7 +62,7 @@ def test_every_matrix_that_was_sent_is_on_probation_for_three_seconds():
 
 def test_one_that_makes_the_loop_worse_gives_way_to_the_one_before():
     told = story()
-    assert told.tell(found()) == (ev.CopyMatrix(source="cm-1", why=WHY, judged=False),)
+    assert told.tell(found()) == (ev.RepublishMatrix(source="cm-1", why=WHY, judged=False),)
     assert told.state.mode is Mode.HOLD
     assert told.state.settings_mode is Mode.AUTO
     (alarm,) = (a for a in told.state.alarms if a.name == "probation")
@@ -94,7 +94,7 @@ def test_it_happens_once_whatever_is_told_again():
     told.tell(found())
     told.tell(found(before="cm-2", after="cm-3"))
     told.wait(20)
-    assert len(told.asked(ev.CopyMatrix)) == 1
+    assert len(told.asked(ev.RepublishMatrix)) == 1
     assert [effect.id for effect in told.asked(ev.SendMatrix)] == ["cm-3"]
 
 
@@ -122,7 +122,7 @@ def test_one_that_was_being_made_is_not_taken_for_the_way_back():
     ("obstacle", "text"),
     [
         (cmd.StopEverything(by="ann"), "everything was stopped by ann"),
-        (ev.Trouble(name="second-rtc", text="two RTCs"), "two RTCs"),
+        (ev.ConditionChanged(name="second-rtc", text="two RTCs"), "two RTCs"),
         (replace(rtc(300), cm_id="cm-2", leak=0.99), "the loop has been changed since"),
         (ev.RtcVanished(), ""),
     ],
@@ -145,11 +145,11 @@ def test_nothing_is_sent_where_something_forbids_it(obstacle, text, late):
 
 def test_one_whose_numbers_the_rtc_has_not_shown_is_not_gone_back_to():
     told = story(after="")
-    told.state = replace(told.state, proven=frozenset({"cm-1"}))
+    told.state = replace(told.state, verified_ids=frozenset({"cm-1"}))
     told.tell(found(before="initial", after="cm-1"))
     assert trial(told).state is ProbationState.KEPT
     assert "has not shown its numbers" in trial(told).text
-    assert told.asked(ev.CopyMatrix) == []
+    assert told.asked(ev.RepublishMatrix) == []
     assert told.state.mode is Mode.HOLD
 
 
@@ -181,7 +181,7 @@ def test_an_operator_who_wants_it_all_the_same_gets_it():
     assert trial(told).state is ProbationState.NOT_JUDGED
     assert "somebody wants it all the same" in trial(told).text
     told.tell(found(before="cm-3", after="cm-6"))
-    assert len(told.asked(ev.CopyMatrix)) == 1
+    assert len(told.asked(ev.RepublishMatrix)) == 1
 
 
 def test_telemetry_that_comes_late_counts_when_it_comes():
@@ -205,7 +205,7 @@ def test_a_loop_that_opens_or_goes_is_not_judged(event):
     told.tell(event)
     assert trial(told).state is ProbationState.NOT_JUDGED
     told.tell(found())
-    assert told.asked(ev.CopyMatrix) == []
+    assert told.asked(ev.RepublishMatrix) == []
     assert told.state.mode is Mode.AUTO
 
 

@@ -86,7 +86,7 @@ def test_a_jump_seen_by_random_signs_needs_a_second_window():
     for _ in range(3):
         see(story)
     see(story, alpha=moved(shift_x_subap=0.1))
-    assert story.state.registration.candidate is not None
+    assert story.state.registration.suspected_jump is not None
 
 
 def test_an_operator_may_dither_every_mode_of_the_basis():

@@ -82,7 +82,7 @@ def test_the_number_of_modes_is_commanded_only_when_it_changes(story):
 @pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch", "instrument-mismatch"])
 def test_nothing_is_published_to_an_rtc_that_may_be_the_wrong_one(name):
     story = Story(Mode.AUTO).meet()
-    story.tell(ev.Trouble(name=name, text="found"))
+    story.tell(ev.ConditionChanged(name=name, text="found"))
     assert not of_kind(story.make("cm-1"), ev.SendMatrix)
     assert story.matrix_state("cm-1") is MatrixState.PROPOSED
 

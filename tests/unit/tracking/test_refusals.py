@@ -5,9 +5,9 @@ import pytest
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import Operation, operating
 from service.tracking.alarms import WINDOWS_REFUSED
 from service.tracking.refusals import IN_A_ROW
+from service.tracking.running_operations import ServiceState, operating
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
 
@@ -40,7 +40,7 @@ def test_the_third_in_a_row_is_an_alarm_with_the_reason_and_the_service_is_degra
     assert WINDOWS_REFUSED not in story.alarms, "a matrix was swapped in them: no fault"
     refuse(story)
     assert MISSING in text_of(story)
-    assert operating(story.state, "", story.now_ns).operation is Operation.DEGRADED
+    assert operating(story.state, "", story.now_ns).service_state is ServiceState.DEGRADED
 
 
 def test_hundreds_of_them_are_one_line_of_alarm(story):
@@ -90,7 +90,7 @@ def test_a_window_far_from_alpha_could_be_used_and_has_an_alarm_of_its_own(story
         cmd.StopDither(),
         cmd.StopEverything(by="x", reason="y"),
         ev.RtcVanished(),
-        ev.Trouble(name="loop-diverging", text="found"),
+        ev.ConditionChanged(name="loop-diverging", text="found"),
         ev.SessionStarted(session="s2"),
         rtc(loop="open"),
     ],

@@ -56,7 +56,7 @@ def test_alpha_is_known_at_once_with_its_sigma_grown_by_the_time_away(before):
 
 def test_nothing_is_made_from_it_until_windows_confirm_it(before):
     again = restarted(before, 5.0)
-    assert again.state.registration.standing.validity is Validity.STALE
+    assert again.state.registration.validity.level is Validity.STALE
     again.meet()
     assert not of_kind(again.wait(20), ev.MakeMatrix)
     assert not of_kind(again.see(), ev.MakeMatrix)
@@ -81,8 +81,8 @@ def test_a_window_that_disagrees_is_a_suspected_jump_as_ever(before):
 def test_a_doubt_survives_but_the_window_that_raised_it_does_not(before):
     before.see(moved(shift_x_subap=0.2))
     again = restarted(before, 5.0)
-    assert again.state.registration.candidate is None
-    assert again.state.registration.standing.validity is Validity.INVALID
+    assert again.state.registration.suspected_jump is None
+    assert again.state.registration.validity.level is Validity.INVALID
     again.meet()
     again.see()
     assert again.state.registration.usable

@@ -193,9 +193,9 @@ def test_a_computation_that_never_ends_is_given_up_after_a_minute(story):
 
 @pytest.mark.parametrize("name", ["second-rtc", "basis-mismatch"])
 def test_an_alarm_the_link_repeats_is_over_after_fifteen_silent_seconds(story, name):
-    story.tell(ev.Trouble(name=name, text="found"))
+    story.tell(ev.ConditionChanged(name=name, text="found"))
     story.wait(10)
-    story.tell(ev.Trouble(name=name, text="found again"))
+    story.tell(ev.ConditionChanged(name=name, text="found again"))
     story.wait(15)
     assert name in story.alarms
     story.wait(1)
@@ -203,16 +203,16 @@ def test_an_alarm_the_link_repeats_is_over_after_fifteen_silent_seconds(story, n
 
 
 def test_other_alarms_last_until_they_are_taken_back(story):
-    story.tell(ev.Trouble(name="instrument-mismatch", text="found"))
+    story.tell(ev.ConditionChanged(name="instrument-mismatch", text="found"))
     story.wait(60, every_s=10)
     assert "instrument-mismatch" in story.alarms
-    story.tell(ev.Trouble(name="instrument-mismatch", text="fits", over=True))
+    story.tell(ev.ConditionChanged(name="instrument-mismatch", text="fits", over=True))
     assert "instrument-mismatch" not in story.alarms
 
 
 def test_something_noted_changes_only_the_log(story):
     before = story.state
-    story.tell(ev.Noted(name="x", text="y", level=Level.WARNING))
+    story.tell(ev.LogEvent(name="x", text="y", level=Level.WARNING))
     assert story.state.log[-1].text == "y"
     assert replace(story.state, log=()).alarms == replace(before, log=()).alarms
     assert story.state.registration is before.registration

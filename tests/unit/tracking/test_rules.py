@@ -11,8 +11,8 @@ from service.errors import CommandError, ConfigurationError, UnknownIdError
 from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarms import Act, Severity, forbidding
-from service.tracking.attention import FIELDS, is_news
+from service.tracking.alarm_records import FIELDS, changes_value
+from service.tracking.alarms import Interlock, Severity, blocking_alarm
 from service.tracking.state import Mode, TrackerState
 
 SHUTTER = """
@@ -69,12 +69,12 @@ def night(settings):
 def test_a_rule_holds_while_its_value_is_told_so_and_while_nobody_tells_it(night):
     alarm = night.alarms["rule.shutter"]
     assert alarm.text.endswith("nothing is published (shutter_open is not known)")
-    assert alarm.kind.severity is Severity.CRITICAL
-    assert forbidding(night.state, Act.SEND_KNOWN) is alarm
-    assert forbidding(night.state, Act.MEASURE) is None
+    assert alarm.definition.severity is Severity.CRITICAL
+    assert blocking_alarm(night.state, Interlock.SEND_KNOWN) is alarm
+    assert blocking_alarm(night.state, Interlock.MEASURE) is None
     night.tell(cmd.SetValue(name="shutter_open", value=True, for_s=30.0, by="dome"))
     assert "rule.shutter" not in night.alarms
-    assert forbidding(night.state, Act.SEND_NEW) is None
+    assert blocking_alarm(night.state, Interlock.SEND_NEW) is None
     night.tell(cmd.SetValue(name="shutter_open", value=False))
     assert night.alarms["rule.shutter"].text.endswith("(shutter_open is false)")
     night.tell(cmd.SetValue(name="shutter_open", value=True, for_s=30.0))
@@ -88,7 +88,7 @@ def test_a_field_of_the_state_is_compared_as_it_is_now(night):
     assert "rule.low" not in night.alarms
     night.tell(cmd.SetPointing(elevation_deg=29.0, azimuth_deg=0.0))
     assert night.alarms["rule.low"].text == "the telescope looks low (state.elevation_deg is 29.0)"
-    assert night.alarms["rule.low"].kind.forbids == frozenset()
+    assert night.alarms["rule.low"].definition.blocks == frozenset()
     night.tell(cmd.SetPointing(elevation_deg=31.0, azimuth_deg=0.0))
     assert "rule.low" not in night.alarms
 
@@ -96,7 +96,7 @@ def test_a_field_of_the_state_is_compared_as_it_is_now(night):
 def test_a_rules_alarm_is_acknowledged_and_muted_like_others(night):
     night.tell(cmd.AcknowledgeAlarm(name="rule.shutter", by="Ada"))
     night.tell(cmd.MuteAlarm(name="rule.low", for_s=60.0))
-    notes = {note.name: note for note in night.state.notes}
+    notes = {note.name: note for note in night.state.alarm_records}
     assert notes["rule.shutter"].acknowledged.by == "Ada"
     assert notes["rule.low"].muted is not None
 
@@ -120,11 +120,11 @@ def test_what_no_rule_asks_for_or_compares_otherwise_is_refused(night):
 
 def test_only_what_differs_from_what_is_known_is_news(night):
     told = cmd.SetValue(name="shutter_open", value=True, for_s=10.0)
-    assert is_news(night.state, told, night.now_ns)
+    assert changes_value(night.state, told, night.now_ns)
     night.tell(told)
-    assert not is_news(night.state, told, night.now_ns)
-    assert is_news(night.state, replace(told, value=False), night.now_ns)
-    assert is_news(night.state, told, night.now_ns + 11 * SECOND)
+    assert not changes_value(night.state, told, night.now_ns)
+    assert changes_value(night.state, replace(told, value=False), night.now_ns)
+    assert changes_value(night.state, told, night.now_ns + 11 * SECOND)
 
 
 def test_the_settings_know_every_field_there_is():

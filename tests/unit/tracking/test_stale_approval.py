@@ -26,7 +26,7 @@ from tests.unit.tracking.situations import (
 
 def proposed(alpha):
     """The service believes in ``alpha``; a proposal for ``ALPHA`` waits."""
-    known = Registration(
+    registration = Registration(
         alpha=alpha,
         covariance=np.diag([0.001, 0.001, 1e-5, 1e-4]) ** 2,
         floor=POLICY.floor,
@@ -34,13 +34,13 @@ def proposed(alpha):
         arrived_ns_utc=START_NS,
         n_windows=5,
     )
-    then = judged(replace(known, alpha=ALPHA), rtc())
+    then = judged(replace(registration, alpha=ALPHA), rtc())
     return TrackerState(
         system="flao",
         rtc=rtc(),
-        proven=frozenset({"initial"}),
+        verified_ids=frozenset({"initial"}),
         reconstructors=(record("cm-1", judged=then),),
-        registration=known,
+        registration=registration,
         mode_proof=ALL_SHOWN,
     )
 

@@ -5,10 +5,10 @@ import pytest
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.activity import under_way
 from service.tracking.interlocks import ALLOWS
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.resume import resumed, saved_of
+from service.tracking.running_operations import under_way
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.wire import DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import POLICY, of_kind

@@ -50,7 +50,7 @@ class TestSuspicion:
         story.see(THERE)
         known = story.state.registration
         assert known.alpha == before.alpha
-        assert known.candidate.alpha == THERE
+        assert known.suspected_jump.alpha == THERE
         assert "jump-suspected" in story.alarms
         entry = next(e for e in story.state.log if e.name == "registration.jump-suspected")
         assert entry.level is Level.WARNING
@@ -63,7 +63,7 @@ class TestSuspicion:
         story.see(n_windows=2)
         made = len(story.asked(ev.MakeMatrix))
         story.see(THERE)
-        assert story.state.registration.standing.validity is Validity.INVALID
+        assert story.state.registration.validity.level is Validity.INVALID
         assert not story.state.registration.usable
         story.wait(20)
         assert len(story.asked(ev.MakeMatrix)) == made
@@ -95,8 +95,8 @@ class TestSuspicion:
     def test_nobody_waits_for_the_deciding_window_for_ever(self, story):
         story.see(THERE)
         story.wait(61)
-        assert story.state.registration.candidate is None
-        assert story.state.registration.standing.validity is Validity.INVALID
+        assert story.state.registration.suspected_jump is None
+        assert story.state.registration.validity.level is Validity.INVALID
 
 
 class TestDecision:
@@ -108,7 +108,7 @@ class TestDecision:
         known = story.state.registration
         assert known.alpha.shift_x_subap == pytest.approx(THERE.shift_x_subap + 0.001, abs=1e-3)
         assert known.n_windows == 2
-        assert known.candidate is None
+        assert known.suspected_jump is None
         assert known.usable
         assert "jump-suspected" not in story.alarms
         entry = next(e for e in story.state.log if e.name == "registration.jump")
@@ -147,7 +147,7 @@ class TestDecision:
         story.see(THERE)
         story.see(moved(shift_y_subap=-0.2))
         known = story.state.registration
-        assert known.candidate.alpha == moved(shift_y_subap=-0.2)
+        assert known.suspected_jump.alpha == moved(shift_y_subap=-0.2)
         assert known.alpha == story.state.history[2].filtered
         assert story.state.windows_outlying == 1
         assert not known.usable
@@ -221,7 +221,10 @@ class TestDecision:
             )
             story.see(moved(**far))
         known = story.state.registration
-        assert np.abs(known.alpha.vector - ALPHA.vector).max() < 1e-6 or known.candidate is not None
+        assert (
+            np.abs(known.alpha.vector - ALPHA.vector).max() < 1e-6
+            or known.suspected_jump is not None
+        )
 
     def test_the_history_says_which_windows_entered(self, story):
         story.see(THERE)

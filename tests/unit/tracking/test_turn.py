@@ -1,5 +1,5 @@
 from service.tracking.state import Level, TrackerState
-from service.tracking.turn import LOG_LENGTH, Turn, logged, tell_bursts
+from service.tracking.step_context import LOG_LENGTH, StepContext, logged, tell_bursts
 from tests.unit.tracking.situations import turned
 
 STATE = TrackerState(system="flao")
@@ -10,11 +10,11 @@ def counted(state, now_ns):
 
 
 def with_alarm(state, name, text, now_ns):
-    return turned(state, Turn.alarm, name, text, now_ns=now_ns)
+    return turned(state, StepContext.raise_alarm, name, text, now_ns=now_ns)
 
 
 def without_alarm(state, name, now_ns):
-    return turned(state, Turn.calm, name, now_ns=now_ns)
+    return turned(state, StepContext.clear_alarm, name, now_ns=now_ns)
 
 
 SECOND_NS = 10**9

@@ -42,7 +42,7 @@ def point(story, pointing):
 
 
 def worth(story):
-    return story.state.registration.standing.validity
+    return story.state.registration.validity.level
 
 
 class TestTime:
@@ -76,20 +76,20 @@ class TestTime:
         assert seen[Validity.INVALID] == pytest.approx(278, abs=3)
 
     def test_until_when_it_is_valid_is_told_beforehand(self, story):
-        until_ns = story.state.registration.standing.until_ns_utc
+        until_ns = story.state.registration.validity.until_ns_utc
         story.wait((until_ns - story.now_ns) / SECOND - 1)
         assert worth(story) is Validity.AGEING
-        assert story.state.registration.standing.until_ns_utc == pytest.approx(until_ns, abs=1e6)
+        assert story.state.registration.validity.until_ns_utc == pytest.approx(until_ns, abs=1e6)
         story.wait(3)
         assert worth(story) is Validity.STALE
-        assert story.state.registration.standing.until_ns_utc is None
+        assert story.state.registration.validity.until_ns_utc is None
 
     def test_what_never_drifts_never_goes_stale(self):
         story = Story(Mode.AUTO, replace(POLICY, drift_rate=np.zeros(4))).meet()
         story.see(n_windows=2)
         story.wait(300)
         assert worth(story) is Validity.FRESH
-        assert story.state.registration.standing.until_ns_utc is None
+        assert story.state.registration.validity.until_ns_utc is None
 
     def test_stale_is_an_alarm_with_the_parameter_and_a_dither_is_due(self, story):
         story.wait(80)
@@ -213,7 +213,7 @@ class TestPointing:
     def test_a_turn_in_azimuth_is_a_slew_as_well(self, story):
         point(story, replace(HERE, azimuth_deg=130.0))
         story.wait(1)
-        assert "moved by 15 deg" in story.state.registration.standing.reason
+        assert "moved by 15 deg" in story.state.registration.validity.reason
 
     def test_a_status_that_knows_it_overrules_what_was_told(self, story):
         there = Pointing(elevation_deg=30.0, azimuth_deg=0.0)

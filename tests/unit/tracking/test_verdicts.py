@@ -168,7 +168,7 @@ class TestAuto:
         "change",
         [
             lambda s: s.tell(rtc(loop="open")),
-            lambda s: s.tell(ev.Trouble(name="edge-slip", text="the outer ring slips")),
+            lambda s: s.tell(ev.ConditionChanged(name="edge-slip", text="the outer ring slips")),
             lambda s: s.meet(session="s2"),
         ],
         ids=["open", "slipping", "new session"],

@@ -9,10 +9,10 @@ from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.evidence import fit_begins_at
 from service.tracking.loop import loop_numbers
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
+from service.tracking.window_processing import fit_begins_at
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -40,7 +40,7 @@ def watch(story, alpha, after_s=10.0, scatter=SCATTER):
     """A look of the watchdog; the RTC's clock tells when."""
     now_ns = story.now_ns + round(after_s * SECOND)
     story.tell(rtc(t_ns=now_ns))
-    return story.tell(ev.Watched(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
+    return story.tell(ev.PassiveFitted(estimate=watched(alpha, scatter), t_ns_utc=now_ns), after_s)
 
 
 @pytest.fixture
@@ -66,9 +66,9 @@ def learnt(story, off=0.06, n_looks=20):
 def test_it_only_reports_while_there_is_nothing_to_compare_with():
     story = Story(Mode.AUTO).meet()
     watch(story, Misregistration())
-    assert story.state.watchdog.consistent
-    assert "no dithered estimate" in story.state.watchdog.text
-    np.testing.assert_array_equal(story.state.watchdog.sigma, watched(ALPHA).sigma)
+    assert story.state.passive.consistent
+    assert "no dithered estimate" in story.state.passive.text
+    np.testing.assert_array_equal(story.state.passive.sigma, watched(ALPHA).sigma)
     assert story.state.registration is None
 
 
@@ -85,26 +85,26 @@ def test_a_reading_too_far_away_for_its_fit_is_worth_nothing_and_says_so():
     """2 deg and 0.8 subapertures: the range of one linearised fit, about the nominal rotation."""
     story = Story(Mode.AUTO).meet()
     watch(story, moved(rotation_rad=np.deg2rad(3.0)))
-    assert np.isinf(story.state.watchdog.sigma).all()
-    assert "cannot tell" in story.state.watchdog.text
+    assert np.isinf(story.state.passive.sigma).all()
+    assert "cannot tell" in story.state.passive.text
     assert fit_begins_at(story.state) is None
     turned = Story(Mode.AUTO, replace(POLICY, start=moved(rotation_rad=np.deg2rad(3.0)))).meet()
     watch(turned, moved(rotation_rad=np.deg2rad(3.0)))
-    assert np.isfinite(turned.state.watchdog.sigma).all()
+    assert np.isfinite(turned.state.passive.sigma).all()
 
 
 def test_why_there_is_no_look_is_told_until_there_is_one(story):
-    story.tell(ev.Unwatched(text="no passive estimate: the loop is open"))
-    assert story.state.unwatched == "no passive estimate: the loop is open"
+    story.tell(ev.PassiveUnavailable(text="no passive estimate: the loop is open"))
+    assert story.state.passive_unavailable_reason == "no passive estimate: the loop is open"
     watch(story, ALPHA)
-    assert story.state.unwatched == ""
+    assert story.state.passive_unavailable_reason == ""
 
 
 def test_before_a_bias_is_learnt_a_shift_is_worth_ten_percent_and_says_so(story):
     before = story.state.registration
     watch(story, moved(shift_x_subap=0.06))
     after = story.state.registration
-    assert np.all(story.state.watchdog.sigma[:2] >= 0.1)
+    assert np.all(story.state.passive.sigma[:2] >= 0.1)
     assert after.alpha.shift_x_subap == pytest.approx(before.alpha.shift_x_subap, abs=0.005)
     assert after.n_windows == before.n_windows
     assert after.window_ns_utc == before.window_ns_utc
@@ -116,9 +116,9 @@ def test_the_more_a_look_scatters_the_larger_its_bias_may_be_and_it_says_so(stor
     before = story.state.registration
     watch(story, moved(shift_x_subap=0.20), scatter=scatter)
     expected = watched(ALPHA, scatter).sigma
-    np.testing.assert_allclose(story.state.watchdog.sigma, expected)
+    np.testing.assert_allclose(story.state.passive.sigma, expected)
     assert expected[0] == pytest.approx(0.16, abs=0.005)
-    assert story.state.watchdog.consistent
+    assert story.state.passive.consistent
     after = story.state.registration.alpha
     assert after.shift_x_subap == pytest.approx(before.alpha.shift_x_subap, abs=0.005)
 
@@ -140,14 +140,14 @@ def test_a_bias_that_was_learnt_is_not_excused_by_a_look_that_scatters_more(stor
     watch(story, moved(shift_x_subap=0.16), after_s=4.0, scatter=3 * SCATTER)
     assert disagrees(story)
     expected = watched(ALPHA, 3 * SCATTER).sigma
-    np.testing.assert_allclose(story.state.watchdog.sigma, expected)
+    np.testing.assert_allclose(story.state.passive.sigma, expected)
 
 
 def test_the_bias_is_learnt_between_windows_and_shown(story):
     known = learnt(story).state.registration
     assert known.bias.offset[0] == pytest.approx(0.06, abs=0.004)
-    assert story.state.watchdog.bias[0] == pytest.approx(0.06, abs=0.004)
-    assert story.state.watchdog.sigma[0] < 0.02
+    assert story.state.passive.bias[0] == pytest.approx(0.06, abs=0.004)
+    assert story.state.passive.sigma[0] < 0.02
     assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap, abs=0.003)
 
 
@@ -183,8 +183,8 @@ def test_once_learnt_it_follows_a_drift_without_any_window(story):
 def test_how_well_the_model_fits_a_look_is_shown_and_in_the_history(story):
     now_ns = story.now_ns + 4 * SECOND
     look = replace(watched(ALPHA), misfit=1.7)
-    story.tell(ev.Watched(estimate=look, t_ns_utc=now_ns), after_s=4.0)
-    assert story.state.watchdog.misfit == 1.7
+    story.tell(ev.PassiveFitted(estimate=look, t_ns_utc=now_ns), after_s=4.0)
+    assert story.state.passive.misfit == 1.7
     assert story.state.history[-1].misfit == 1.7
 
 
@@ -203,13 +203,13 @@ class TestBark:
         assert "registration.passive-jump" in barking.logged
         assert barking.state.dither_due_since_ns_utc == barking.now_ns
         assert "wind" in barking.state.dither_due_reason
-        assert not barking.state.watchdog.consistent
+        assert not barking.state.passive.consistent
 
     def test_alpha_stays_valid_the_bias_is_forgotten_and_nothing_is_made_meanwhile(self, barking):
         known = barking.state.registration
         assert known.alpha == self.before.alpha
         np.testing.assert_array_equal(known.bias.offset, 0.0)
-        assert known.standing.validity is Validity.FRESH
+        assert known.validity.level is Validity.FRESH
         assert not of_kind(barking.wait(30), ev.MakeMatrix)
         assert not of_kind(barking.make("cm-1"), ev.SendMatrix)
 
@@ -230,13 +230,13 @@ class TestBark:
         story.tell(cmd.StopDither())
         watch(story, moved(shift_x_subap=0.30))
         assert "stopped by the operator" in story.state.alarm("watchdog").text
-        assert story.state.registration.standing.validity is Validity.FRESH
+        assert story.state.registration.validity.level is Validity.FRESH
 
     def test_what_a_window_has_made_void_a_look_makes_no_better(self, story):
         learnt(story)
         story.see(moved(shift_x_subap=0.4))
         watch(story, moved(shift_x_subap=0.46))
-        assert story.state.registration.standing.validity is Validity.INVALID
+        assert story.state.registration.validity.level is Validity.INVALID
 
     def test_a_window_at_the_old_place_ends_it(self, barking):
         watch(barking, moved(shift_x_subap=1.3))
@@ -263,7 +263,7 @@ class TestJump:
         before = story.state.registration
         watch(story, moved(shift_x_subap=0.10))
         assert story.state.registration.alpha == before.alpha
-        assert "both sides of a jump" in story.state.watchdog.text
+        assert "both sides of a jump" in story.state.passive.text
 
     def test_one_that_began_after_it_is(self, story):
         learnt(story)
@@ -283,7 +283,7 @@ class TestJump:
 
 def test_it_is_of_the_time_of_its_telemetry_not_of_when_the_worker_was_done(story):
     end_ns = story.state.registration.t_ns_utc + 4 * SECOND
-    story.tell(ev.Watched(estimate=watched(ALPHA), t_ns_utc=end_ns), after_s=60.0)
+    story.tell(ev.PassiveFitted(estimate=watched(ALPHA), t_ns_utc=end_ns), after_s=60.0)
     assert story.state.registration.t_ns_utc == end_ns
     assert story.state.registration.bias.looked_ns_utc == end_ns
 
@@ -328,26 +328,26 @@ def test_a_look_that_was_under_way_when_the_loop_changed_is_not_used(story):
     learnt(story)
     before = loop_numbers(rtc())
     story.tell(rtc(300, t_ns=story.now_ns))
-    look = ev.Watched(estimate=watched(ALPHA), t_ns_utc=story.now_ns, loop=before)
+    look = ev.PassiveFitted(estimate=watched(ALPHA), t_ns_utc=story.now_ns, loop=before)
     known = story.state.registration
     story.tell(look, after_s=1.0)
     assert story.state.registration.alpha == known.alpha
     assert story.state.registration.bias is None
-    assert "the loop has changed" in story.state.unwatched
+    assert "the loop has changed" in story.state.passive_unavailable_reason
 
 
 @pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip", "commands-off-loop"])
 def test_a_look_at_a_loop_out_of_hand_moves_nothing(story, alarm):
     learnt(story)
     known = story.state.registration
-    story.tell(ev.Trouble(name=alarm, text="it is"))
+    story.tell(ev.ConditionChanged(name=alarm, text="it is"))
     watch(story, moved(shift_x_subap=0.08), after_s=4.0)
     assert story.state.registration.alpha == known.alpha
-    assert "no measurement" in story.state.unwatched
-    story.tell(ev.Trouble(name=alarm, text="over", over=True))
+    assert "no measurement" in story.state.passive_unavailable_reason
+    story.tell(ev.ConditionChanged(name=alarm, text="over", over=True))
     watch(story, moved(shift_x_subap=0.06), after_s=4.0)
     assert story.state.history[-1].source is Source.PASSIVE
-    assert story.state.unwatched == ""
+    assert story.state.passive_unavailable_reason == ""
 
 
 def test_a_bias_of_which_nothing_was_learnt_is_of_no_loop(story):
@@ -362,10 +362,10 @@ def test_gains_that_follow_the_seeing_by_a_percent_unteach_no_bias(story):
     gains = (0.4 * 1.01,) * 400 + (0.0,) * 194
     story.tell(rtc(t_ns=story.now_ns, gains=gains))
     assert story.state.registration.bias is before
-    late = ev.Watched(
+    late = ev.PassiveFitted(
         estimate=watched(moved(shift_x_subap=0.06)),
         t_ns_utc=story.now_ns + 4 * SECOND,
         loop=loop_numbers(rtc()),
     )
     story.tell(late, 4.0)
-    assert story.state.unwatched == ""
+    assert story.state.passive_unavailable_reason == ""

@@ -73,7 +73,9 @@ def alarm(told, name):
 
 def test_the_matrix_that_the_rtc_brought_is_gone_back_to_though_no_gate_has_judged_it():
     told = story()
-    assert [e.source for e in told.tell(found()) if isinstance(e, ev.CopyMatrix)] == ["initial"]
+    assert [e.source for e in told.tell(found()) if isinstance(e, ev.RepublishMatrix)] == [
+        "initial"
+    ]
     copied(told)
     assert [e.id for e in told.asked(ev.SendMatrix)] == ["cm-2"]
     told.acknowledge("cm-2")
@@ -105,7 +107,7 @@ def test_it_has_its_own_number_of_modes():
 )
 def test_what_came_with_the_worse_matrix_does_not_keep_it_in_use(name):
     told = story()
-    told.tell(ev.Trouble(name=name, text="it came with it"), after_s=0.1)
+    told.tell(ev.ConditionChanged(name=name, text="it came with it"), after_s=0.1)
     told.tell(found())
     copied(told)
     assert [e.id for e in told.asked(ev.SendMatrix)] == ["cm-2"]
@@ -114,16 +116,16 @@ def test_what_came_with_the_worse_matrix_does_not_keep_it_in_use(name):
 @pytest.mark.parametrize("name", ["loop-law", "commands-off-loop", "loop-diverging"])
 def test_commands_that_no_longer_obey_after_a_swap_are_reason_enough(name):
     told = story()
-    told.tell(ev.Trouble(name=name, text=LAW), after_s=1.0)
+    told.tell(ev.ConditionChanged(name=name, text=LAW), after_s=1.0)
     assert trial(told).state is ProbationState.ROLLING_BACK
     assert LAW in trial(told).text
-    assert [e.source for e in told.asked(ev.CopyMatrix)] == ["initial"]
+    assert [e.source for e in told.asked(ev.RepublishMatrix)] == ["initial"]
 
 
 def test_a_law_that_was_wrong_before_the_swap_is_not_the_matrixs_doing():
     told = story()
     told.tell(found(verdict=Verdict.AS_GOOD))
-    told.tell(ev.Trouble(name="loop-law", text=LAW), after_s=60.0)
+    told.tell(ev.ConditionChanged(name="loop-law", text=LAW), after_s=60.0)
     assert trial(told).state is ProbationState.PASSED
 
 
@@ -155,7 +157,7 @@ def test_a_loop_that_is_lost_though_the_matrix_before_is_back_is_opened_in_auto(
 
 def test_one_that_goes_on_diverging_is_opened_before_telemetry_has_been_compared():
     told = story()
-    told.tell(ev.Trouble(name="loop-diverging", text="ten times"), after_s=0.1)
+    told.tell(ev.ConditionChanged(name="loop-diverging", text="ten times"), after_s=0.1)
     gone_back(told)
     told.wait(1.5, every_s=0.5)
     assert len(opened(told)) == 1
@@ -172,7 +174,7 @@ def test_one_that_is_only_somewhat_worse_stays_closed():
 
 def test_where_there_is_no_way_back_a_lost_loop_is_opened():
     told = story()
-    (effect,) = (e for e in told.tell(found()) if isinstance(e, ev.CopyMatrix))
+    (effect,) = (e for e in told.tell(found()) if isinstance(e, ev.RepublishMatrix))
     told.tell(ev.JobFailed(effect=effect, text="the disk is gone"))
     assert trial(told).state is ProbationState.OPENING
     assert len(opened(told)) == 1
@@ -246,7 +248,7 @@ def test_an_operator_can_go_back_to_the_rtcs_own_as_to_ours():
     told = story()
     told.tell(found(verdict=Verdict.AS_GOOD))
     told.tell(cmd.Rollback())
-    assert [e.source for e in told.asked(ev.CopyMatrix)] == ["initial"]
+    assert [e.source for e in told.asked(ev.RepublishMatrix)] == ["initial"]
     copied(told)
     own, again = told.state.reconstructor("initial"), told.state.reconstructor("cm-2")
     assert own.origin == "the RTC's own"

@@ -9,7 +9,7 @@ from service.control.expected_gain import ExpectedGain
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Mode
-from service.tracking.worth import CALMING_S
+from service.tracking.update_policy import CALMING_S
 from tests.unit.tracking import situations
 from tests.unit.tracking.situations import ALPHA, POLICY, Story, moved, of_kind, verdict
 
@@ -115,7 +115,7 @@ def test_after_a_move_the_new_matrix_comes_before_the_margin_of_the_old_one(stor
 
 def test_a_registration_that_may_have_jumped_makes_nothing(story):
     story.see(moved(shift_x_subap=0.4))
-    assert story.state.registration.candidate is not None
+    assert story.state.registration.suspected_jump is not None
     assert not judged(story, told(loss_m=5e-9))
 
 

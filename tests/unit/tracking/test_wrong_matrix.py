@@ -88,7 +88,7 @@ def test_a_wrong_matrix_is_over_when_the_rtc_acknowledges_the_right_one_or_start
     answer(story, OTHER)
     story.tell(ev.SessionStarted(session="s2"))
     assert "wrong-matrix" not in story.alarms
-    assert story.state.wrong_matrix is None
+    assert story.state.mismatched_id is None
 
 
 def test_a_commit_the_rtc_could_not_read_is_rejected_though_it_names_none():
@@ -187,6 +187,6 @@ def test_an_rtc_that_does_not_offer_its_matrix_is_dithered_all_the_same():
     assert not story.asked(DitherRequest)
     story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
     story.wait(2.0)
-    assert story.state.unfetched == "no answer on rtc/cm/applied"
+    assert story.state.read_back_error == "no answer on rtc/cm/applied"
     assert story.asked(DitherRequest)
     assert replace(story.state, alarms=()).in_use is None

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from service.estimation.openloop import FarEstimate
+from service.estimation.openloop import WideCaptureEstimate
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, MeasureState, NoisyFinding
 from service.tracking.state import Mode
@@ -136,9 +136,13 @@ class World(Story):
             return
         self.since_window_s = STEP_S
         fitted = estimate(ALPHA, t_ns=self.now_ns, session=f"s{self.session}")
-        if self.state.acquisition.looks_afar:
+        if self.state.acquisition.uses_wide_capture:
             far = replace(fitted, modes=self.playing.request.modes, covariance=1e2 * PRECISE)
-            self.tell(ev.FarFitted(found=FarEstimate(estimate=far, unexplained=0.05, n_starts=1)))
+            self.tell(
+                ev.WideCaptureFitted(
+                    found=WideCaptureEstimate(estimate=far, unexplained=0.05, n_starts=1)
+                )
+            )
         elif self.loop != "open":
             self.tell(ev.WindowFitted(estimate=fitted))
 
@@ -198,26 +202,26 @@ class World(Story):
         yield loop_answered(asked.id, accepted=not busy, reason=busy)
 
     def of_matrices(self, effect):
-        known, view = self.state.registration, self.state.rtc or self.status()
+        registration, view = self.state.registration, self.state.rtc or self.status()
         match effect:
-            case ev.MakeMatrix() | ev.CopyMatrix() as asked:
+            case ev.MakeMatrix() | ev.RepublishMatrix() as asked:
                 self.n_made += 1
                 n_modes = asked.n_modes if isinstance(asked, ev.MakeMatrix) else 400
                 changes = {"n_modes": n_modes, "created_ns_utc": self.now_ns}
-                if known is not None:
+                if registration is not None:
                     gains = getattr(asked, "gains", None)
-                    at = judged(known, view, n_modes)
+                    at = judged(registration, view, n_modes)
                     at = at if gains is None else replace(at, gains=gains[:n_modes])
-                    changes |= {"alpha": known.alpha, "judged": at}
+                    changes |= {"alpha": registration.alpha, "judged": at}
                 made = record(f"cm-{self.n_made}", MatrixState.PROPOSED, **changes)
-                wanted = isinstance(asked, ev.CopyMatrix)
+                wanted = isinstance(asked, ev.RepublishMatrix)
                 yield ev.MatrixMade(record=made, wanted=wanted)
             case ev.FetchMatrix(id=name):
                 yield ev.MatrixFetched(record=foreign(name or self.cm_id))
             case ev.JudgeMatrix(id=name):
                 yield ev.MarginJudged(id=name, verdict=verdict())
             case ev.JudgeProposal(id=name, gains=gains, wanted=wanted):
-                at = replace(judged(known, view, len(gains)), gains=gains)
+                at = replace(judged(registration, view, len(gains)), gains=gains)
                 yield ev.ProposalJudged(id=name, verdict=verdict(), judged=at, wanted=wanted)
             case ev.SendMatrix(id=name, n_modes=n_modes):
                 self.cm_id, self.n_controlled = name, n_modes

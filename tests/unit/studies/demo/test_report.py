@@ -275,7 +275,7 @@ def test_a_service_that_was_never_ready_says_what_it_waited_for(truth):
 
 
 def waiting(name, party, text):
-    return {"name": name, "party": party, "text": text, "hinders": True}
+    return {"name": name, "responsible": party, "text": text, "blocks": True}
 
 
 def test_what_the_service_waits_for_is_passed_on_once(truth):

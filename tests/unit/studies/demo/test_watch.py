@@ -13,7 +13,7 @@ from studies.demo.watch import (
     STRETCH,
     Promise,
     Stopwatch,
-    Watch,
+    TelemetryObserver,
     awaited,
     live_line,
     slow_line,
@@ -115,7 +115,7 @@ class Scene:
     def watch(self, seconds=60.0, *, whole=False, started=()):
         promise = Promise(seconds=seconds, whole=whole, real_time=True)
         truth = TruthFile(self.path)
-        return Watch(self.client, truth, list(started), promise, self.lines.append)
+        return TelemetryObserver(self.client, truth, list(started), promise, self.lines.append)
 
 
 @pytest.fixture
@@ -289,6 +289,11 @@ def test_a_slow_machine_is_said_to_be_slow_and_a_slow_telescope_is_not_its_fault
 
 def test_while_it_prepares_the_demo_says_what_it_waits_for():
     assert awaited(None) == "the service is starting"
-    wait = {"name": "model", "party": "worker", "text": "it is being prepared", "hinders": True}
+    wait = {
+        "name": "model",
+        "responsible": "worker",
+        "text": "it is being prepared",
+        "blocks": True,
+    }
     assert awaited({"waiting_for": [wait]}) == "for the worker: it is being prepared"
     assert "telescope" in awaited({"waiting_for": []})

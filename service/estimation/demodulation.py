@@ -21,10 +21,10 @@ Array = NDArray[Any]
 SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
 """Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
 
-STRETCH_S = 0.12
+SEGMENT_S = 0.12
 """Of frames: with longer ones it takes more shapes, with shorter ones more sums."""
 
-LEAST_STRETCH = 16
+MIN_SEGMENT = 16
 
 FAINTEST_SHAPE = 1e-7
 """Of the strongest: what weaker ones have in a bin is rounding."""
@@ -34,7 +34,7 @@ _N_SHAPES = 1 + 2 * len(_BESIDE_HZ)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comb:
+class DemodulationBank:
     """Lines, and ``SIDE_OFFSETS_HZ`` beside each, in a Hann window."""
 
     lines_hz: tuple[float, ...]
@@ -51,7 +51,7 @@ class Comb:
         length = _smooth(self.frame_rate_hz, self.n_frames).shape[1]
         end = place + len(columns)
         cuts = [place, *range(place // length * length + length, end, length), end]
-        stretches = [_stretch(self, first // length) for first in cuts[:-1]]
+        stretches = [_segment(self, first // length) for first in cuts[:-1]]
         bins = np.hstack([stretch.bins for stretch in stretches])
         found = np.empty((len(stretches), len(stretches[0].lines), columns.shape[1]), np.float32)
         for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
@@ -76,7 +76,7 @@ class Comb:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Stretch:
+class _Segment:
     """The two steps that lead from the frames of a stretch to the bins."""
 
     lines: Array
@@ -87,24 +87,24 @@ class _Stretch:
 
 
 @lru_cache(maxsize=48)
-def _stretch(comb: Comb, index: int) -> _Stretch:
+def _segment(bank: DemodulationBank, index: int) -> _Segment:
     """Return what leads from the frames of a stretch to the bins: the same in every window."""
-    smooth = _smooth(comb.frame_rate_hz, comb.n_frames)
+    smooth = _smooth(bank.frame_rate_hz, bank.n_frames)
     length = smooth.shape[1]
     frames = index * length + np.arange(length)
-    turns = np.outer(_BESIDE_HZ / comb.frame_rate_hz, frames)
+    turns = np.outer(_BESIDE_HZ / bank.frame_rate_hz, frames)
     turning = np.vstack([np.ones(length), *cosines_and_sines(turns)])
-    lines = smooth[:, None] * _lines(comb, frames)
-    return _Stretch(
+    lines = smooth[:, None] * _lines(bank, frames)
+    return _Segment(
         lines=lines.reshape(-1, length),
-        bins=np.asarray((turning * _hann(comb.n_frames, frames)) @ smooth.T, np.float32),
+        bins=np.asarray((turning * _hann(bank.n_frames, frames)) @ smooth.T, np.float32),
     )
 
 
 @lru_cache(maxsize=4)
 def _smooth(frame_rate_hz: float, n_frames: int) -> Array:
     """Return ``(n_smooth, length)`` orthonormal shapes: all that bins can be in a stretch."""
-    length = max(round(STRETCH_S * frame_rate_hz), LEAST_STRETCH)
+    length = max(round(SEGMENT_S * frame_rate_hz), MIN_SEGMENT)
     # a Hann window is a mean and a turn more or less
     weight_hz = np.array([-1.0, 0.0, 1.0]) * frame_rate_hz / n_frames
     slow_hz = np.add.outer([0.0, *_BESIDE_HZ], weight_hz)
@@ -113,9 +113,9 @@ def _smooth(frame_rate_hz: float, n_frames: int) -> Array:
     return np.asarray(shapes[size > FAINTEST_SHAPE * size[0]], np.float32)
 
 
-def _lines(comb: Comb, frames: Array) -> Array:
+def _lines(bank: DemodulationBank, frames: Array) -> Array:
     """Return ``exp(-i w k)`` of every line, ``(2 * n_lines, n)``: real parts, imaginary ones."""
-    cosines, sines = cosines_and_sines(np.outer(comb.lines_hz, frames / comb.frame_rate_hz))
+    cosines, sines = cosines_and_sines(np.outer(bank.lines_hz, frames / bank.frame_rate_hz))
     return np.concatenate([cosines, -sines])
 
 

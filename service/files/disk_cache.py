@@ -29,7 +29,7 @@ from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis
 
 Arrays = Mapping[str, NDArray[Any]]
 
-MOST_BYTES = 1_000_000_000
+MAX_BYTES = 1_000_000_000
 """All files together; the ones used least recently go first."""
 
 VARIABLE = "PYRCAL_SERVICE__CACHE_DIR"
@@ -49,12 +49,12 @@ def usual_folder(environment: Mapping[str, str]) -> Path:
     return Path(home) / "pyrcal"
 
 
-class Prepared:
+class DiskCache:
     """A folder of results; without one everything is computed."""
 
-    def __init__(self, folder: Path | None, *, most_bytes: int = MOST_BYTES) -> None:
+    def __init__(self, folder: Path | None, *, max_bytes: int = MAX_BYTES) -> None:
         self._folder = folder
-        self._most_bytes = most_bytes
+        self._max_bytes = max_bytes
 
     def basis(self, instrument: Instrument) -> Basis:
         """Return the modes of this instrument, as ``modal_basis`` does.
@@ -107,7 +107,7 @@ class Prepared:
         return found
 
     def _write(self, path: Path, arrays: Arrays) -> None:
-        if sum(array.nbytes for array in arrays.values()) > self._most_bytes:
+        if sum(array.nbytes for array in arrays.values()) > self._max_bytes:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         number, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=_SUFFIX)
@@ -127,7 +127,7 @@ class Prepared:
             with contextlib.suppress(OSError):  # another process tidies, too
                 status = path.stat()
                 files.append((status.st_mtime, status.st_size, path))
-        room = self._most_bytes
+        room = self._max_bytes
         for modified_s, n_bytes, path in sorted(files, reverse=True):
             waiting = path.name.startswith(".")
             room -= n_bytes

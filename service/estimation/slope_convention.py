@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.estimation.orientation import (
-    LEAST_CORRELATION,
-    LEAST_LEAD,
+    MIN_CORRELATION,
+    MIN_LEAD,
     Pose,
     poses_of,
     setting_written,
@@ -61,7 +61,7 @@ _UNIT_DECADES = 1.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Dialect:
+class SlopeConvention:
     """What was found of an RTC's slopes and commands."""
 
     wrong: str = ""
@@ -85,7 +85,7 @@ def of_reconstructor(
     near: Misregistration,
     response: NDArray[np.floating],
     mapper: Mapper = map,
-) -> Dialect:
+) -> SlopeConvention:
     """Return what the matrix an RTC runs with, ``(n_controlled, n_slopes)``, says of its slopes.
 
     ``near`` is where the mirror is thought to be and ``response`` ``(n_slopes, n_modes)`` the
@@ -93,7 +93,7 @@ def of_reconstructor(
     """
     used = np.flatnonzero(np.any(reconstructor != 0.0, axis=1))
     if not len(used) or not np.isfinite(reconstructor).all():
-        return Dialect()
+        return SlopeConvention()
     known = np.asarray(reconstructor[used], dtype=np.float64)
     measured = np.asarray(np.linalg.pinv(known, rcond=1.0 / LARGEST_CONDITION), dtype=np.float64)
     lower = used[: (len(used) + 1) // 2]
@@ -109,12 +109,16 @@ def of_reconstructor(
             mapper=mapper,
         )
     except MatrixError as error:
-        return Dialect(wrong=unit or f"the RTC's matrix answers to hardly any slope: {error}")
+        return SlopeConvention(
+            wrong=unit or f"the RTC's matrix answers to hardly any slope: {error}"
+        )
     axes = _judged(poses, instrument, near.rotation_rad)
     return replace(axes, wrong="; ".join(part for part in (unit, axes.wrong) if part))
 
 
-def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Instrument) -> Dialect:
+def of_answer(
+    slopes: Array, expected: Array, turns_rad: Array, instrument: Instrument
+) -> SlopeConvention:
     """Return what the slopes that answer a dither say.
 
     Parameters
@@ -127,9 +131,9 @@ def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Inst
         ``(n_lines,)`` phase by which each line advances in a frame: slopes that lag by half a
         period are no slopes of the other sign.
     """
-    told, mask = _told(instrument), rtc_valid_subapertures(instrument)
-    model = _planes(expected, told, mask)
-    as_seen = _planes(slopes, told, mask)
+    reported, mask = _reported(instrument), rtc_valid_subapertures(instrument)
+    model = _planes(expected, reported, mask)
+    as_seen = _planes(slopes, reported, mask)
     as_told = _resemblance(as_seen, model)
     lagging = max(_resemblance(as_seen * np.exp(1j * turns_rad * lag), model) for lag in LAGS)
     ratio = float(np.median(np.linalg.norm(slopes, axis=1) / np.linalg.norm(expected, axis=1)))
@@ -138,72 +142,74 @@ def of_answer(slopes: Array, expected: Array, turns_rad: Array, instrument: Inst
         unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
     every = {
         setting: _resemblance(_planes(slopes, setting, mask), model)
-        for setting in settings_of(told, told.kind.orders)
+        for setting in settings_of(reported, reported.kind.orders)
     }
     best = max(every.values())
     if best < RESEMBLANCE or as_told * ADVANTAGE > best or lagging > best:
-        return Dialect(wrong=unit)
-    alike = [setting for setting, much in every.items() if much > best - LEAST_LEAD]
-    found = min(alike, key=lambda setting: _n_changes(setting, told))
-    return Dialect(wrong=_axes_named("the answer to the dither", found, told), found=found)
+        return SlopeConvention(wrong=unit)
+    alike = [setting for setting, much in every.items() if much > best - MIN_LEAD]
+    found = min(alike, key=lambda setting: _n_changes(setting, reported))
+    return SlopeConvention(
+        wrong=_axes_named("the answer to the dither", found, reported), found=found
+    )
 
 
-def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Dialect:
-    told = _told(instrument)
+def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> SlopeConvention:
+    reported = _reported(instrument)
     best = max(poses, key=lambda pose: pose.correlation)
     stated = instrument.slopes.orientation is not None
-    if best.correlation < LEAST_CORRELATION:
+    if best.correlation < MIN_CORRELATION:
         text = (
             'slopes.orientation is "auto", and no orientation explains the RTC\'s own matrix '
             f"(correlation {best.correlation:.2f}): its modes are another basis; write "
             "[slopes] orientation"
         )
-        return Dialect(wrong="" if stated else text)
-    alike = [pose for pose in poses if pose.correlation > best.correlation - LEAST_LEAD]
+        return SlopeConvention(wrong="" if stated else text)
+    alike = [pose for pose in poses if pose.correlation > best.correlation - MIN_LEAD]
     near = [pose for pose in alike if abs(wrapped(pose.rotation_rad - start_rad)) <= REACH_RAD]
     settings = {pose.slopes: pose.rotation_rad for pose in near}
-    if told in settings:
-        return Dialect(found=told, rotation_rad=settings[told])
+    if reported in settings:
+        return SlopeConvention(found=reported, rotation_rad=settings[reported])
     if not near:
         turned_deg = np.rad2deg(
-            min(alike, key=lambda pose: _n_changes(pose.slopes, told)).rotation_rad
+            min(alike, key=lambda pose: _n_changes(pose.slopes, reported)).rotation_rad
         )
-        return Dialect(
+        return SlopeConvention(
             wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, "
             f"{np.rad2deg(start_rad):.0f} deg were told: write [mirror] nominal_rotation_deg"
         )
-    found = min(settings, key=lambda setting: _n_changes(setting, told))
+    found = min(settings, key=lambda setting: _n_changes(setting, reported))
     if not stated:
-        return Dialect(found=found, rotation_rad=settings[found])
-    return Dialect(wrong=_axes_named("the RTC's own matrix", found, told), found=found)
+        return SlopeConvention(found=found, rotation_rad=settings[found])
+    return SlopeConvention(wrong=_axes_named("the RTC's own matrix", found, reported), found=found)
 
 
-def _told(instrument: Instrument) -> SlopeRecipe:
+def _reported(instrument: Instrument) -> SlopeRecipe:
     return replace(instrument.slopes, orientation=instrument.slopes.assumed_orientation)
 
 
-def _n_changes(setting: SlopeRecipe, told: SlopeRecipe) -> int:
+def _n_changes(setting: SlopeRecipe, reported: SlopeRecipe) -> int:
     """Return how much of what was told a setting contradicts."""
-    axes, told_axes = setting.assumed_orientation, told.assumed_orientation
+    axes, told_axes = setting.assumed_orientation, reported.assumed_orientation
     names = (*FLIPS, "sign_x", "sign_y")
     changed = sum(bool(getattr(axes, name) != getattr(told_axes, name)) for name in names)
     both_signs = axes.sign_x != told_axes.sign_x and axes.sign_y != told_axes.sign_y
     # light counted the other way round turns both signs: one thing
-    return changed - both_signs + (setting.order != told.order)
+    return changed - both_signs + (setting.order != reported.order)
 
 
-def _axes_named(witness: str, found: SlopeRecipe, told: SlopeRecipe) -> str:
+def _axes_named(witness: str, found: SlopeRecipe, reported: SlopeRecipe) -> str:
     """Return which of the axes, signs and orders are others than told, and what to write."""
-    axes, told_axes = found.assumed_orientation, told.assumed_orientation
+    axes, told_axes = found.assumed_orientation, reported.assumed_orientation
     differ = []
-    if found.order != told.order:
-        differ.append(f'slopes.order = "{found.order}" ("{told.order}" told)')
+    if found.order != reported.order:
+        differ.append(f'slopes.order = "{found.order}" ("{reported.order}" told)')
     flips = [name for name in FLIPS if getattr(axes, name) != getattr(told_axes, name)]
     differ += [f"orientation.{name} = {str(getattr(axes, name)).lower()}" for name in flips]
     if (axes.sign_x, axes.sign_y) != (told_axes.sign_x, told_axes.sign_y):
         differ.append(f"orientation.{sign_written(axes)} ({sign_written(told_axes)} told)")
     turned = replace(told_axes, sign_x=-told_axes.sign_x, sign_y=-told_axes.sign_y)
-    only_the_sign = found == replace(told, orientation=turned)
+    only_the_sign = found == replace(reported, orientation=turned)
     other = "slopes have the other sign" if only_the_sign else "slopes lie otherwise"
     return (
         f"{other} than the instrument file says: {', '.join(differ)} by {witness}. Write "

@@ -52,7 +52,7 @@ _STILL_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopLaw:
+class ControlLawCheck:
     """Frames of a loop that has not changed: feed it blocks with ``follow``."""
 
     from_seq: int = 0
@@ -78,7 +78,7 @@ class LoopLaw:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FoundLaw:
+class IdentifiedLaw:
     """What the frames say of the loop, and what was told."""
 
     leak: float
@@ -90,7 +90,7 @@ class FoundLaw:
     """What disagrees, found and told; empty: nothing does."""
 
 
-def follow(law: LoopLaw, block: FrameBlock, loop: ClosedLoop) -> LoopLaw:
+def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> ControlLawCheck:
     """Return the law after one more block, as far as it is of this loop."""
     if block.first_seq < law.from_seq or _has_time(law, block):
         return law
@@ -112,13 +112,15 @@ def follow(law: LoopLaw, block: FrameBlock, loop: ClosedLoop) -> LoopLaw:
     )
 
 
-def _has_time(law: LoopLaw, block: FrameBlock) -> bool:
+def _has_time(law: ControlLawCheck, block: FrameBlock) -> bool:
     """Return whether these frames will be forgotten before the next verdict on their matrix."""
     first_seq = law.judged_seq + JUDGED_EVERY - KEPT_FRAMES
     return block.next_seq <= first_seq and block.cm_id == law.cm_id
 
 
-def judged(law: LoopLaw, loop: ClosedLoop, last_seq: int) -> tuple[LoopLaw, FoundLaw | None]:
+def judged(
+    law: ControlLawCheck, loop: ClosedLoop, last_seq: int
+) -> tuple[ControlLawCheck, IdentifiedLaw | None]:
     """Return what the frames up to one say of the loop; None: nothing, or nothing new."""
     if last_seq - law.judged_seq < JUDGED_EVERY:
         return law, None
@@ -180,7 +182,7 @@ def _fitted(commands: Array, seen: Array, at: Array, n_taps: int) -> _Fits:
     )
 
 
-def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> FoundLaw:
+def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> IdentifiedLaw:
     leak, sigma, late = (
         float(np.median(found[clear])) for found in (fits.leak, fits.leak_sigma, fits.delay_frames)
     )
@@ -194,7 +196,7 @@ def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> Foun
         wrong.append(f"gain {gain:.3g} times the one told{_hint(gain)}")
     if abs(late - loop.delay_frames) > DELAY_TOLERANCE:
         wrong.append(f"delay {late:.2f} frames found, {loop.delay_frames:.2f} told")
-    return FoundLaw(leak=leak, gain=gain, delay_frames=late, wrong="; ".join(wrong))
+    return IdentifiedLaw(leak=leak, gain=gain, delay_frames=late, wrong="; ".join(wrong))
 
 
 def _hint(gain: float) -> str:
@@ -206,9 +208,11 @@ def _hint(gain: float) -> str:
     return f": {whose} look like {unit}, metres of OPD are expected" if unit else ""
 
 
-def _begun(law: LoopLaw, cm_id: str | None, loop: ClosedLoop) -> LoopLaw:
+def _begun(law: ControlLawCheck, cm_id: str | None, loop: ClosedLoop) -> ControlLawCheck:
     in_loop = np.flatnonzero(loop.gains > 0.0)
     chosen = np.unique(np.linspace(0, len(in_loop) - 1, MODES_WATCHED).round().astype(int))
     modes = in_loop[chosen] if len(in_loop) else in_loop
     none = np.zeros((0, len(modes)), np.float32)
-    return LoopLaw(from_seq=law.from_seq, cm_id=cm_id, modes=modes, commands_m=none, seen_m=none)
+    return ControlLawCheck(
+        from_seq=law.from_seq, cm_id=cm_id, modes=modes, commands_m=none, seen_m=none
+    )

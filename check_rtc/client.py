@@ -11,12 +11,17 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.articles import Checked, fine, seen, skipped, wrong
-from check_rtc.ear import ANSWER_S, Ear
-from check_rtc.watch import Watch
+from check_rtc.connection import ANSWER_S, RtcConnection
+from check_rtc.requirements import Checked, fine, seen, skipped, wrong
+from check_rtc.watch import TelemetryObserver
 from service.errors import LinkError, WireError
+from service.estimation.dither_monitor import (
+    DitherMeasurement,
+    DitherMonitor,
+    ExpectedDither,
+    measure_block,
+)
 from service.estimation.frames import FrameBlock
-from service.estimation.played import Asked, Finding, Meter, measured
 from service.wire import (
     CommandKind,
     DitherKind,
@@ -60,17 +65,17 @@ _SIDES: Final = (-4.0, -3.0, 3.0, 4.0)
 _STOPS_S: Final = 2.0
 
 
-class Talk:
+class RtcClient:
     """An ear, and what it hears, brought together while something is waited for."""
 
     def __init__(
         self,
-        ear: Ear,
-        watch: Watch,
+        connection: RtcConnection,
+        observer: TelemetryObserver,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        self.ear, self.watch, self.clock = ear, watch, clock
+        self.connection, self.watch, self.clock = connection, observer, clock
         self._sleep = sleep
 
     def listen(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -81,7 +86,7 @@ class Talk:
             if left_s <= 0.0:
                 return False
             self._sleep(min(left_s, 0.02))
-            self.watch.take(self.ear.take())
+            self.watch.take(self.connection.take())
         return True
 
 
@@ -101,9 +106,9 @@ class _Question:
     optional: bool = False
 
 
-def _questions(talk: Talk, status: Status) -> list[_Question]:
+def _questions(client: RtcClient, status: Status) -> list[_Question]:
     """Return commands none of which can be carried out."""
-    new, n_modes = talk.ear.new_id, status.n_modes
+    new, n_modes = client.connection.new_id, status.n_modes
     dither = DitherRequest(
         id=new("dither"),
         kind=DitherKind.SINE,
@@ -155,12 +160,12 @@ def _questions(talk: Talk, status: Status) -> list[_Question]:
     ]
 
 
-def replies(talk: Talk, status: Status) -> Checked:
+def replies(client: RtcClient, status: Status) -> Checked:
     """Ask for what must be refused; for one thing twice, with the same id."""
     said, absent, slowest_s, first = [], [], 0.0, b""
-    questions = _questions(talk, status)
+    questions = _questions(client, status)
     for question in questions:
-        answer, took_s = talk.ear.ask(question.kind, question.payload)
+        answer, took_s = client.connection.ask(question.kind, question.payload)
         if answer is None:
             if question.optional and took_s < ANSWER_S / 2:
                 absent.append(question.kind.value)
@@ -170,7 +175,7 @@ def replies(talk: Talk, status: Status) -> Checked:
         slowest_s = max(slowest_s, took_s)
         said += _wrong_reply(answer, question, took_s)
         first = answer if question is questions[3] else first
-    again, _ = talk.ear.ask(questions[3].kind, questions[3].payload)
+    again, _ = client.connection.ask(questions[3].kind, questions[3].payload)
     if first and again != first:
         said.append("the same id was answered otherwise when asked again")
     if said:
@@ -201,16 +206,16 @@ class _Ledger:
     """What the frames hold of a dither: fed with blocks."""
 
     def __init__(
-        self, asked: Asked, matrix: NDArray[np.float32] | None, in_loop: list[int]
+        self, asked: ExpectedDither, matrix: NDArray[np.float32] | None, in_loop: list[int]
     ) -> None:
         self.first_seq: int | None = None
         self.last_seq = -1
         self.next_seq = 0
-        self.findings: list[Finding] = []
+        self.findings: list[DitherMeasurement] = []
         self.seq: list[NDArray[np.int64]] = []
         self.seen_m: list[NDArray[np.float64]] = []
         self.moved_m: list[NDArray[np.float64]] = []
-        self._meter, self._matrix, self._in_loop = Meter(asked=asked), matrix, in_loop
+        self._meter, self._matrix, self._in_loop = DitherMonitor(asked=asked), matrix, in_loop
         self._span = asked.first_seq, asked.stop_seq
 
     def take(self, block: FrameBlock) -> None:
@@ -222,7 +227,7 @@ class _Ledger:
                 self.last_seq = block.first_seq + int(rows[-1])
                 if self.first_seq is None:
                     self.first_seq = block.first_seq + int(rows[0])
-        self._meter, found = measured(self._meter, block)
+        self._meter, found = measure_block(self._meter, block)
         self.findings += [] if found is None else [found]
         first, stop = self._span
         if self._matrix is None or block.first_seq < first or block.next_seq > stop:
@@ -234,7 +239,7 @@ class _Ledger:
 
 
 def dither(
-    talk: Talk, status: Status, matrix: NDArray[np.float32] | None, most_m: float = TOTAL_M
+    client: RtcClient, status: Status, matrix: NDArray[np.float32] | None, most_m: float = TOTAL_M
 ) -> list[Checked]:
     """Have a small dither played, stop it, and say what the frames held of it."""
     if status.dither is not None:
@@ -243,7 +248,7 @@ def dither(
     modes = dithered_modes(status)
     amplitude = min(most_m / np.sqrt(len(modes)), status.max_dither_m)
     request = DitherRequest(
-        id=talk.ear.new_id("dither"),
+        id=client.connection.new_id("dither"),
         kind=DitherKind.SINE,
         modes=modes,
         amplitude_m=(float(amplitude),) * len(modes),
@@ -251,27 +256,27 @@ def dither(
         duration_s=DITHER_S,
     )
     try:
-        reply = talk.ear.command(request)
+        reply = client.connection.command(request)
     except LinkError as error:
         return [wrong("dither", str(error)), skipped("columns", "there was no dither")]
     if not reply.accepted or reply.start_seq is None:
         found = f"refused: {reply.reason}" if not reply.accepted else "start_seq is nil"
         return [wrong("dither", found), skipped("columns", "there was no dither")]
     try:
-        ledger = _played(talk, status, request, reply.start_seq, matrix)
+        ledger = _listen_to_dither(client, status, request, reply.start_seq, matrix)
     finally:  # also where it is broken off
-        ended = stopped(talk)
+        ended = stopped(client)
     told_seq = ledger.next_seq
-    gone = talk.listen(
+    gone = client.listen(
         _STOPS_S,
         lambda: (
-            talk.watch.status is not None
-            and talk.watch.status.dither is None
+            client.watch.status is not None
+            and client.watch.status.dither is None
             and ledger.next_seq > ledger.last_seq + 50
         ),
     )
-    talk.watch.block_takers.remove(ledger.take)
-    judged = _judged(talk, request, reply.start_seq, ledger)
+    client.watch.block_takers.remove(ledger.take)
+    judged = _judged(client, request, reply.start_seq, ledger)
     if not judged and not (ended.accepted and gone):
         still_s = (ledger.last_seq - told_seq) / status.frame_rate_hz
         judged = f"told to stop, it went on for {still_s:.1f} s, or its status does: {ended.reason}"
@@ -285,10 +290,10 @@ def dither(
     return [fine("dither", found), _columns(ledger, modes, status)]
 
 
-def stopped(talk: Talk) -> Reply:
+def stopped(client: RtcClient) -> Reply:
     """Tell the dither to stop; return what is replied, also where nothing is."""
     try:
-        return talk.ear.command(DitherStop(id=talk.ear.new_id("stop")))
+        return client.connection.command(DitherStop(id=client.connection.new_id("stop")))
     except LinkError as error:
         return Reply(id=None, accepted=False, reason=str(error), start_seq=None)
 
@@ -303,8 +308,8 @@ def dithered_modes(status: Status) -> tuple[int, ...]:
     return tuple(dict.fromkeys(min(mode, status.n_modes - 1) for mode in chosen))[:most]
 
 
-def _played(
-    talk: Talk,
+def _listen_to_dither(
+    client: RtcClient,
     status: Status,
     request: DitherRequest,
     start_seq: int,
@@ -314,7 +319,7 @@ def _played(
     rate_hz = status.frame_rate_hz
     stop_seq = start_seq + round(PLAYED_S * rate_hz)
     own = tuple(mode not in status.in_loop for mode in request.modes)
-    asked = Asked(
+    asked = ExpectedDither(
         modes=request.modes,
         amplitude_m=request.amplitude_m,
         frequency_hz=request.frequency_hz or (),
@@ -325,12 +330,12 @@ def _played(
     )
     in_loop = [mode for mode, outside in zip(request.modes, own, strict=True) if not outside]
     ledger = _Ledger(asked, matrix, in_loop)
-    talk.watch.block_takers.append(ledger.take)
-    talk.listen(2.0 * PLAYED_S, lambda: ledger.next_seq >= stop_seq)
+    client.watch.block_takers.append(ledger.take)
+    client.listen(2.0 * PLAYED_S, lambda: ledger.next_seq >= stop_seq)
     return ledger
 
 
-def _judged(talk: Talk, request: DitherRequest, start_seq: int, ledger: _Ledger) -> str:
+def _judged(client: RtcClient, request: DitherRequest, start_seq: int, ledger: _Ledger) -> str:
     """Return what is otherwise than asked for; empty: nothing."""
     if ledger.first_seq is None:
         return f"accepted from frame {start_seq}, and the frames hold none of it"
@@ -342,7 +347,7 @@ def _judged(talk: Talk, request: DitherRequest, start_seq: int, ledger: _Ledger)
         return texts[0]
     if not ledger.findings:
         return "less than a second of it has come"
-    told = [status.dither for _, status in talk.watch.statuses if status.dither_id == request.id]
+    told = [status.dither for _, status in client.watch.statuses if status.dither_id == request.id]
     if not told or told[0] is None:
         return "no status tells it"
     if told[0].start_seq != start_seq or told[0].request != request:

@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from check_rtc.articles import Checked, fine, seen, skipped, wrong
-from check_rtc.watch import Arrival, Watch, in_order, of_session
-from service.estimation.dialect import Dialect
+from check_rtc.requirements import Checked, fine, seen, skipped, wrong
+from check_rtc.watch import Arrival, TelemetryObserver, in_order, of_session
 from service.estimation.orientation import setting_written
-from service.runtime.waiting import MOST_STATUSES_HZ
+from service.estimation.slope_convention import SlopeConvention
+from service.runtime.readiness import MAX_STATUSES_HZ
 from service.wire import Keys, Manifest, Status
 
 SLOWEST, FASTEST = 0.8, 1.1
@@ -56,7 +56,7 @@ class About:
     config_id: str | None = None
     """As the instrument file pins them; None: any."""
 
-    dialect: Dialect | str = ""
+    dialect: SlopeConvention | str = ""
     """What the matrix says of signs and axes, or why nobody looked."""
 
     @property
@@ -65,37 +65,37 @@ class About:
         return self.ended_s - self.began_s
 
 
-def listened(watch: Watch, about: About) -> Iterator[Checked]:
+def find_all(observer: TelemetryObserver, about: About) -> Iterator[Checked]:
     """Yield what every check finds in what has come."""
     for look in _LOOKS:
-        yield look(watch, about)
+        yield look(observer, about)
 
 
-def _connection(watch: Watch, _: About) -> Checked:
-    came = [at_s for at_s, alive in watch.tokens if alive]
-    gone = [at_s for at_s, alive in watch.tokens if not alive]
+def _connection(observer: TelemetryObserver, _: About) -> Checked:
+    came = [at_s for at_s, alive in observer.tokens if alive]
+    gone = [at_s for at_s, alive in observer.tokens if not alive]
     if not came:
         return wrong("connection", "there is no token alive/rtc, though telemetry comes")
     if not gone:
         return fine("connection", "the token is there")
-    if watch.tokens[-1][1]:
+    if observer.tokens[-1][1]:
         away_s = came[-1] - gone[-1]
         return seen("connection", f"the token was gone for {away_s:.1f} s, and came back")
     return wrong("connection", "the token has gone")
 
 
-def _messages(watch: Watch, _: About) -> Checked:
-    counts = Counter(refused.topic for refused in watch.refused)
+def _messages(observer: TelemetryObserver, _: About) -> Checked:
+    counts = Counter(refused.topic for refused in observer.refused)
     if not counts:
-        n = len(watch.arrivals) + len(watch.statuses) + len(watch.acknowledgements)
+        n = len(observer.arrivals) + len(observer.statuses) + len(observer.acknowledgements)
         return fine("messages", f"{n} messages, each as its table says")
     which = ", ".join(f"{n} {topic}" for topic, n in counts.items())
-    texts = dict.fromkeys(refused.text for refused in watch.refused)
+    texts = dict.fromkeys(refused.text for refused in observer.refused)
     return wrong("messages", f"{which} cannot be read: {'; '.join(list(texts)[:3])}")
 
 
-def _frames(watch: Watch, _: About) -> Checked:
-    arrivals = of_session(watch.arrivals, _chief_session(watch))
+def _frames(observer: TelemetryObserver, _: About) -> Checked:
+    arrivals = of_session(observer.arrivals, _chief_session(observer))
     if len(arrivals) < 3:
         return wrong("frames", f"{len(arrivals)} messages of frames have come")
     first, last = arrivals[0], arrivals[-1]
@@ -107,9 +107,9 @@ def _frames(watch: Watch, _: About) -> Checked:
         f"{rate_hz:.0f} frames a second in {messages_hz:.0f} messages of up to "
         f"{max(a.header.n for a in arrivals)}; dt_ns tells {nominal_hz:.4g} Hz"
     )
-    told = watch.status
-    if told is not None and abs(told.frame_rate_hz / nominal_hz - 1.0) > 1e-3:
-        return wrong("frames", f"{found}, the status {told.frame_rate_hz:.6g} Hz")
+    status = observer.status
+    if status is not None and abs(status.frame_rate_hz / nominal_hz - 1.0) > 1e-3:
+        return wrong("frames", f"{found}, the status {status.frame_rate_hz:.6g} Hz")
     if rate_hz > FASTEST * nominal_hz:
         return wrong("frames", found)
     if rate_hz < SLOWEST * nominal_hz:
@@ -136,34 +136,34 @@ def _rate_hz(arrivals: list[Arrival]) -> float:
     return float(np.median(rates_hz))
 
 
-def _sizes(watch: Watch, _: About) -> Checked:
-    sizes = Counter((a.header.n_slopes, a.header.n_modes) for a in watch.arrivals)
-    told = watch.status
+def _sizes(observer: TelemetryObserver, _: About) -> Checked:
+    sizes = Counter((a.header.n_slopes, a.header.n_modes) for a in observer.arrivals)
+    status = observer.status
     words = " and ".join(f"{slopes} slopes, {modes} modes" for slopes, modes in sizes)
-    if told is not None and set(sizes) - {(told.n_slopes, told.n_modes)}:
+    if status is not None and set(sizes) - {(status.n_slopes, status.n_modes)}:
         return wrong(
-            "sizes", f"{words}; the status tells {told.n_slopes} slopes, {told.n_modes} modes"
+            "sizes", f"{words}; the status tells {status.n_slopes} slopes, {status.n_modes} modes"
         )
     if len(sizes) > 1:
         return wrong("sizes", f"{words} in turn")
     return fine("sizes", words) if sizes else skipped("sizes", "no frame has come")
 
 
-def _numbers(watch: Watch, _: About) -> Checked:
+def _numbers(observer: TelemetryObserver, _: About) -> Checked:
     said = []
-    if watch.n_nonfinite:
-        said.append(f"{watch.n_nonfinite} frames with numbers that are not finite")
-    if watch.n_frozen:
-        said.append(f"{watch.n_frozen} frames whose slopes repeat those before to the last bit")
+    if observer.n_nonfinite:
+        said.append(f"{observer.n_nonfinite} frames with numbers that are not finite")
+    if observer.n_frozen:
+        said.append(f"{observer.n_frozen} frames whose slopes repeat those before to the last bit")
     if said:
         return wrong("numbers", "; ".join(said))
-    return fine("numbers", f"all of {sum(a.header.n for a in watch.arrivals)} frames")
+    return fine("numbers", f"all of {sum(a.header.n for a in observer.arrivals)} frames")
 
 
-def _sequence(watch: Watch, _: About) -> Checked:
+def _sequence(observer: TelemetryObserver, _: About) -> Checked:
     counts, over = Counter[str](), ""
-    for session in watch.sessions():
-        arrivals = of_session(watch.arrivals, session)
+    for session in observer.sessions():
+        arrivals = of_session(observer.arrivals, session)
         over = over or _started_over(arrivals)
         head, known = arrivals[0].header.seq0, set[int]()
         for arrival in arrivals:
@@ -199,10 +199,10 @@ def _started_over(arrivals: list[Arrival]) -> str:
     return ""
 
 
-def _steps(watch: Watch) -> Iterator[tuple[Arrival, Arrival, float, float]]:
+def _steps(observer: TelemetryObserver) -> Iterator[tuple[Arrival, Arrival, float, float]]:
     """Yield neighbours, by how much the clock steps in between, and the time they waited, s."""
-    for session in watch.sessions():
-        for before, after in pairwise(in_order(of_session(watch.arrivals, session))):
+    for session in observer.sessions():
+        for before, after in pairwise(in_order(of_session(observer.arrivals, session))):
             dt_ns = before.header.dt_ns
             n_frames = after.header.seq0 - before.header.seq0
             step_ns = after.header.t0_ns - before.header.t0_ns - n_frames * dt_ns
@@ -210,10 +210,10 @@ def _steps(watch: Watch) -> Iterator[tuple[Arrival, Arrival, float, float]]:
             yield before, after, step_ns * 1e-9, since_s
 
 
-def _clock(watch: Watch, _: About) -> Checked:
+def _clock(observer: TelemetryObserver, _: About) -> Checked:
     pauses: list[tuple[float, int]] = []
     steps: list[tuple[float, int]] = []
-    for before, after, step_s, since_s in _steps(watch):
+    for before, after, step_s, since_s in _steps(observer):
         if abs(step_s) <= before.header.dt_ns * 0.5e-9:
             continue
         waited = step_s > 0.0 and abs(since_s - step_s) < max(0.3 * step_s, 0.1)
@@ -226,19 +226,19 @@ def _clock(watch: Watch, _: About) -> Checked:
     if pauses:
         step_s, seq = pauses[0]
         return seen("clock", f"the loop stood still for {step_s:.2f} s before frame {seq}")
-    if not watch.arrivals:
+    if not observer.arrivals:
         return skipped("clock", "no frame has come")
-    away_ns = watch.arrivals[-1].header.t0_ns - time.time_ns()
+    away_ns = observer.arrivals[-1].header.t0_ns - time.time_ns()
     if abs(away_ns) > FAR_NS:
         return seen("clock", f"it is {away_ns * 1e-9:+.3g} s from the clock here")
     return fine("clock", f"it goes on evenly, {away_ns * 1e-9:+.2g} s from the clock here")
 
 
-def _delivery(watch: Watch, _: About) -> Checked:
+def _delivery(observer: TelemetryObserver, _: About) -> Checked:
     """Judge by neighbours in the order of arrival: how late one is against the one before."""
     late, where = 0.0, 0
-    for session in watch.sessions():
-        for before, after in pairwise(of_session(watch.arrivals, session)):
+    for session in observer.sessions():
+        for before, after in pairwise(of_session(observer.arrivals, session)):
             dt_s = before.header.dt_ns * 1e-9
             by_seq = (after.stop_seq - before.stop_seq) * dt_s
             by_clock = (after.header.t0_ns - before.header.t0_ns) * 1e-9
@@ -251,9 +251,9 @@ def _delivery(watch: Watch, _: About) -> Checked:
     return (seen if late > LATE_S else fine)("delivery", found)
 
 
-def _session(watch: Watch, _: About) -> Checked:
-    runs = [watch.arrivals[0].header.session] if watch.arrivals else []
-    for before, after in pairwise(watch.arrivals):
+def _session(observer: TelemetryObserver, _: About) -> Checked:
+    runs = [observer.arrivals[0].header.session] if observer.arrivals else []
+    for before, after in pairwise(observer.arrivals):
         if after.header.session != before.header.session:
             runs.append(after.header.session)
     if not runs:
@@ -269,48 +269,49 @@ def _session(watch: Watch, _: About) -> Checked:
     return fine("session", f"{names[0]} throughout")
 
 
-def _status(watch: Watch, about: About) -> Checked:
-    told = watch.status
-    if told is None:
+def _status(observer: TelemetryObserver, about: About) -> Checked:
+    status = observer.status
+    if status is None:
         return wrong("status", f"none has come in {about.span_s:.0f} s")
-    heard = [at_s for at_s, _ in watch.statuses]
+    heard = [at_s for at_s, _ in observer.statuses]
     rate_hz = (len(heard) - 1) / max(heard[-1] - heard[0], 1.0)
     found = (
-        f"{rate_hz:.1f} a second; loop {told.loop}, {told.n_controlled} of {told.n_modes} modes, "
-        f"matrix {told.cm_id}"
+        f"{rate_hz:.1f} a second; loop {status.loop}, {status.n_controlled} of {status.n_modes} "
+        f"modes, "
+        f"matrix {status.cm_id}"
     )
-    disagrees = _disagreement(watch, told)
+    disagrees = _disagreement(observer, status)
     if disagrees:
         return wrong("status", f"{found}; {disagrees}")
-    if rate_hz > MOST_STATUSES_HZ or rate_hz < STATUSES_HZ[0]:
+    if rate_hz > MAX_STATUSES_HZ or rate_hz < STATUSES_HZ[0]:
         return wrong("status", found)
-    if rate_hz > STATUSES_HZ[1] or not told.in_loop or told.cm_id is None:
+    if rate_hz > STATUSES_HZ[1] or not status.in_loop or status.cm_id is None:
         return seen("status", found)
     return fine("status", found)
 
 
-def _disagreement(watch: Watch, told: Status) -> str:
+def _disagreement(observer: TelemetryObserver, status: Status) -> str:
     """Return how the last status contradicts the frames, or itself; empty: it does not."""
-    if told.loop == "closed" and not all(told.gains[: told.n_controlled]):
+    if status.loop == "closed" and not all(status.gains[: status.n_controlled]):
         return "it tells a closed loop, and gains of 0 for modes that are controlled: partial"
-    if told.loop != "open" and any(told.gains[told.n_controlled :]):
+    if status.loop != "open" and any(status.gains[status.n_controlled :]):
         return "it tells gains for modes that are not controlled"
-    at_s = watch.statuses[-1][0]
-    of_it = [a for a in of_session(watch.arrivals, told.session) if a.at_s <= at_s]
+    at_s = observer.statuses[-1][0]
+    of_it = [a for a in of_session(observer.arrivals, status.session) if a.at_s <= at_s]
     if not of_it:
-        return f"no frame is of its session {told.session}" if watch.arrivals else ""
+        return f"no frame is of its session {status.session}" if observer.arrivals else ""
     latest = max(arrival.stop_seq for arrival in of_it) - 1
-    reach = 2.0 * told.frame_rate_hz
-    if told.seq is None or abs(told.seq - latest) > reach:
-        return f"it tells seq {told.seq}, the frames are at {latest}"
-    if told.cm_id is not None and told.cm_id not in {a.header.cm_id for a in of_it[-20:]}:
+    reach = 2.0 * status.frame_rate_hz
+    if status.seq is None or abs(status.seq - latest) > reach:
+        return f"it tells seq {status.seq}, the frames are at {latest}"
+    if status.cm_id is not None and status.cm_id not in {a.header.cm_id for a in of_it[-20:]}:
         return f"the frames name matrix {of_it[-1].header.cm_id}"
     return ""
 
 
-def _ids(watch: Watch, about: About) -> Checked:
-    found = dict.fromkeys((a.header.basis_id, a.header.config_id) for a in watch.arrivals)
-    found |= dict.fromkeys((s.basis_id, s.config_id) for _, s in watch.statuses)
+def _ids(observer: TelemetryObserver, about: About) -> Checked:
+    found = dict.fromkeys((a.header.basis_id, a.header.config_id) for a in observer.arrivals)
+    found |= dict.fromkeys((s.basis_id, s.config_id) for _, s in observer.statuses)
     if about.applied is not None:
         found |= {(about.applied.basis_id, about.applied.config_id): None}
     words = "; then ".join(f"basis {basis}, configuration {config}" for basis, config in found)
@@ -324,29 +325,31 @@ def _ids(watch: Watch, about: About) -> Checked:
     return fine("ids", words) if found else skipped("ids", "nothing has come")
 
 
-def _matrix(watch: Watch, about: About) -> Checked:
-    manifest, told = about.applied, watch.status
+def _matrix(observer: TelemetryObserver, about: About) -> Checked:
+    manifest, status = about.applied, observer.status
     if manifest is None and not about.offered:
         why = "nobody answers on rtc/cm/applied: optional; without it ids are believed"
         return skipped("matrix", why)
-    if manifest is None or told is None:
+    if manifest is None or status is None:
         return wrong("matrix", about.not_applied or "there is no status to compare it with")
     shape = manifest.layout.shape
     found = f"{manifest.id}, {list(shape)} in {manifest.layout.n_chunks} parts, its sum is right"
-    if shape[1] != told.n_slopes or (told.in_loop and shape[0] != told.n_controlled):
-        return wrong("matrix", f"{found}; the status tells {[told.n_controlled, told.n_slopes]}")
-    named = {status.cm_id for _, status in watch.statuses}
+    if shape[1] != status.n_slopes or (status.in_loop and shape[0] != status.n_controlled):
+        return wrong(
+            "matrix", f"{found}; the status tells {[status.n_controlled, status.n_slopes]}"
+        )
+    named = {status.cm_id for _, status in observer.statuses}
     if manifest.id not in named and named != {None}:
-        return wrong("matrix", f"{found}; the status names {told.cm_id}")
+        return wrong("matrix", f"{found}; the status names {status.cm_id}")
     if manifest.system != about.keys.system:
         return wrong("matrix", f"{found}; its system is {manifest.system}")
     return fine("matrix", found)
 
 
-def _law(watch: Watch, about: About) -> Checked:
-    laws, told = watch.loop.laws, watch.status
-    why = _why_unjudged(watch, about)
-    if why or told is None:
+def _law(observer: TelemetryObserver, about: About) -> Checked:
+    laws, status = observer.loop.laws, observer.status
+    why = _why_unjudged(observer, about)
+    if why or status is None:
         return skipped("law", why)
     if not laws:
         why = (
@@ -361,12 +364,12 @@ def _law(watch: Watch, about: About) -> Checked:
     )
     if last.wrong and all(law.wrong for law in laws[-2:]):
         return wrong("law", last.wrong)
-    return fine("law", f"{found}; told {told.leak:.4f} and {told.delay_frames:g} frames")
+    return fine("law", f"{found}; told {status.leak:.4f} and {status.delay_frames:g} frames")
 
 
-def _obedience(watch: Watch, about: About) -> Checked:
-    why = _why_unjudged(watch, about)
-    verdicts = watch.loop.obediences
+def _obedience(observer: TelemetryObserver, about: About) -> Checked:
+    why = _why_unjudged(observer, about)
+    verdicts = observer.loop.obediences
     if why or not verdicts:
         return skipped("obedience", why or "too few frames of one loop have come")
     if any(not one.holds and not other.holds for one, other in pairwise(verdicts)):
@@ -380,16 +383,16 @@ def _obedience(watch: Watch, about: About) -> Checked:
     )
 
 
-def _why_unjudged(watch: Watch, about: About) -> str:
-    told = watch.status
-    if told is None:
+def _why_unjudged(observer: TelemetryObserver, about: About) -> str:
+    status = observer.status
+    if status is None:
         return "no status has come"
-    if not told.in_loop:
+    if not status.in_loop:
         return "the loop is open"
     return "" if about.applied is not None else "the matrix in use is not known"
 
 
-def _orientation(_: Watch, about: About) -> Checked:
+def _orientation(_: TelemetryObserver, about: About) -> Checked:
     dialect = about.dialect
     if isinstance(dialect, str):
         return skipped("orientation", dialect)
@@ -402,20 +405,20 @@ def _orientation(_: Watch, about: About) -> Checked:
     return fine("orientation", found)
 
 
-def _late_join(watch: Watch, about: About) -> Checked:
-    asked = [at_s for at_s, key in watch.asked if key == about.keys.current]
+def _late_join(observer: TelemetryObserver, about: About) -> Checked:
+    asked = [at_s for at_s, key in observer.asked if key == about.keys.current]
     if asked:
         return fine("late-join", f"cm/current was asked {len(asked)} time(s)")
     why = "not asked meanwhile: once a session is enough; start the RTC after this to see it"
     return skipped("late-join", why)
 
 
-def _chief_session(watch: Watch) -> str | None:
+def _chief_session(observer: TelemetryObserver) -> str | None:
     """Return the session of most batches."""
-    return next((session for session, _ in watch.sessions().most_common(1)), None)
+    return next((session for session, _ in observer.sessions().most_common(1)), None)
 
 
-_LOOKS: Final[tuple[Callable[[Watch, About], Checked], ...]] = (
+_LOOKS: Final[tuple[Callable[[TelemetryObserver, About], Checked], ...]] = (
     _connection,
     _messages,
     _frames,

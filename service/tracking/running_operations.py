@@ -23,7 +23,7 @@ ANSWERED_WITHIN_S = 30.0
 """A gain ramp that the RTC has neither accepted nor refused for so long is none."""
 
 
-class Activity(StrEnum):
+class OperationKind(StrEnum):
     """What may run, or keep everything from running."""
 
     STOPPED = "an operator has stopped everything"
@@ -39,15 +39,15 @@ class Activity(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Running:
+class RunningOperation:
     """Something that runs, in words."""
 
-    activity: Activity
+    kind: OperationKind
     text: str
     """What runs, and what ends it."""
 
 
-def under_way(state: TrackerState, now_ns: int) -> tuple[Running, ...]:
+def under_way(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:
     """Return all that runs now, what is exclusive first."""
     return (*_exclusive(state, now_ns), *_dither(state, now_ns), *_of_matrices(state))
 
@@ -64,50 +64,54 @@ def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
     return asked if accepted and now_ns < asked.until_ns_utc else None
 
 
-def _exclusive(state: TrackerState, now_ns: int) -> Iterator[Running]:
+def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     for alarm in state.alarms:
         if alarm.name == STANDING_BY:
-            yield Running(Activity.STANDING_BY, alarm.text)
+            yield RunningOperation(OperationKind.STANDING_BY, alarm.text)
     if state.stopped_because:
-        yield Running(Activity.STOPPED, f"{state.stopped_because}; release the stop first")
+        yield RunningOperation(
+            OperationKind.STOPPED, f"{state.stopped_because}; release the stop first"
+        )
     if state.measuring is not None:
         text = f"interaction matrix {state.measuring.id} is being measured"
-        yield Running(Activity.MEASURING, f"{text}; wait for it, or give it up")
-    if state.gathering is not None:
-        text = f"noisy matrix {state.gathering.id} is under way; wait for it, or give it up"
-        yield Running(Activity.GATHERING, text)
+        yield RunningOperation(OperationKind.MEASURING, f"{text}; wait for it, or give it up")
+    if state.noisy_measurement is not None:
+        text = f"noisy matrix {state.noisy_measurement.id} is under way; wait for it, or give it up"
+        yield RunningOperation(OperationKind.GATHERING, text)
     ramp = ramping(state, now_ns)
     if ramp is not None:
         left_s = max((ramp.until_ns_utc - now_ns) / SECOND_NS, 0.0) or ramp.lasts_s
         text = f"gain ramp {ramp.id} is under way; wait for it, {left_s:.0f} s"
-        yield Running(Activity.RAMPING, f"{text}, or open the loop to end it")
+        yield RunningOperation(OperationKind.RAMPING, f"{text}, or open the loop to end it")
     if state.acquisition.under_way:
         text = f"an acquisition is under way ({state.acquisition.text}); wait for it, or abort it"
-        yield Running(Activity.ACQUIRING, text)
+        yield RunningOperation(OperationKind.ACQUIRING, text)
 
 
-def _dither(state: TrackerState, now_ns: int) -> Iterator[Running]:
+def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     """Yield the dither that plays, followed or not; one that was told to stop does no more."""
     known = None if state.dither is None else state.dither.id
-    told = now_ns - state.dithering.told_ns_utc < GONE_WITHIN_S * SECOND_NS
+    told = now_ns - state.dither_policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
     seen = None if state.rtc is None or told else state.rtc.dither_id
     playing = known or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
     if playing is not None:
         own = playing.startswith(OWN_DITHER)
-        activity = Activity.OWN_DITHER if own else Activity.OTHER_DITHER
-        yield Running(activity, f"{playing} is running; stop it first")
+        activity = OperationKind.OWN_DITHER if own else OperationKind.OTHER_DITHER
+        yield RunningOperation(activity, f"{playing} is running; stop it first")
 
 
-def _of_matrices(state: TrackerState) -> Iterator[Running]:
+def _of_matrices(state: TrackerState) -> Iterator[RunningOperation]:
     if state.making_since_ns_utc is not None:
-        yield Running(Activity.MAKING, "a reconstructor is being computed; wait for it")
+        yield RunningOperation(
+            OperationKind.MAKING, "a reconstructor is being computed; wait for it"
+        )
     for record in state.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} is on its way to the RTC; wait for it"
-            yield Running(Activity.SENDING, text)
+            yield RunningOperation(OperationKind.SENDING, text)
 
 
-class Operation(StrEnum):
+class ServiceState(StrEnum):
     """Whether the service does its work; the first that holds, from below."""
 
     OPERATIONAL = "Operational"
@@ -126,7 +130,7 @@ class Operation(StrEnum):
     """An alarm that is critical lasts: the loop, or what is heard of it, cannot be relied on."""
 
 
-class Occupation(StrEnum):
+class CurrentOperation(StrEnum):
     """What it does; the first that holds, from above."""
 
     ACQUIRING = "Acquiring"
@@ -145,12 +149,12 @@ class Occupation(StrEnum):
     """None of these: α is not known, or there is no closed loop to follow it in."""
 
 
-OCCUPIES: dict[Activity, Occupation] = {
-    Activity.ACQUIRING: Occupation.ACQUIRING,
-    Activity.MEASURING: Occupation.MEASURING,
-    Activity.GATHERING: Occupation.MEASURING,
-    Activity.RAMPING: Occupation.MEASURING,
-    Activity.STOPPED: Occupation.HOLD,
+OPERATION_OF: dict[OperationKind, CurrentOperation] = {
+    OperationKind.ACQUIRING: CurrentOperation.ACQUIRING,
+    OperationKind.MEASURING: CurrentOperation.MEASURING,
+    OperationKind.GATHERING: CurrentOperation.MEASURING,
+    OperationKind.RAMPING: CurrentOperation.MEASURING,
+    OperationKind.STOPPED: CurrentOperation.HOLD,
 }
 """What it does while one of these runs; the others change nothing of it."""
 
@@ -159,15 +163,15 @@ OCCUPIES: dict[Activity, Occupation] = {
 class Operating:
     """What the service is in and does, and why."""
 
-    operation: Operation
-    occupation: Occupation
+    service_state: ServiceState
+    current_operation: CurrentOperation
     because: str
     """In a sentence."""
 
     @property
     def words(self) -> str:
         """Both as one."""
-        return f"{self.operation}, {self.occupation}"
+        return f"{self.service_state}, {self.current_operation}"
 
 
 def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
@@ -182,34 +186,34 @@ def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
     now_ns
         The service's clock, nanoseconds.
     """
-    occupation, doing = _occupation(state, now_ns)
-    operation, because = Operation.OPERATIONAL, doing
+    occupation, doing = _current_operation(state, now_ns)
+    operation, because = ServiceState.OPERATIONAL, doing
     critical, serious = (_first(state, grade) for grade in (Severity.CRITICAL, Severity.SERIOUS))
     if critical is not None:
-        operation, because = Operation.ERROR, critical.text
+        operation, because = ServiceState.ERROR, critical.text
     elif hindered:
-        operation, because = Operation.NOT_READY, hindered
+        operation, because = ServiceState.NOT_READY, hindered
     elif serious is not None:
-        operation, because = Operation.DEGRADED, serious.text
+        operation, because = ServiceState.DEGRADED, serious.text
     elif state.stopped_because:
-        operation = Operation.READY
-    elif occupation in {Occupation.IDLE, Occupation.HOLD, Occupation.TRACKING}:
+        operation = ServiceState.READY
+    elif occupation in {CurrentOperation.IDLE, CurrentOperation.HOLD, CurrentOperation.TRACKING}:
         idle = _why_nothing_to_do(state)
-        operation, because = (Operation.READY, idle) if idle else (operation, because)
-    return Operating(operation=operation, occupation=occupation, because=because)
+        operation, because = (ServiceState.READY, idle) if idle else (operation, because)
+    return Operating(service_state=operation, current_operation=occupation, because=because)
 
 
-def _occupation(state: TrackerState, now_ns: int) -> tuple[Occupation, str]:
+def _current_operation(state: TrackerState, now_ns: int) -> tuple[CurrentOperation, str]:
     for running in under_way(state, now_ns):
-        if running.activity in OCCUPIES:
-            return OCCUPIES[running.activity], running.text
+        if running.kind in OPERATION_OF:
+            return OPERATION_OF[running.kind], running.text
     if state.mode is Mode.HOLD:
-        return Occupation.HOLD, "mode is hold: nothing is made or sent unless asked for"
+        return CurrentOperation.HOLD, "mode is hold: nothing is made or sent unless asked for"
     if _why_nothing_to_do(state):
-        return Occupation.IDLE, "there is no closed loop"
+        return CurrentOperation.IDLE, "there is no closed loop"
     if state.registration is None:
-        return Occupation.IDLE, "α is not known yet: no window has been accepted"
-    return Occupation.TRACKING, "α is known and the loop is closed"
+        return CurrentOperation.IDLE, "α is not known yet: no window has been accepted"
+    return CurrentOperation.TRACKING, "α is known and the loop is closed"
 
 
 def _why_nothing_to_do(state: TrackerState) -> str:
@@ -220,4 +224,4 @@ def _why_nothing_to_do(state: TrackerState) -> str:
 
 
 def _first(state: TrackerState, severity: Severity) -> Alarm | None:
-    return next((alarm for alarm in state.alarms if alarm.kind.severity is severity), None)
+    return next((alarm for alarm in state.alarms if alarm.definition.severity is severity), None)

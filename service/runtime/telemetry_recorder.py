@@ -15,7 +15,7 @@ from annotated_types import Ge, Le, MaxLen, MinLen
 
 from service.archive import Archive, AuditEntry
 from service.archive.recordings import RUNNING, STORED, RecordingRecord
-from service.archive.retention import GIGABYTE, Keeping, low_on_space
+from service.archive.retention import GIGABYTE, RetentionPolicy, low_on_space
 from service.errors import (
     CommandError,
     ConfigurationError,
@@ -57,7 +57,7 @@ class AnnotationChoice(Instruction):
     """Of what time it is, nanoseconds since the Unix epoch; None: of now."""
 
 
-class TelemetryKeeper:
+class TelemetryRecorder:
     """Writes one recording at a time; belongs to the event loop, the disk is waited for in threads.
 
     Parameters
@@ -79,13 +79,13 @@ class TelemetryKeeper:
         self,
         *,
         archive: Archive,
-        keeping: Keeping,
+        retention: RetentionPolicy,
         system: str,
         tap: Callable[[RecordingWriter | None, float], float],
         audit: Callable[[AuditEntry], None],
     ) -> None:
         self._archive = archive
-        self._keeping = keeping
+        self._retention = retention
         self._system = system
         self._tap = tap
         self._audit = audit
@@ -246,7 +246,7 @@ class TelemetryKeeper:
     def _full(self) -> str | None:
         """Return what to tell of a disk with little room, None where there is enough."""
         try:
-            return low_on_space(self._archive.directory, self._keeping, low=False)
+            return low_on_space(self._archive.directory, self._retention, low=False)
         except OSError as error:
             return str(error)
 

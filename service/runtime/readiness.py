@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from service.link.intake import SPARED
-from service.link.statistics import MALFORMED, RECENT_S, USED, Fate, LinkStatistics
+from service.link.intake import COALESCED
+from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, LinkStatistics
 from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.activity import operating
-from service.tracking.alarms import Act, Alarm, Party, Waiting, forbids
+from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
+from service.tracking.running_operations import operating
 from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
-from service.tracking.worth import PROPOSAL_STANDS_S, outdated
+from service.tracking.update_policy import PROPOSAL_STANDS_S, outdated
 from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0
@@ -38,7 +38,7 @@ FAULT_S: Final = 10.0
 UNUSED_SHARE: Final = 0.1
 """Of the frames that come: more of them lost to their own faults are an alarm."""
 
-MOST_STATUSES_HZ: Final = 25.0
+MAX_STATUSES_HZ: Final = 25.0
 """More than twice what the contract allows is a flood."""
 
 OVER_NS: Final = 3 * SECOND_NS
@@ -50,10 +50,10 @@ FAULTS: Final = ("leap", "sequence", "shape", MALFORMED)
 NAMED_ELSEWHERE: Final = ("basis", "config")
 """What becomes of frames under an alarm of its own."""
 
-TOLD_AFTER_NS: Final = 2 * SECOND_NS
+LOG_AFTER_NS: Final = 2 * SECOND_NS
 """What is waited for no longer than this need not be put on record."""
 
-TOLD_EVERY_NS: Final = 60 * SECOND_NS
+LOG_EVERY_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
 
 LOST_S: Final = 5.0
@@ -89,7 +89,7 @@ def complaints(link: LinkStatistics) -> dict[str, str]:
 
 def _unused(link: LinkStatistics) -> str:
     """Return which frames come and are not used, and why; empty: all is well."""
-    frames = [fate for fate in link.fates if fate.kind == "frames"]
+    frames = [disposition for disposition in link.dispositions if disposition.kind == "frames"]
     came, used = sum(f.n for f in frames), sum(f.n for f in frames if f.outcome == USED)
     lost = [f for f in frames if f.outcome not in NAMED_ELSEWHERE and _is_lost(f, link, used)]
     faults = [f for f in lost if f.outcome in FAULTS and f.age_s < FAULT_S]
@@ -106,9 +106,9 @@ def _unused(link: LinkStatistics) -> str:
     )
 
 
-def _is_lost(fate: Fate, link: LinkStatistics, used: int) -> bool:
+def _is_lost(disposition: Disposition, link: LinkStatistics, used: int) -> bool:
     """Return whether frames that met this fate are missed."""
-    match fate.outcome:
+    match disposition.outcome:
         case "used":
             return False
         case "duplicate":
@@ -121,7 +121,7 @@ def _is_lost(fate: Fate, link: LinkStatistics, used: int) -> bool:
 
 def _refused(link: LinkStatistics) -> str:
     """Return which messages besides frames broke the contract; empty: none of late."""
-    bad = [f for f in link.fates if f.outcome == MALFORMED and f.kind != "frames"]
+    bad = [f for f in link.dispositions if f.outcome == MALFORMED and f.kind != "frames"]
     bad = [f for f in bad if f.age_s < FAULT_S]
     if not bad:
         return ""
@@ -131,10 +131,10 @@ def _refused(link: LinkStatistics) -> str:
 
 
 def _flood(link: LinkStatistics) -> str:
-    rate_hz = sum(f.n for f in link.fates if f.kind == "status") / RECENT_S
-    if rate_hz <= MOST_STATUSES_HZ:
+    rate_hz = sum(f.n for f in link.dispositions if f.kind == "status") / RECENT_S
+    if rate_hz <= MAX_STATUSES_HZ:
         return ""
-    spared = any(f.outcome == SPARED and f.n for f in link.fates)
+    spared = any(f.outcome == COALESCED and f.n for f in link.dispositions)
     taken = "the latest is taken twice a second" if spared else "each says something else"
     return (
         f"the RTC floods the service with statuses: {rate_hz:.0f} a second, 1 to 10 are expected; "
@@ -188,7 +188,7 @@ class Losses:
         )
 
 
-def news_of_link(
+def detect_link_changes(
     link: LinkStatistics, state: TrackerState, now_ns: int, also: Mapping[str, str] = NOTHING_ELSE
 ) -> list[ev.Event]:
     """Return which complaints are made, again or anew, and which are over.
@@ -202,15 +202,15 @@ def news_of_link(
     for name, text in made.items():
         before = raised.get(name)
         same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
-        found.append(ev.Trouble(name=name, text=before.text if before and same else text))
+        found.append(ev.ConditionChanged(name=name, text=before.text if before and same else text))
     for name, alarm in raised.items():
         if name not in made and now_ns - alarm.seen_ns_utc > OVER_NS:
-            found.append(ev.Trouble(name=name, text="over", over=True))
+            found.append(ev.ConditionChanged(name=name, text="over", over=True))
     return list(found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Facts:
+class ReadinessInputs:
     """All that what the service waits for is derived from."""
 
     state: TrackerState
@@ -218,13 +218,13 @@ class Facts:
     preparing: bool
     """The worker prepares the optical model."""
 
-    worker_trouble: str = ""
+    worker_problem: str = ""
     """What is wrong with the worker; empty: nothing."""
 
     @property
     def frames_come(self) -> bool:
         """Whether frames, used or not, came of late."""
-        return any(f.kind == "frames" and f.age_s < 1.0 for f in self.link.fates)
+        return any(f.kind == "frames" and f.age_s < 1.0 for f in self.link.dispositions)
 
     @property
     def status_silent_s(self) -> float:
@@ -233,88 +233,94 @@ class Facts:
         return self.link.session_age_s if age_s is None else age_s
 
 
-def waiting_for(facts: Facts) -> tuple[Waiting, ...]:
+def waiting_for(inputs: ReadinessInputs) -> tuple[Prerequisite, ...]:
     """Return whom the service waits for and what they should do, what hinders most first."""
-    found = [waiting for look in _LOOKS for waiting in look(facts)]
-    return tuple(sorted(found, key=lambda waiting: not waiting.hinders))
+    found = [waiting for look in _LOOKS for waiting in look(inputs)]
+    return tuple(sorted(found, key=lambda waiting: not waiting.blocks))
 
 
-def _for_the_worker(facts: Facts) -> Iterator[Waiting]:
-    if facts.preparing:
+def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    if inputs.preparing:
         text = "the optical model is being prepared: wait"
-        yield Waiting(name="model", party=Party.WORKER, text=text, hinders=True)
-    if facts.worker_trouble:
-        text = f"{facts.worker_trouble}: until it, or another, has done a job"
-        yield Waiting(name=alarms.WORKER_LOST, party=Party.WORKER, text=text, hinders=True)
-    if facts.state.making_since_ns_utc is not None:
+        yield Prerequisite(name="model", responsible=Responsible.WORKER, text=text, blocks=True)
+    if inputs.worker_problem:
+        text = f"{inputs.worker_problem}: until it, or another, has done a job"
+        yield Prerequisite(
+            name=alarms.WORKER_LOST, responsible=Responsible.WORKER, text=text, blocks=True
+        )
+    if inputs.state.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
-        yield Waiting(name="matrix", party=Party.WORKER, text=text)
+        yield Prerequisite(name="matrix", responsible=Responsible.WORKER, text=text)
 
 
-def _for_messages(facts: Facts) -> Iterator[Waiting]:
+def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield what of the RTC's telemetry does not come."""
-    link, where, rtc = facts.link, f"ao/v1/{facts.state.system}", facts.state.rtc
+    link, where, rtc = inputs.link, f"ao/v1/{inputs.state.system}", inputs.state.rtc
     if rtc is not None and rtc.trouble and link.rtc_alive:
-        yield Waiting(name="rtc-trouble", party=Party.RTC, text=rtc.trouble, hinders=True)
-    no_status = facts.status_silent_s >= SILENT_S
-    if facts.frames_come:
+        yield Prerequisite(
+            name="rtc-trouble", responsible=Responsible.RTC, text=rtc.trouble, blocks=True
+        )
+    no_status = inputs.status_silent_s >= SILENT_S
+    if inputs.frames_come:
         if no_status:
             text = (
                 f"frames come, and no status that could be used for {SILENT_S:.0f} s: send one on "
                 f"{where}/tel/status 1 to 10 times a second"
             )
-            yield Waiting(name="status", party=Party.RTC, text=text, hinders=True)
+            yield Prerequisite(name="status", responsible=Responsible.RTC, text=text, blocks=True)
     elif not link.rtc_alive:
         text = f"no RTC is there: start it, as a zenoh client of this service, system {where}"
-        yield Waiting(name="rtc", party=Party.RTC, text=text)
+        yield Prerequisite(name="rtc", responsible=Responsible.RTC, text=text)
     elif link.session is None or no_status:
         text = (
             f"its token is there, and nothing comes: send {where}/tel/frames and tel/status (after "
             f"{REVIVED_AFTER_S:.0f} s the link is opened anew: a connection may be left over)"
         )
-        yield Waiting(name="telemetry", party=Party.RTC, text=text)
+        yield Prerequisite(name="telemetry", responsible=Responsible.RTC, text=text)
     elif link.frame_age_s is None or link.frame_age_s >= SILENT_S:
         text = f"it sends statuses and no frames: send them on {where}/tel/frames"
-        yield Waiting(name="frames", party=Party.RTC, text=text)
-    if link.session_waiting is not None and facts.frames_come:
+        yield Prerequisite(name="frames", responsible=Responsible.RTC, text=text)
+    if link.session_waiting is not None and inputs.frames_come:
         text = (
             f"session {link.session_waiting} is taken for the RTC's once {link.session} has been "
             "silent for 2 s"
         )
-        yield Waiting(name="session", party=Party.RTC, text=text)
+        yield Prerequisite(name="session", responsible=Responsible.RTC, text=text)
 
 
-def _for_frames(facts: Facts) -> Iterator[Waiting]:
-    text, fates = _unused(facts.link), facts.link.fates
+def _for_frames(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    text, fates = _unused(inputs.link), inputs.link.dispositions
     if text and not any(f.n for f in fates if f.kind == "frames" and f.outcome == USED):
-        yield Waiting(name=alarms.FRAMES_UNUSED, party=Party.RTC, text=text, hinders=True)
+        yield Prerequisite(
+            name=alarms.FRAMES_UNUSED, responsible=Responsible.RTC, text=text, blocks=True
+        )
 
 
-def _for_the_matrix(facts: Facts) -> Iterator[Waiting]:
+def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield what must be known of the reconstructor in use, or sent."""
-    state, rtc = facts.state, facts.state.rtc
+    state, rtc = inputs.state, inputs.state.rtc
     if rtc is not None and rtc.cm_id is None:
         text = (
             "its status names no reconstructor (cm_id is nil): the loop is not judged until it "
-            f"does; rtc/cm/applied is asked meanwhile{_told(state)}"
+            f"does; rtc/cm/applied is asked meanwhile{_describe_rtc(state)}"
         )
-        yield Waiting(name="matrix-name", party=Party.RTC, text=text)
+        yield Prerequisite(name="matrix-name", responsible=Responsible.RTC, text=text)
     elif rtc is not None and (
         why_unread(state, rtc.cm_id) or (rtc.cm_id and state.reconstructor(rtc.cm_id) is None)
     ):
-        text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_told(state)}"
-        yield Waiting(name="matrix-in-use", party=Party.RTC, text=text)
+        text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
+        yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
     no_return = why_no_return(state)
     for record in state.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
-            yield Waiting(name="acknowledgement", party=Party.RTC, text=text)
+            yield Prerequisite(name="acknowledgement", responsible=Responsible.RTC, text=text)
         elif record.state is MatrixState.PROPOSED and (state.mode is not Mode.AUTO or no_return):
             text = f"reconstructor {record.id} is proposed: approve or reject it"
             more = [no_return or "", _replaced(state, record)]
-            yield Waiting(
+            yield Prerequisite(
                 name="approval",
-                party=Party.OPERATOR,
+                responsible=Responsible.OPERATOR,
                 text="; ".join((text, *filter(None, more))),
             )
 
@@ -328,23 +334,27 @@ def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
     return f"α has moved on since: a newer one follows after {then:%H:%M:%S} UTC"
 
 
-def _told(state: TrackerState) -> str:
-    return f" (last: {state.unfetched})" if state.unfetched else ""
+def _describe_rtc(state: TrackerState) -> str:
+    return f" (last: {state.read_back_error})" if state.read_back_error else ""
 
 
-def _for_alarms(facts: Facts) -> Iterator[Waiting]:
+def _for_alarms(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield the alarms that keep the service from its job: their texts say what to do."""
-    for alarm in facts.state.alarms:
-        acts = [act for act in (Act.ASK, Act.DECIDE, Act.MEASURE) if forbids(alarm, act)]
-        party = alarm.kind.party
+    for alarm in inputs.state.alarms:
+        acts = [
+            interlock
+            for interlock in (Interlock.ASK, Interlock.DECIDE, Interlock.MEASURE)
+            if alarm_blocks(alarm, interlock)
+        ]
+        party = alarm.definition.responsible
         if acts or party is not None:
-            party = party or Party.OPERATOR
-            hinders = Act.ASK in acts
-            yield Waiting(name=alarm.name, party=party, text=alarm.text, hinders=hinders)
+            party = party or Responsible.OPERATOR
+            hinders = Interlock.ASK in acts
+            yield Prerequisite(name=alarm.name, responsible=party, text=alarm.text, blocks=hinders)
 
 
-def _for_the_operator(facts: Facts) -> Iterator[Waiting]:
-    state, rtc = facts.state, facts.state.rtc
+def _for_the_operator(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    state, rtc = inputs.state, inputs.state.rtc
     orders = {
         "mode": (state.mode is Mode.HOLD, "mode is hold, nothing is made: set another when it may"),
         "dither-stopped": (
@@ -358,26 +368,29 @@ def _for_the_operator(facts: Facts) -> Iterator[Waiting]:
     }
     for name, (is_so, text) in orders.items():
         if is_so:
-            yield Waiting(name=name, party=Party.OPERATOR, text=text)
+            yield Prerequisite(name=name, responsible=Responsible.OPERATOR, text=text)
     if rtc is not None and state.dither is not None and state.registration is None:
         text = f"{state.dither.id}: the first window of telemetry that holds it"
-        yield Waiting(name="window", party=Party.RTC, text=text)
+        yield Prerequisite(name="window", responsible=Responsible.RTC, text=text)
 
 
-def _for_measurements(facts: Facts) -> Iterator[Waiting]:
-    state = facts.state
+def _for_measurements(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
+    state = inputs.state
     if state.measuring is not None:
         text = f"interaction matrix {state.measuring.id} is being measured: wait, or give it up"
-        yield Waiting(name="measurement", party=Party.RTC, text=text)
-    if state.gathering is not None:
-        text = f"noisy interaction matrix {state.gathering.id} is gathered: wait, or give it up"
-        yield Waiting(name="noisy-matrix", party=Party.RTC, text=text)
+        yield Prerequisite(name="measurement", responsible=Responsible.RTC, text=text)
+    if state.noisy_measurement is not None:
+        text = (
+            f"noisy interaction matrix {state.noisy_measurement.id} is gathered: wait, or "
+            f"give it up"
+        )
+        yield Prerequisite(name="noisy-matrix", responsible=Responsible.RTC, text=text)
     if state.acquisition.under_way:
         text = f"an acquisition is under way: {state.acquisition.text}"
-        yield Waiting(name="acquiring", party=Party.RTC, text=text)
+        yield Prerequisite(name="acquiring", responsible=Responsible.RTC, text=text)
 
 
-_LOOKS: Final[tuple[Callable[[Facts], Iterator[Waiting]], ...]] = (
+_LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] = (
     _for_the_worker,
     _for_messages,
     _for_frames,
@@ -404,7 +417,7 @@ class Revival:
 
     def due(self, link: LinkStatistics, now_s: float) -> bool:
         """Return whether it is time; each time in vain, it is twice as long to the next."""
-        heard = any(fate.age_s < SILENT_S for fate in link.fates)
+        heard = any(disposition.age_s < SILENT_S for disposition in link.dispositions)
         if heard:
             self._wait_s = REVIVED_AFTER_S
         if heard or not link.rtc_alive:
@@ -418,46 +431,46 @@ class Revival:
         return True
 
 
-class Told:
+class ReadinessLog:
     """Which waits are on record: each once it has lasted, and no more often than now and then."""
 
-    __slots__ = ("_since_ns", "_told_ns")
+    __slots__ = ("_logged_ns", "_since_ns")
 
     def __init__(self) -> None:
         self._since_ns: dict[str, int] = {}
-        self._told_ns: dict[str, int] = {}
+        self._logged_ns: dict[str, int] = {}
 
-    def news(
-        self, waiting: tuple[Waiting, ...], alarms: tuple[Alarm, ...], now_ns: int
+    def due_lines(
+        self, waiting: tuple[Prerequisite, ...], alarms: tuple[Alarm, ...], now_ns: int
     ) -> list[str]:
         """Return what is to be put on record now; alarms are by themselves."""
         self._since_ns = {w.name: self._since_ns.get(w.name, now_ns) for w in waiting}
         named = {alarm.name for alarm in alarms}
         due = [wait for wait in waiting if wait.name not in named and self._due(wait.name, now_ns)]
-        self._told_ns |= {wait.name: now_ns for wait in due}
-        return [f"{wait.party}: {wait.text}" for wait in due]
+        self._logged_ns |= {wait.name: now_ns for wait in due}
+        return [f"{wait.responsible}: {wait.text}" for wait in due]
 
     def _due(self, name: str, now_ns: int) -> bool:
-        since_ns, told_ns = self._since_ns[name], self._told_ns.get(name)
-        if now_ns - since_ns < TOLD_AFTER_NS:
+        since_ns, told_ns = self._since_ns[name], self._logged_ns.get(name)
+        if now_ns - since_ns < LOG_AFTER_NS:
             return False
-        return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= TOLD_EVERY_NS)
+        return told_ns is None or (told_ns < since_ns and now_ns - told_ns >= LOG_EVERY_NS)
 
 
 def state_message(
-    state: TrackerState, now_ns: int, waiting: tuple[Waiting, ...] = ()
+    state: TrackerState, now_ns: int, waiting: tuple[Prerequisite, ...] = ()
 ) -> StateMessage:
     """Return the short account of the state for whoever listens on the network."""
-    known = state.registration
-    hindered = "; ".join(wait.text for wait in waiting if wait.hinders)
+    registration = state.registration
+    hindered = "; ".join(wait.text for wait in waiting if wait.blocks)
     return StateMessage(
         system=state.system,
         t_ns=now_ns,
         mode=state.mode.value,
-        alpha=None if known is None else known.alpha.to_boundary(),
-        sigma=None if known is None else at_boundary(known.sigma),
+        alpha=None if registration is None else registration.alpha.to_boundary(),
+        sigma=None if registration is None else at_boundary(registration.sigma),
         in_use=state.in_use,
-        validity=None if known is None else known.standing.validity.value,
-        waiting_for=tuple(f"{w.party}: {w.text}"[:TEXT_LIMIT] for w in waiting),
+        validity=None if registration is None else registration.validity.level.value,
+        waiting_for=tuple(f"{w.responsible}: {w.text}"[:TEXT_LIMIT] for w in waiting),
         operation=operating(state, hindered, now_ns).words,
     )

@@ -17,7 +17,7 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
-from service.tracking.turn import Turn
+from service.tracking.step_context import StepContext
 from service.wire import Status
 
 MIN_WINDOWS = 2
@@ -44,38 +44,40 @@ VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A verdict of the gate is not for a registration further away than this (numeric units)."""
 
 
-def settled(known: Registration) -> bool:
+def settled(registration: Registration) -> bool:
     """Return whether α may be believed: windows agree, and none of them hints at a jump."""
-    sure = known.candidate is None and not known.doubt
-    return known.n_windows >= MIN_WINDOWS and sure and known.usable
+    sure = registration.suspected_jump is None and not registration.doubt
+    return registration.n_windows >= MIN_WINDOWS and sure and registration.usable
 
 
-def why_stale(state: TrackerState, judged: Judged | None, gains: tuple[float, ...]) -> str | None:
+def verdict_invalid_reason(
+    state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
+) -> str | None:
     """Return why a verdict says nothing of a loop with these gains now; None: it does.
 
     It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now, but
     for a small ``REACH``: σ grows between two windows, and another verdict takes as long.
     """
-    known = state.registration
-    if known is None or judged is None:
-        return None if known is None else why_of_another_loop(state, judged, gains)
-    moved = np.abs(known.alpha.vector - judged.alpha.vector)
-    if np.any(moved + 3.0 * known.sigma > 3.0 * judged.sigma + REACH):
+    registration = state.registration
+    if registration is None or judged is None:
+        return None if registration is None else why_of_another_loop(state, judged, gains)
+    moved = np.abs(registration.alpha.vector - judged.alpha.vector)
+    if np.any(moved + 3.0 * registration.sigma > 3.0 * judged.sigma + REACH):
         return "α ± 3σ reaches further than it was judged for"
     return why_of_another_loop(state, judged, gains)
 
 
-def why_worthless(
+def verdict_doubtful_reason(
     state: TrackerState, judged: Judged | None, gains: tuple[float, ...]
 ) -> str | None:
     """Return the same where it need not be sent: while α is in doubt no verdict is of where it is.
 
     A reconstructor that somebody wants back is sent all the same.
     """
-    known = state.registration
-    if known is not None and known.doubt:
-        return known.doubt
-    return why_stale(state, judged, gains)
+    registration = state.registration
+    if registration is not None and registration.doubt:
+        return registration.doubt
+    return verdict_invalid_reason(state, judged, gains)
 
 
 def why_of_another_loop(
@@ -100,53 +102,60 @@ def why_of_another_loop(
     return None if same else "the gains have changed"
 
 
-def why_worthwhile(
+def update_reason(
     state: TrackerState, in_use: ReconstructorRecord, policy: Policy, now_ns: int
 ) -> str | None:
     """Return why the reconstructor in use should be replaced now, or None."""
-    known = state.registration
-    if known is None:
+    registration = state.registration
+    if registration is None:
         return None
     if in_use.alpha is None:
         return f"{in_use.id} was not made for a known registration"
     if state.margin is not None and not state.margin.accepted:
         return f"{in_use.id}: {state.margin.reason}"
     if moved(state, in_use, policy):
-        step = known.alpha.vector - in_use.alpha.vector
+        step = registration.alpha.vector - in_use.alpha.vector
         return f"moved by {step_text(step)} since {in_use.id}"
-    if _jumped(state, in_use, known):
+    if _jumped(state, in_use, registration):
         return f"{in_use.id} was made before the mirror jumped"
     last = state.assessment
     if last is None or last.id != in_use.id:
         return None
-    return _why_gaining(last, in_use, known, policy, now_ns)
+    return _gain_reason(last, in_use, registration, policy, now_ns)
 
 
-def look_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
+def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
     """Return whether the last look at the matrix in use says nothing of now.
 
-    Its verdict holds as long as :func:`why_stale` says. What a new one would win counts only where
-    α is known to be elsewhere than where the one in use was made for: there every move counts.
+    Its verdict holds as long as :func:`verdict_invalid_reason` says. What a new one would win
+    counts only where α is known to be elsewhere than where the one in use was made for: there every
+    move counts.
     """
-    known, last = state.registration, state.assessment
+    registration, last = state.registration, state.assessment
     gains = () if state.rtc is None else state.rtc.gains[: in_use.n_modes]
-    if why_stale(state, in_use.judged, gains) is not None:
+    if verdict_invalid_reason(state, in_use.judged, gains) is not None:
         return True
-    if known is None or last is None or _step_since(in_use, known.alpha, known) is None:
+    if (
+        registration is None
+        or last is None
+        or _step_since(in_use, registration.alpha, registration) is None
+    ):
         return False
-    noise = np.sqrt(np.diag(known.covariance))
-    return bool(np.any(np.abs(known.alpha.vector - last.alpha.vector) > np.maximum(NOTICED, noise)))
+    noise = np.sqrt(np.diag(registration.covariance))
+    return bool(
+        np.any(np.abs(registration.alpha.vector - last.alpha.vector) > np.maximum(NOTICED, noise))
+    )
 
 
-def _why_gaining(
+def _gain_reason(
     last: Assessment,
     in_use: ReconstructorRecord,
-    known: Registration,
+    registration: Registration,
     policy: Policy,
     now_ns: int,
 ) -> str | None:
     """Return what a new one would win, where that is more than the threshold of now."""
-    since = _step_since(in_use, last.alpha, known)
+    since = _step_since(in_use, last.alpha, registration)
     if since is None:
         return None
     step, covariance = since
@@ -176,7 +185,7 @@ def _raised(in_use: ReconstructorRecord, now_ns: int) -> float:
 
 
 def _step_since(
-    in_use: ReconstructorRecord, alpha: Misregistration, known: Registration
+    in_use: ReconstructorRecord, alpha: Misregistration, registration: Registration
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return the step from what a matrix was made for to ``alpha``, and its covariance.
 
@@ -186,8 +195,8 @@ def _step_since(
     if in_use.alpha is None or in_use.sigma is None:
         return None
     step = alpha.vector - in_use.alpha.vector
-    then = np.maximum(in_use.sigma**2 - known.floor**2, 0.0)
-    covariance = known.covariance + np.diag(then)
+    then = np.maximum(in_use.sigma**2 - registration.floor**2, 0.0)
+    covariance = registration.covariance + np.diag(then)
     far = step @ np.linalg.solve(covariance, step) >= SIGNIFICANT
     return (step, covariance) if far else None
 
@@ -200,19 +209,24 @@ def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> b
     return _apart(state, record, policy.update_threshold)
 
 
-def _jumped(state: TrackerState, in_use: ReconstructorRecord, known: Registration) -> bool:
+def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Registration) -> bool:
     """Return whether the mirror has jumped since, further than the gate's verdict reaches.
 
     What a new one wins does not matter: what has jumped once may jump again.
     """
-    since = known.jumped_ns_utc is not None and known.jumped_ns_utc > in_use.created_ns_utc
+    since = (
+        registration.jumped_ns_utc is not None
+        and registration.jumped_ns_utc > in_use.created_ns_utc
+    )
     return since and outdated(state, in_use)
 
 
 def left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
     """Return whether α has gone so far from this reconstructor that nobody may want it now."""
-    known = state.registration
-    return known is not None and (moved(state, record, policy) or _jumped(state, record, known))
+    registration = state.registration
+    return registration is not None and (
+        moved(state, record, policy) or _jumped(state, record, registration)
+    )
 
 
 def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
@@ -223,13 +237,13 @@ def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
 def _apart(
     state: TrackerState, record: ReconstructorRecord, threshold: NDArray[np.float64]
 ) -> bool:
-    known = state.registration
-    if known is None:
+    registration = state.registration
+    if registration is None:
         return False
     if record.alpha is None or record.sigma is None:
         return True
-    distance = np.abs(known.alpha.vector - record.alpha.vector)
-    noise = np.sqrt(np.diag(known.covariance))
+    distance = np.abs(registration.alpha.vector - record.alpha.vector)
+    noise = np.sqrt(np.diag(registration.covariance))
     return bool(np.any(distance > np.maximum(threshold, 3.0 * noise)))
 
 
@@ -290,46 +304,48 @@ def _comfortable(state: TrackerState) -> bool:
     return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
 
 
-def note_limit(turn: Turn, record: ReconstructorRecord, asked: int, why_fewer: str) -> None:
+def note_limit(
+    context: StepContext, record: ReconstructorRecord, asked: int, why_fewer: str
+) -> None:
     """Note what a reconstructor asked to have ``asked`` modes says of how many are possible."""
-    n_now = turn.rtc.n_controlled if turn.rtc is not None else record.n_modes
+    n_now = context.rtc.n_controlled if context.rtc is not None else record.n_modes
     if record.state is MatrixState.REFUSED:
         if asked > n_now:
             reason = record.gate.reason if record.gate is not None else record.reason
-            limit_modes(turn, n_now, reason)
+            limit_modes(context, n_now, reason)
         return
     if record.n_modes < asked:
-        limit_modes(turn, record.n_modes, why_fewer)
+        limit_modes(context, record.n_modes, why_fewer)
     text = f"{record.id} has {record.n_modes} modes, {n_now} are controlled"
     if record.n_modes < n_now:
-        turn.warn("modes.lowered", f"{text}: {why_fewer}")
+        context.warn("modes.lowered", f"{text}: {why_fewer}")
         return
     if record.n_modes > n_now:
-        turn.log("modes.raised", text)
-    limit = turn.state.mode_limit
+        context.log("modes.raised", text)
+    limit = context.state.mode_limit
     if limit is not None and record.n_modes > limit.n_modes:
         # kept: a limit found again soon must be waited out longer
-        turn.state = replace(turn.state, mode_limit=replace(limit, n_modes=record.n_modes))
+        context.state = replace(context.state, mode_limit=replace(limit, n_modes=record.n_modes))
 
 
-def note_declined(turn: Turn) -> None:
+def note_declined(context: StepContext) -> None:
     """Note that a reconstructor which had passed the gate was declined before it came into use.
 
     If it has more modes than are controlled, that is what it was made for: no more are tried for a
     while, longer each time. An acquisition counts its own failures.
     """
-    before, records = turn.before, turn.state.reconstructors
-    if records is before.reconstructors or turn.acquisition.under_way:
+    before, records = context.before, context.state.reconstructors
+    if records is before.reconstructors or context.acquisition.under_way:
         return
-    rtc = turn.rtc or before.rtc
+    rtc = context.rtc or before.rtc
     if rtc is None or rtc.n_controlled == 0:
         return
     earlier = {record.id: record.state for record in before.reconstructors}
     for record in records:
-        wait_s = _wait_after(record, earlier.get(record.id), turn.event)
+        wait_s = _wait_after(record, earlier.get(record.id), context.event)
         if wait_s is not None and record.n_modes > rtc.n_controlled:
             reason = f"{record.id} was {record.state}: {record.reason}"
-            limit_modes(turn, rtc.n_controlled, reason, wait_s)
+            limit_modes(context, rtc.n_controlled, reason, wait_s)
 
 
 def _wait_after(
@@ -345,9 +361,11 @@ def _wait_after(
     return None
 
 
-def limit_modes(turn: Turn, n_modes: int, reason: str, first_wait_s: float = FIRST_WAIT_S) -> None:
+def limit_modes(
+    context: StepContext, n_modes: int, reason: str, first_wait_s: float = FIRST_WAIT_S
+) -> None:
     """Try no more than these for a while, longer each time that it is found again."""
-    before, wait_s, now_ns = turn.state.mode_limit, first_wait_s, turn.now_ns
+    before, wait_s, now_ns = context.state.mode_limit, first_wait_s, context.now_ns
     if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS
         wait_s = max(first_wait_s, min(2.0 * before.wait_s, LONGEST_WAIT_S), left_s)
@@ -358,5 +376,5 @@ def limit_modes(turn: Turn, n_modes: int, reason: str, first_wait_s: float = FIR
         wait_s=wait_s,
         reason=reason,
     )
-    turn.state = replace(turn.state, mode_limit=limit)
-    turn.log("modes.limited", f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}")
+    context.state = replace(context.state, mode_limit=limit)
+    context.log("modes.limited", f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}")

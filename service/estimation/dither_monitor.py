@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.comb import cosines_and_sines
+from service.estimation.demodulation import cosines_and_sines
 from service.estimation.frames import FrameBlock
 
 Array = NDArray[Any]
@@ -23,7 +23,7 @@ Array = NDArray[Any]
 CHECK_S = 1.0
 """Of frames that hold the dither, between two findings."""
 
-LEAST_FRAMES = 50
+MIN_FRAMES = 50
 
 LOUDER, WEAKER = 1.25, 0.5
 """Of what was asked for: a mode that is beyond is named."""
@@ -56,7 +56,7 @@ _nothing = partial(np.zeros, (), np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Asked:
+class ExpectedDither:
     """A dither as the service asked for it."""
 
     modes: tuple[int, ...]
@@ -81,7 +81,7 @@ class Asked:
     """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
 
     @property
-    def heard(self) -> list[int]:
+    def audible(self) -> list[int]:
         """Which of the modes asked for are looked for in the slopes."""
         if not self.frequency_hz or not self.response:
             return []
@@ -90,7 +90,7 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class DitherMeasurement:
     """What a second of frames holds of a dither."""
 
     found_m: float
@@ -105,10 +105,10 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Meter:
+class DitherMonitor:
     """Sums over the frames of a dither: feed it blocks with ``measured``."""
 
-    asked: Asked
+    asked: ExpectedDither
     n_frames: int = 0
     """Summed so far."""
 
@@ -139,84 +139,92 @@ class Meter:
     whether they answer."""
 
 
-def measured(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
+def measure_block(
+    monitor: DitherMonitor, block: FrameBlock
+) -> tuple[DitherMonitor, DitherMeasurement | None]:
     """Add a block of frames; return what was found if a second of them is full."""
-    asked, found = meter.asked, None
+    asked, found = monitor.asked, None
     start = max(asked.first_seq - block.first_seq, 0)
     stop = max(min(asked.stop_seq - block.first_seq, block.n_frames), 0)
     while start < stop:
-        end = min(start + _enough(asked) - meter.n_frames, stop)
-        meter, new = _added(meter, block.rows(start, end))
+        end = min(start + _enough(asked) - monitor.n_frames, stop)
+        monitor, new = _added(monitor, block.rows(start, end))
         start, found = end, new or found
-    return meter, found
+    return monitor, found
 
 
-def asked_anew(meter: Meter, asked: Asked) -> Meter:
+def with_expected(monitor: DitherMonitor, asked: ExpectedDither) -> DitherMonitor:
     """Return the meter of the same dither whose modes have come into the loop, or left it."""
-    return meter if asked.own == meter.asked.own else Meter(asked=asked)
+    return monitor if asked.own == monitor.asked.own else DitherMonitor(asked=asked)
 
 
-def _enough(asked: Asked) -> int:
-    return max(round(CHECK_S * asked.frame_rate_hz), LEAST_FRAMES)
+def _enough(asked: ExpectedDither) -> int:
+    return max(round(CHECK_S * asked.frame_rate_hz), MIN_FRAMES)
 
 
-def _added(meter: Meter, block: FrameBlock) -> tuple[Meter, Finding | None]:
+def _added(
+    monitor: DitherMonitor, block: FrameBlock
+) -> tuple[DitherMonitor, DitherMeasurement | None]:
     """Add frames that fill a second at most."""
-    asked, dither = meter.asked, block.dither_m
+    asked, dither = monitor.asked, block.dither_m
     if dither is None or not block.is_dithered:
-        return meter, None
+        return monitor, None
     squares = np.einsum("km,km->m", dither, dither).astype(float)
-    meter, lines = _demodulated(meter, block, dither[:, list(asked.modes)])
-    meter = _heard(meter, block.slopes, block.first_seq)
-    meter = replace(
-        meter,
-        n_frames=meter.n_frames + len(dither),
-        squares=meter.squares + squares,
-        lines=meter.lines + lines,
+    monitor, lines = _demodulated(monitor, block, dither[:, list(asked.modes)])
+    monitor = _add_slopes(monitor, block.slopes, block.first_seq)
+    monitor = replace(
+        monitor,
+        n_frames=monitor.n_frames + len(dither),
+        squares=monitor.squares + squares,
+        lines=monitor.lines + lines,
     )
-    if meter.n_frames < _enough(asked):
-        return meter, None
-    powers = _powers(meter)
+    if monitor.n_frames < _enough(asked):
+        return monitor, None
+    powers = _powers(monitor)
     unanswered = _unanswered(powers, asked)
-    found, doubted = _found(meter)
-    begun = Meter(asked=asked, last_m=meter.last_m, next_seq=meter.next_seq, doubted=doubted)
+    found, doubted = _found(monitor)
+    begun = DitherMonitor(
+        asked=asked, last_m=monitor.last_m, next_seq=monitor.next_seq, doubted=doubted
+    )
     if unanswered is None:
         begun = replace(begun, powers=powers)
     return begun, replace(found, unanswered=unanswered)
 
 
-def _demodulated(meter: Meter, block: FrameBlock, dither: Array) -> tuple[Meter, Array]:
+def _demodulated(
+    monitor: DitherMonitor, block: FrameBlock, dither: Array
+) -> tuple[DitherMonitor, Array]:
     """Return ``(2, n_asked)`` sums at the lines; random signs have none and are left out.
 
     Of the commands the steps from frame to frame: turbulence that is played on the mirror is slow.
     """
-    asked = meter.asked
+    asked = monitor.asked
     if not asked.frequency_hz:
-        return meter, np.zeros((2, len(asked.modes)), complex)
+        return monitor, np.zeros((2, len(asked.modes)), complex)
     commands = block.commands_m[:, list(asked.modes)].astype(float)
-    follows = meter.last_m is not None and meter.next_seq == block.first_seq
-    before = meter.last_m if follows else commands[0]
+    follows = monitor.last_m is not None and monitor.next_seq == block.first_seq
+    before = monitor.last_m if follows else commands[0]
     steps = np.diff(commands, axis=0, prepend=np.asarray(before)[None])
     seq = block.first_seq + np.arange(len(commands))
     phasors = np.exp(-2j * np.pi * np.outer(seq / asked.frame_rate_hz, asked.frequency_hz))
-    meter = replace(meter, last_m=commands[-1], next_seq=block.next_seq)
-    return meter, np.stack([(phasors * dither).sum(axis=0), (phasors * steps).sum(axis=0)])
+    monitor = replace(monitor, last_m=commands[-1], next_seq=block.next_seq)
+    return monitor, np.stack([(phasors * dither).sum(axis=0), (phasors * steps).sum(axis=0)])
 
 
-def _heard(meter: Meter, slopes: Array, first_seq: int) -> Meter:
+def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> DitherMonitor:
     """Add slopes to the sums on and beside the lines."""
-    asked = meter.asked
-    lines = np.array(asked.frequency_hz)[asked.heard]
+    asked = monitor.asked
+    lines = np.array(asked.frequency_hz)[asked.audible]
     if not len(lines):
-        return meter
+        return monitor
     bins_hz = (lines[:, None] + np.array([0, *SIDES_HZ])).ravel()
     seq = first_seq - asked.first_seq + np.arange(len(slopes))
     turns = np.outer(bins_hz / asked.frame_rate_hz, seq)
     summed = np.concatenate(cosines_and_sines(turns)) @ slopes
     return replace(
-        meter,
-        slopes=meter.slopes + summed,
-        n_repeated=meter.n_repeated + _repeated(slopes),
+        monitor,
+        slopes=monitor.slopes + summed,
+        n_repeated=monitor.n_repeated + _repeated(slopes),
     )
 
 
@@ -227,24 +235,24 @@ def _repeated(slopes: Array) -> int:
     return int(np.count_nonzero((slopes[again] == slopes[again - 1]).all(axis=1)))
 
 
-def _powers(meter: Meter) -> tuple[float, float, float]:
+def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
     """Return the power on the lines beyond the noise, its variance, and what is expected.
 
     What earlier seconds have told is in it, where that was too little for a verdict.
     """
-    asked, heard, before = meter.asked, meter.asked.heard, meter.powers
-    if not heard or meter.n_repeated > REPEATED * meter.n_frames:
+    asked, heard, before = monitor.asked, monitor.asked.audible, monitor.powers
+    if not heard or monitor.n_repeated > REPEATED * monitor.n_frames:
         return before
-    parts = np.einsum("ks,ks->k", meter.slopes, meter.slopes).astype(float)
+    parts = np.einsum("ks,ks->k", monitor.slopes, monitor.slopes).astype(float)
     power = parts.reshape(2, len(heard), -1).sum(axis=0)
     sides = power[:, 1:]
     beyond = np.sum(power[:, 0] - sides.mean(axis=1))
     variance = np.sum(sides.var(axis=1, ddof=1)) * (1.0 + 1.0 / sides.shape[1])
-    expected = np.sum(np.abs(meter.lines[0][heard]) ** 2 * np.array(asked.response)[heard])
+    expected = np.sum(np.abs(monitor.lines[0][heard]) ** 2 * np.array(asked.response)[heard])
     return before[0] + beyond, before[1] + variance, before[2] + expected
 
 
-def _unanswered(powers: tuple[float, float, float], asked: Asked) -> str | None:
+def _unanswered(powers: tuple[float, float, float], asked: ExpectedDither) -> str | None:
     """Return how the slopes do not answer the dither; empty: they do; None: nobody can tell."""
     beyond, variance, expected = powers
     if not expected:
@@ -254,26 +262,26 @@ def _unanswered(powers: tuple[float, float, float], asked: Asked) -> str | None:
         return ""
     if share + 3.0 * sigma > UNANSWERED:
         return None
-    modes = ", ".join(str(asked.modes[k]) for k in sorted(asked.heard))
+    modes = ", ".join(str(asked.modes[k]) for k in sorted(asked.audible))
     return (
         f"the slopes hold {100.0 * max(share, 0.0):.1f} ± {100.0 * sigma:.1f} % of the power that "
         f"modes {modes} should put on their lines"
     )
 
 
-def _found(meter: Meter) -> tuple[Finding, bool]:
+def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
     """Return what a second of frames holds, and whether the loop may have made it of its dither."""
-    asked = meter.asked
-    rms = np.sqrt(meter.squares / meter.n_frames)
+    asked = monitor.asked
+    rms = np.sqrt(monitor.squares / monitor.n_frames)
     wanted, modes = np.array(asked.amplitude_m), list(asked.modes)
-    told, moved = np.abs(meter.lines) * np.sqrt(2.0) / meter.n_frames
+    told, moved = np.abs(monitor.lines) * np.sqrt(2.0) / monitor.n_frames
     carried, own, doubted = rms[modes], np.array(asked.own), False
     if asked.frequency_hz:
         fraction = np.array(asked.frequency_hz) / asked.frame_rate_hz
         moved = moved / np.abs(2.0 * np.sin(np.pi * fraction))
         beyond = own & (moved > LOUDER * told)
         doubted = bool(np.any(beyond & (moved <= AMPLIFIED * told)))
-        if doubted and not meter.doubted:
+        if doubted and not monitor.doubted:
             own = own & (moved > AMPLIFIED * told)
         # a mode of the loop answers the dither: there its column alone tells how strong it is
         carried = np.maximum(carried, np.where(own, moved, 0.0))
@@ -282,16 +290,18 @@ def _found(meter: Meter) -> tuple[Finding, bool]:
     total = float(np.sqrt(np.sum(carried**2) + np.sum(stray**2)))
     wanted_total = float(np.sqrt(np.sum(wanted**2)))
     said = [
-        *_off(asked, carried, wanted, told),
+        *_outside_tolerance(asked, carried, wanted, told),
         *_strays(stray, wanted_total),
         *_hidden(asked, own, told, moved),
     ]
     head = f"the frames hold {1e9 * total:.3g} nm RMS of dither in all, {1e9 * wanted_total:.3g} nm"
     text = f"{head} were asked for: {'; '.join(said)}" if said else ""
-    return Finding(found_m=total, asked_m=wanted_total, text=text), doubted
+    return DitherMeasurement(found_m=total, asked_m=wanted_total, text=text), doubted
 
 
-def _off(asked: Asked, carried: Array, wanted: Array, told: Array) -> list[str]:
+def _outside_tolerance(
+    asked: ExpectedDither, carried: Array, wanted: Array, reported_m: Array
+) -> list[str]:
     """Return which of the modes asked for are too strong, too weak, or at another frequency."""
     ratio, said = carried / wanted, []
     for k in np.flatnonzero((ratio > LOUDER) | (ratio < WEAKER))[:_NAMED]:
@@ -299,7 +309,7 @@ def _off(asked: Asked, carried: Array, wanted: Array, told: Array) -> list[str]:
         said.append(f"{found} instead of {1e9 * wanted[k]:.3g} nm")
     if not asked.frequency_hz:
         return said
-    for k in np.flatnonzero((ratio >= WEAKER) & (told < WEAKER * carried))[:_NAMED]:
+    for k in np.flatnonzero((ratio >= WEAKER) & (reported_m < WEAKER * carried))[:_NAMED]:
         line = f"{asked.frequency_hz[k]:g} Hz"
         said.append(f"mode {asked.modes[k]} moves at another frequency than {line}")
     return said
@@ -317,14 +327,14 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
     return [f"modes nobody asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
 
 
-def _hidden(asked: Asked, own: Array, told: Array, moved: Array) -> list[str]:
+def _hidden(asked: ExpectedDither, own: Array, reported_m: Array, moved: Array) -> list[str]:
     """Return which modes outside the loop move more than the columns of the dither say."""
     if not asked.frequency_hz:
         return []
-    much = moved > LOUDER * told + WEAKER * np.array(asked.amplitude_m)
+    much = moved > LOUDER * reported_m + WEAKER * np.array(asked.amplitude_m)
     hidden = np.flatnonzero(own & much)
     return [
         f"the commands of mode {asked.modes[k]} hold {1e9 * moved[k]:.3g} nm at "
-        f"{asked.frequency_hz[k]:g} Hz, its dither column {1e9 * told[k]:.3g} nm"
+        f"{asked.frequency_hz[k]:g} Hz, its dither column {1e9 * reported_m[k]:.3g} nm"
         for k in hidden[:_NAMED]
     ]

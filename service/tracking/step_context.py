@@ -7,8 +7,15 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Generic, TypeVar
 
-from service.tracking.alarms import ALARMS, Act, Alarm, Kind, Severity, forbidding
-from service.tracking.dither_request import Dither, Dithering
+from service.tracking.alarms import (
+    ALARMS,
+    Alarm,
+    AlarmDefinition,
+    Interlock,
+    Severity,
+    blocking_alarm,
+)
+from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
@@ -54,18 +61,18 @@ class _Part(Generic[T]):
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def __get__(self, turn: Turn, _: type[Turn]) -> T:
-        part: T = getattr(turn.state, self._name)
+    def __get__(self, context: StepContext, _: type[StepContext]) -> T:
+        part: T = getattr(context.state, self._name)
         return part
 
-    def __set__(self, turn: Turn, part: T) -> None:
+    def __set__(self, context: StepContext, part: T) -> None:
         changed = object.__new__(TrackerState)
-        vars(changed).update(vars(turn.state))
+        vars(changed).update(vars(context.state))
         vars(changed)[self._name] = part
-        turn.state = changed
+        context.state = changed
 
 
-class Turn:
+class StepContext:
     """One event being worked out: the state as it becomes, and what is to be done about it.
 
     It lasts as long as ``service.tracker.step``; before and after it states are values.
@@ -73,13 +80,13 @@ class Turn:
 
     __slots__ = ("before", "effects", "event", "now_ns", "policy", "state")
 
-    known = _Part[Registration | None]("registration")
+    registration = _Part[Registration | None]("registration")
     """What is known of α; None: nothing."""
 
     dither = _Part[Dither | None]("dither")
     """The dither that was asked for or runs; None: none."""
 
-    dithering = _Part[Dithering]("dithering")
+    dither_policy = _Part[DitherPolicyState]("dither_policy")
     """What the dither policy remembers."""
 
     acquisition = _Part[Acquisition]("acquisition")
@@ -104,9 +111,9 @@ class Turn:
         """Have something done."""
         self.effects.append(effect)
 
-    def forbidden(self, act: Act) -> Alarm | None:
+    def blocking_alarm(self, interlock: Interlock) -> Alarm | None:
         """Return an alarm that forbids this now, or None."""
-        return forbidding(self.state, act)
+        return blocking_alarm(self.state, interlock)
 
     def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
         """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
@@ -132,8 +139,8 @@ class Turn:
         """Add a warning to the log."""
         self.log(name, text, Level.WARNING)
 
-    def alarm(
-        self, name: str, text: str, own: Kind | None = None, *, critical: bool = False
+    def raise_alarm(
+        self, name: str, text: str, own: AlarmDefinition | None = None, *, critical: bool = False
     ) -> None:
         """Raise an alarm; one already raised keeps its beginning.
 
@@ -151,7 +158,7 @@ class Turn:
         if before is None:
             self.log(name, text, Level.ALARM)
 
-    def calm(self, name: str) -> None:
+    def clear_alarm(self, name: str) -> None:
         """End an alarm, if it is raised."""
         others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
         if len(others) < len(self.state.alarms):
@@ -223,18 +230,18 @@ def _of_burst(entry: LogEntry) -> str:
     )
 
 
-def tell_bursts(turn: Turn) -> None:
+def tell_bursts(context: StepContext) -> None:
     """Add a line for each burst that is over: when it was, how often, and from what to what.
 
     It has the time of the burst's end, and not of when it is told.
     """
-    for entry in turn.state.log:
-        if entry.times > 1 and turn.now_ns - entry.t_ns_utc >= BURST_NS:
+    for entry in context.state.log:
+        if entry.times > 1 and context.now_ns - entry.t_ns_utc >= BURST_NS:
             told = replace(
                 entry, t_ns_utc=entry.last_ns_utc, text=_of_burst(entry), times=1, ranges=()
             )
-            log = (replace(e, times=1, ranges=()) if e is entry else e for e in turn.state.log)
-            turn.state = replace(turn.state, log=(*log, told)[-LOG_LENGTH:])
+            log = (replace(e, times=1, ranges=()) if e is entry else e for e in context.state.log)
+            context.state = replace(context.state, log=(*log, told)[-LOG_LENGTH:])
 
 
 def new_lines(before: TrackerState, after: TrackerState) -> list[LogEntry]:

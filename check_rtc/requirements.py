@@ -47,7 +47,7 @@ class Moves(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Article:
+class Requirement:
     """One thing the contract asks."""
 
     says: str
@@ -59,85 +59,87 @@ class Article:
     moves: Moves = Moves.NOTHING
 
 
-ARTICLES: Final[dict[str, Article]] = {
-    "connection": Article("the token alive/rtc is there, and stays", "connection"),
-    "messages": Article("every message is as its table says", "messages"),
-    "frames": Article(
+REQUIREMENTS: Final[dict[str, Requirement]] = {
+    "connection": Requirement("the token alive/rtc is there, and stays", "connection"),
+    "messages": Requirement("every message is as its table says", "messages"),
+    "frames": Requirement(
         "frames come at the rate that status and dt_ns tell, 10 to 100 messages a second", "frames"
     ),
-    "sizes": Article("slopes and modes of a frame are those of the status, and stay so", "frames"),
-    "numbers": Article("every number is finite, and slopes are new ones", "frames"),
-    "sequence": Article(
+    "sizes": Requirement(
+        "slopes and modes of a frame are those of the status, and stay so", "frames"
+    ),
+    "numbers": Requirement("every number is finite, and slopes are new ones", "frames"),
+    "sequence": Requirement(
         "each frame comes once, none is lost, seq0 never goes back", "sessions-sequence-time"
     ),
-    "clock": Article("t0_ns goes on by dt_ns a frame", "sessions-sequence-time"),
-    "delivery": Article("a batch is sent when its last frame is there", "timing"),
-    "session": Article(
+    "clock": Requirement("t0_ns goes on by dt_ns a frame", "sessions-sequence-time"),
+    "delivery": Requirement("a batch is sent when its last frame is there", "timing"),
+    "session": Requirement(
         "one session, until the RTC or its integrator starts over", "sessions-sequence-time"
     ),
-    "status": Article("a status 1 to 10 times a second, that agrees with the frames", "status"),
-    "ids": Article(
+    "status": Requirement("a status 1 to 10 times a second, that agrees with the frames", "status"),
+    "ids": Requirement(
         "one basis and one configuration, in frames, status and manifest",
         "slopes-commands-orientation",
     ),
-    "matrix": Article(
+    "matrix": Requirement(
         "rtc/cm/applied answers with manifest and parts of the matrix in use", "reconstructors"
     ),
-    "law": Article("leak, gain and delay of the frames are those of the status", "the-loop"),
-    "obedience": Article("every mode does what the loop asks of it", "the-loop"),
-    "orientation": Article(
+    "law": Requirement("leak, gain and delay of the frames are those of the status", "the-loop"),
+    "obedience": Requirement("every mode does what the loop asks of it", "the-loop"),
+    "orientation": Requirement(
         "sign, order, axes and unit are those of the instrument file", "slopes-commands-orientation"
     ),
-    "late-join": Article(
+    "late-join": Requirement(
         "cm/current is asked once a session, when alive/service appears", "reconstructors"
     ),
-    "replies": Article(
+    "replies": Requirement(
         "a reply within 1 s to everything, refusals with their word, once for each id",
         "commands",
         Moves.WORDS,
     ),
-    "dither": Article(
+    "dither": Requirement(
         "a dither begins at start_seq as asked for, is told, and stops when told to",
         "dither",
         Moves.MIRROR,
     ),
-    "columns": Article(
+    "columns": Requirement(
         "row k holds the slopes and the command of one exposure, of the matrix's sign",
         "frames",
         Moves.MIRROR,
     ),
-    "commit": Article(
+    "commit": Requirement(
         "a matrix is applied within 2 s of its commit, from the frame acknowledged",
         "reconstructors",
         Moves.MATRIX,
     ),
-    "chunks": Article(
+    "chunks": Requirement(
         "a commit may overtake its chunks; what is missing after 2 s is asked for",
         "reconstructors",
         Moves.MATRIX,
     ),
-    "rejection": Article(
+    "rejection": Requirement(
         "a wrong sum, basis or manifest and a used id are rejected, a repeat answered again",
         "reconstructors",
         Moves.MATRIX,
     ),
-    "reconnect": Article(
+    "reconnect": Requirement(
         "the RTC comes back after the router was away, in the same session",
         "connection",
         Moves.WORDS,
     ),
-    "loop": Article(
+    "loop": Requirement(
         "opening zeroes the integrator in a new session; closing goes on in it; the matrix "
         "survives",
         "loop",
         Moves.LOOP,
     ),
-    "measure": Article(
+    "measure": Requirement(
         "a measured matrix comes in slope per metre; the loop is closed again",
         "measure",
         Moves.LOOP,
     ),
-    "offload": Article(
+    "offload": Requirement(
         "a demand moves the image as asked for, once, and stands still from start_seq on",
         "offload",
         Moves.IMAGE,
@@ -158,9 +160,9 @@ class Checked:
     """Or why it was not made."""
 
     @property
-    def article(self) -> Article:
+    def requirement(self) -> Requirement:
         """What the contract says."""
-        return ARTICLES[self.name]
+        return REQUIREMENTS[self.name]
 
 
 fine = partial(Checked, Outcome.OK)

@@ -25,7 +25,7 @@ from typing_extensions import override
 
 from service.archive import AuditEntry
 from service.errors import ConfigurationError
-from service.runtime.recording import Caller, Whence
+from service.runtime.recording import Actor, Channel
 from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
 from service.web.problems import problem
@@ -36,7 +36,7 @@ COOKIE = "pyrcal_key"
 MOST_FAILURES, FAILURES_WITHIN_S = 10, 60.0
 """Wrong keys that an address may show within so many seconds: the next are answered 429."""
 
-MOST_ADDRESSES = 1000
+MAX_ADDRESSES = 1000
 """Whose failures are remembered; the oldest go first."""
 
 MOST_TOLD, TOLD_WITHIN_S = 20, 60.0
@@ -147,7 +147,7 @@ class Failures:
         if now_s - since_s >= FAILURES_WITHIN_S:
             since_s, n_before = now_s, 0
         self._of[house] = (since_s, n_before + 1)
-        if len(self._of) > MOST_ADDRESSES:
+        if len(self._of) > MAX_ADDRESSES:
             self._of.popitem(last=False)
         left_s = since_s + FAILURES_WITHIN_S - now_s
         return 0 if n_before < MOST_FAILURES else math.ceil(left_s)
@@ -193,7 +193,7 @@ class Refusals:
                 name=f"request.{refusal.kind}",
                 text=f"{request.method} {request.url.path:.200}",
                 address=address,
-                whence=whence_of(request),
+                channel=channel_of(request),
                 answer=f"{refusal.status}: {refusal.detail}",
             )
         )
@@ -223,23 +223,25 @@ def address_of(request: Request) -> str:
     return "" if request.client is None else request.client.host
 
 
-def caller_of(request: Request) -> Caller:
+def actor_of(request: Request) -> Actor:
     """Return who asks, once they are let through."""
     key: Key | None = request.user
-    return Caller(
-        address=address_of(request), key="" if key is None else key.name, whence=whence_of(request)
+    return Actor(
+        address=address_of(request),
+        key="" if key is None else key.name,
+        channel=channel_of(request),
     )
 
 
-def whence_of(request: Request) -> Whence:
+def channel_of(request: Request) -> Channel:
     """Return what a request came through."""
     sent = request.headers
     if "origin" in sent or "sec-fetch-site" in sent:  # only browsers say so
-        return Whence.PAGE
-    return Whence.CLI if sent.get("user-agent", "").startswith("pyrcal") else Whence.REST
+        return Channel.PAGE
+    return Channel.CLI if sent.get("user-agent", "").startswith("pyrcal") else Channel.REST
 
 
-class Admission(Middleware):
+class Authentication(Middleware):
     """Lets requests through to the application that may be made, each with its whole body.
 
     ``request.user`` is then the key it was made with; None: there are no keys, or none is needed.
@@ -281,7 +283,7 @@ class Admission(Middleware):
         request, scope["user"] = Request(scope), None
         refusal = self._stranger(request)
         if refusal is None and (needed := self._scope_of(request)) is not None:
-            scope["user"], refusal = self._known(request, needed)
+            scope["user"], refusal = self._check_key(request, needed)
             send = self._while_valid(scope["user"], send)
         if refusal is not None:
             self._refusals.tell(request, refusal)
@@ -306,7 +308,7 @@ class Admission(Middleware):
             return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
         return None
 
-    def _known(self, request: Request, needed: KeyScope) -> tuple[Key | None, Refusal | None]:
+    def _check_key(self, request: Request, needed: KeyScope) -> tuple[Key | None, Refusal | None]:
         """Return the key a request is made with, and why it may not be made."""
         secret, by_cookie = shown_key(request)
         try:
@@ -321,7 +323,7 @@ class Admission(Middleware):
             later = {"Retry-After": str(RETRY_S)}
             return None, Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "keys", detail, later)
         if key is None:
-            return None, self._unknown(request, needed, shown=secret is not None)
+            return None, self._check_no_key(request, needed, shown=secret is not None)
         if not key.scope.covers(needed):
             detail = f"key {key.name} is of scope {key.scope}, this needs one of scope {needed}"
             told = _challenge(f', error="insufficient_scope", scope="{needed}"')
@@ -331,7 +333,7 @@ class Admission(Middleware):
             return key, Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail, who=key.name)
         return key, None
 
-    def _unknown(self, request: Request, needed: KeyScope, *, shown: bool) -> Refusal:
+    def _check_no_key(self, request: Request, needed: KeyScope, *, shown: bool) -> Refusal:
         """Return the refusal of a request without a key, or with one that is none."""
         expected = f"expected a key of scope {needed}"
         if not shown:

@@ -54,7 +54,7 @@ class Topic(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
+class ReceivedMessage:
     """One message of an RTC's."""
 
     topic: Topic
@@ -91,7 +91,7 @@ def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
     return sorted({Keys.system_of(key) for key in found})
 
 
-class Ear:
+class RtcConnection:
     """A context manager; what zenoh's threads bring waits until it is taken.
 
     Where no service is there it is one to the RTC: it holds the token, and answers for matrices.
@@ -102,7 +102,7 @@ class Ear:
         self.keys = Keys(endpoint.system)
         self._as_service = as_service
         self._outbox = Outbox(OFFERED_S)
-        self._heard: deque[Heard] = deque(maxlen=MOST_WAITING)
+        self._messages: deque[ReceivedMessage] = deque(maxlen=MOST_WAITING)
         self._session: zenoh.Session | None = None
         self._held: list[object] = []
         self._ids = itertools.count()
@@ -130,11 +130,11 @@ class Ear:
         keys = self.keys
         self.other_service = bool(link.tokens(session, keys.alive(Role.SERVICE)))
         self._held = [
-            link.subscribe(session, keys.acknowledgement, self._hear(Topic.ACK)),
-            link.subscribe(session, keys.status, self._hear(Topic.STATUS)),
-            link.subscribe(session, keys.all_measured, self._hear(Topic.MEASURED)),
+            link.subscribe(session, keys.acknowledgement, self._on_message(Topic.ACK)),
+            link.subscribe(session, keys.status, self._on_message(Topic.STATUS)),
+            link.subscribe(session, keys.all_measured, self._on_message(Topic.MEASURED)),
             link.watch(session, keys.alive(Role.RTC), self._on_token),
-            link.subscribe_frames(session, keys.frames, self._hear(Topic.FRAMES)),
+            link.subscribe_frames(session, keys.frames, self._on_message(Topic.FRAMES)),
         ]
         if self._as_service and not self.other_service:
             self._held += [
@@ -149,11 +149,11 @@ class Ear:
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
 
-    def take(self) -> list[Heard]:
+    def take(self) -> list[ReceivedMessage]:
         """Return what has come since the last call, oldest first."""
-        taken: list[Heard] = []
-        while self._heard:
-            taken.append(self._heard.popleft())
+        taken: list[ReceivedMessage] = []
+        while self._messages:
+            taken.append(self._messages.popleft())
         return taken
 
     @property
@@ -230,11 +230,11 @@ class Ear:
             raise LinkError("the link is not open")
         return self._session
 
-    def _hear(self, topic: Topic) -> Callable[[zenoh.Sample], None]:
-        def hear(sample: zenoh.Sample) -> None:
+    def _on_message(self, topic: Topic) -> Callable[[zenoh.Sample], None]:
+        def on_sample(sample: zenoh.Sample) -> None:
             attachment = sample.attachment
-            self._heard.append(
-                Heard(
+            self._messages.append(
+                ReceivedMessage(
                     topic=topic,
                     key=str(sample.key_expr),
                     at_s=time.monotonic(),
@@ -244,17 +244,21 @@ class Ear:
                 )
             )
 
-        return hear
+        return on_sample
 
     def _on_token(self, token: tuple[str, bool]) -> None:
         key, alive = token
-        self._heard.append(Heard(topic=Topic.ALIVE, key=key, at_s=time.monotonic(), alive=alive))
+        self._messages.append(
+            ReceivedMessage(topic=Topic.ALIVE, key=key, at_s=time.monotonic(), alive=alive)
+        )
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             key, part = str(query.key_expr), query.parameters.get("chunk")
             asked = key if part is None else f"{key}?chunk={part}"
-            self._heard.append(Heard(topic=Topic.ASKED, key=asked, at_s=time.monotonic()))
+            self._messages.append(
+                ReceivedMessage(topic=Topic.ASKED, key=asked, at_s=time.monotonic())
+            )
             try:
                 data = self._outbox.asked(self.keys, key, part, time.monotonic())
             except (UnknownIdError, WireError) as error:

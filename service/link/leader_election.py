@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 NAME: Final = re.compile(r"[0-9]{1,19}-[0-9a-f]{1,32}")
 """When a service came, nanoseconds since the Unix epoch, and its zenoh id."""
 
-HEARD_S: Final = 5.0
+RECEIVED_WITHIN_S: Final = 5.0
 """A service that gives no name is there for so long after its last word."""
 
 UNDER_WAY_S: Final = 0.3
@@ -37,7 +37,7 @@ REMEMBERED: Final = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Admitted:
+class SessionDecision:
     """What to do with a message of some session."""
 
     accepted: bool
@@ -46,39 +46,47 @@ class Admitted:
     changed: bool = False
     """Whether it starts a session."""
 
-    rival: str | None = None
+    other_session: str | None = None
     """The session that is interleaved with the one that counts: there are two RTCs."""
 
 
 class SessionWatch:
     """A session counts until it falls silent; one that speaks beside it is a second RTC."""
 
-    __slots__ = ("_heard_s", "_left", "_previous", "_rivals", "_since_s", "current", "other")
+    __slots__ = (
+        "_left",
+        "_other_sessions",
+        "_previous",
+        "_received_s",
+        "_since_s",
+        "current",
+        "other",
+    )
 
     def __init__(self) -> None:
         self.current: str | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._since_s = 0.0
         self._left = False
         self.other: str | None = None
         """Another session that spoke last: the one that counts may be over. None: it is not."""
 
         self._previous: str | None = None
-        self._rivals: dict[str, float] = {}
+        self._other_sessions: dict[str, float] = {}
 
-    def admit(self, session: str, now_s: float) -> Admitted:
+    def admit(self, session: str, now_s: float) -> SessionDecision:
         """Judge a message by its session, and remember that it was heard."""
         if session == self.current:
-            self._heard_s, self._left, self.other = now_s, False, None
-            return Admitted(accepted=True, rival=self._rival(now_s))
-        if self.current is None or self._left or now_s - self._heard_s >= SILENCE_S:
+            self._received_s, self._left, self.other = now_s, False, None
+            return SessionDecision(accepted=True, other_session=self._other_session(now_s))
+        if self.current is None or self._left or now_s - self._received_s >= SILENCE_S:
             return self._begun(session, now_s)
         echo = session == self._previous and now_s - self._since_s < SILENCE_S
         if not echo:
             self.other = session
-            if len(self._rivals) < REMEMBERED:
-                self._rivals.setdefault(session, now_s)
-        return Admitted(accepted=False)
+            if len(self._other_sessions) < REMEMBERED:
+                self._other_sessions.setdefault(session, now_s)
+        return SessionDecision(accepted=False)
 
     def leave(self) -> None:
         """Note that the RTC has said goodbye: unless it speaks again, its session is over."""
@@ -86,26 +94,26 @@ class SessionWatch:
 
     def waiting(self, now_s: float) -> str | None:
         """Return the session that will count if the present one stays silent, or None."""
-        quiet = now_s - self._heard_s > GRACE_S / 2
-        return next(reversed(self._rivals), None) if quiet else None
+        quiet = now_s - self._received_s > GRACE_S / 2
+        return next(reversed(self._other_sessions), None) if quiet else None
 
-    def _begun(self, session: str, now_s: float) -> Admitted:
+    def _begun(self, session: str, now_s: float) -> SessionDecision:
         self._previous, self.current = self.current, session
-        self._heard_s = self._since_s = now_s
+        self._received_s = self._since_s = now_s
         self._left, self.other = False, None
-        self._rivals.clear()
-        return Admitted(accepted=True, changed=True)
+        self._other_sessions.clear()
+        return SessionDecision(accepted=True, changed=True)
 
-    def _rival(self, now_s: float) -> str | None:
+    def _other_session(self, now_s: float) -> str | None:
         """Return a session heard so long ago that this message is no straggler; forget it."""
-        for session, first_s in self._rivals.items():
+        for session, first_s in self._other_sessions.items():
             if now_s - first_s > GRACE_S:
-                del self._rivals[session]
+                del self._other_sessions[session]
                 return session
         return None
 
 
-class Order:
+class LeaderElection:
     """The order of the services that are there.
 
     A service takes a name that ranks after all that it finds, whatever its clock says; of two that
@@ -113,11 +121,11 @@ class Order:
     no name, was first if it was there first. Not thread-safe.
     """
 
-    __slots__ = ("_heard_s", "_names", "contract_held", "drives", "name")
+    __slots__ = ("_names", "_received_s", "contract_held", "drives", "name")
 
     def __init__(self) -> None:
         self._names: set[str] = set()
-        self._heard_s: float | None = None
+        self._received_s: float | None = None
         self.name = ""
         self.drives = False
         self.contract_held = False
@@ -130,16 +138,16 @@ class Order:
         self.name = f"{max(now_ns, latest_ns + 1)}-{own_id}"
         return self.name
 
-    def named(self, name: str, *, alive: bool) -> None:
+    def notice(self, name: str, *, alive: bool) -> None:
         """Note that a service has come or gone."""
         if name != self.name and NAME.fullmatch(name):
             (self._names.add if alive else self._names.discard)(name)
 
-    def heard(self, now_s: float) -> None:
+    def receive(self, now_s: float) -> None:
         """Note a word of another service, that need not have a name, while this one drives."""
         # the last word of the one that has driven before is no second service
         if self.drives:
-            self._heard_s = now_s
+            self._received_s = now_s
 
     def settle(self) -> bool:
         """Return whether this service drives from now on."""
@@ -150,7 +158,7 @@ class Order:
     def others(self, now_s: float) -> tuple[str, ...]:
         """Return the other services that are there, in words, the first one first."""
         names = tuple(_words(name) for name in sorted(self._names, key=_rank))
-        heard = self._heard_s is not None and now_s - self._heard_s < HEARD_S
+        heard = self._received_s is not None and now_s - self._received_s < RECEIVED_WITHIN_S
         nameless = heard or (self.contract_held and not self.drives)
         return names if names or not nameless else ("one that gives no name",)
 
@@ -180,7 +188,7 @@ class Standby:
         self._drive = drive
         self._report = report
         self._lock = threading.Lock()
-        self._order = Order()
+        self._election = LeaderElection()
         self._session: zenoh.Session | None = None
         self._driving: list[object] = []
         self._met: tuple[bool, tuple[str, ...]] = (True, ())
@@ -188,7 +196,7 @@ class Standby:
     @property
     def drives(self) -> bool:
         """Whether this service drives the RTC: it alone commands and publishes."""
-        return self._order.drives
+        return self._election.drives
 
     def join(
         self,
@@ -216,9 +224,9 @@ class Standby:
         keys, contract = self._keys, self._keys.alive(Role.SERVICE)
         found = [_name_of(key) for key in link.tokens(session, keys.all_ranks)]
         with self._lock:
-            self._order = Order()
-            self._order.contract_held = bool(link.tokens(session, contract))
-            name = self._order.join(found, str(session.zid()), time.time_ns())
+            self._election = LeaderElection()
+            self._election.contract_held = bool(link.tokens(session, contract))
+            name = self._election.join(found, str(session.zid()), time.time_ns())
         held = [
             link.announce(session, keys.rank(name)),
             link.watch(session, keys.all_ranks, guarded("alive", self._on_token)),
@@ -247,14 +255,14 @@ class Standby:
         key, alive = token
         with self._lock:
             if key == self._keys.alive(Role.SERVICE):
-                self._order.contract_held = alive
+                self._election.contract_held = alive
             else:
-                self._order.named(_name_of(key), alive=alive)
+                self._election.notice(_name_of(key), alive=alive)
         self._settle()
 
     def _on_state(self, _: zenoh.Sample) -> None:
         with self._lock:
-            self._order.heard(time.monotonic())
+            self._election.receive(time.monotonic())
         self._settle()
 
     def _settle(self) -> None:
@@ -262,12 +270,12 @@ class Standby:
         with self._lock:
             if self._session is None:
                 return
-            drives = self._order.settle()
+            drives = self._election.settle()
             if drives and not self._driving:
                 self._driving = self._drive(self._session)
             elif not drives:
                 self._driving = []
-            met = (drives, self._order.others(time.monotonic()))
+            met = (drives, self._election.others(time.monotonic()))
             news, self._met = met != self._met, met
         if news:
             self._report(ServicesMet(drives=met[0], others=met[1]))

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 from service.errors import CommandError, LinkError
 from service.tracking import commands as cmd
-from service.tracking.alarms import NO_DITHER, Note
-from service.tracking.attention import muted, said
+from service.tracking.alarm_records import as_text, muted
+from service.tracking.alarms import NO_DITHER, AlarmRecord
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
 from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
 from service.tracking.state import TrackerState
-from service.tracking.turn import new_lines
+from service.tracking.step_context import new_lines
 
 SILENT = "sent, the RTC has not answered yet"
 
@@ -26,7 +26,7 @@ _ON_ITS_WAY = {
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class CommandResult:
     """What there is to tell."""
 
     text: str
@@ -35,7 +35,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class CarriedOut:
     """An order that was carried out, as far as the service can by itself."""
 
     command: Command
@@ -45,7 +45,7 @@ class Given:
     then: TrackerState
     """Right after it, before anything was heard of it."""
 
-    def answer(self, now: TrackerState) -> Answer:  # noqa: C901 - one line for each command
+    def result(self, now: TrackerState) -> CommandResult:  # noqa: C901 - one line for each command
         """Return what has come of it by now.
 
         Raises
@@ -57,20 +57,22 @@ class Given:
         """
         match self.command:
             case cmd.SetMode():
-                return Answer(f"mode is {now.mode}")
+                return CommandResult(f"mode is {now.mode}")
             case cmd.StopEverything():
                 return _stopped(now)
             case cmd.Resume():
                 off = "; no dither is started until one is asked for"
-                return Answer(f"released: mode is {now.mode}{off if now.dither_stopped else ''}")
+                return CommandResult(
+                    f"released: mode is {now.mode}{off if now.dither_stopped else ''}"
+                )
             case cmd.SetPointing():
                 return _pointing(now)
             case cmd.SetValue(name=name, value=value, for_s=for_s):
-                return Answer(f"{name} is {said(value)} for {for_s:g} s")
+                return CommandResult(f"{name} is {as_text(value)} for {for_s:g} s")
             case cmd.Acquire():
-                return Answer(f"an acquisition is under way: {now.acquisition.text}")
+                return CommandResult(f"an acquisition is under way: {now.acquisition.text}")
             case cmd.AbortAcquisition():
-                return Answer(f"the acquisition has {now.acquisition.text}")
+                return CommandResult(f"the acquisition has {now.acquisition.text}")
             case cmd.StartDither():
                 return self._dither(now)
             case cmd.StopDither():
@@ -82,28 +84,28 @@ class Given:
             case cmd.GiveUp(id=name):
                 record = now.measurement(name)
                 why = "" if record is None else record.reason.removeprefix("given up ")
-                return Answer(f"{name} is given up {why}")
+                return CommandResult(f"{name} is given up {why}")
             case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
                 return _alarm(now, name)
             case cmd.UnmuteAlarm(name=name):
-                return Answer(f"{name} is not muted any more")
+                return CommandResult(f"{name} is not muted any more")
             case _:
                 return self._of_matrices(now)
 
-    def _of_matrices(self, now: TrackerState) -> Answer:
+    def _of_matrices(self, now: TrackerState) -> CommandResult:
         match self.command:
             case cmd.Refit():
-                return Answer(f"a reconstructor is being computed; mode is {now.mode}")
+                return CommandResult(f"a reconstructor is being computed; mode is {now.mode}")
             case cmd.Approve(id=name):
                 return self._sent(now, name)
             case cmd.Reject(id=name):
-                return Answer(f"{name} is discarded")
+                return CommandResult(f"{name} is discarded")
             case cmd.Publish(id=name):
-                return self._copied(now, name)
+                return self._republished(now, name)
             case _:
-                return self._copied(now, self.before.previous or "")
+                return self._republished(now, self.before.previous or "")
 
-    def _copied(self, now: TrackerState, source: str) -> Answer:
+    def _republished(self, now: TrackerState, source: str) -> CommandResult:
         """Tell of a reconstructor that goes out again, under an id of its own."""
         known = {record.id for record in self.before.reconstructors}
         made = [r for r in now.reconstructors if r.parent == source and r.id not in known]
@@ -112,13 +114,15 @@ class Given:
                 text = f"{_why_not(made[-1])}; ordered with anyway, it goes out all the same"
                 raise CommandError(text)
             answer = self._sent(now, made[-1].id)
-            return Answer(f"{answer.text}; it is {source} again; mode is {now.mode}", answer.final)
+            return CommandResult(
+                f"{answer.text}; it is {source} again; mode is {now.mode}", answer.final
+            )
         failed = [line for line in new_lines(self.then, now) if line.name == "job.failed"]
         if now.making_since_ns_utc is None and failed:
             raise CommandError(failed[-1].text)
-        return Answer(f"{source} is being judged before it is sent again", final=False)
+        return CommandResult(f"{source} is being judged before it is sent again", final=False)
 
-    def _sent(self, now: TrackerState, name: str) -> Answer:
+    def _sent(self, now: TrackerState, name: str) -> CommandResult:
         """Tell how far a reconstructor is on its way to the RTC."""
         record = now.reconstructor(name)
         if record is None:
@@ -128,17 +132,17 @@ class Given:
                 raise CommandError(line.text)
         held = why_unsendable(now, record) if record.state is MatrixState.PROPOSED else None
         if held is not None:
-            return Answer(f"{name} is proposed and not sent: {held}")
+            return CommandResult(f"{name} is proposed and not sent: {held}")
         words = _ON_ITS_WAY.get(record.state)
         if words is not None:
-            return Answer(f"{name} {words}", final=False)
+            return CommandResult(f"{name} {words}", final=False)
         if record.state is MatrixState.FAILED:
             raise LinkError(record.reason)
         if not record.was_used:
             raise CommandError(_why_not(record))
-        return Answer(f"{name} sent, applied at frame {record.applied_frame_seq}")
+        return CommandResult(f"{name} sent, applied at frame {record.applied_frame_seq}")
 
-    def _dither(self, now: TrackerState) -> Answer:
+    def _dither(self, now: TrackerState) -> CommandResult:
         asked = self.then.dither
         name = "" if asked is None else asked.id
         dither = now.dither
@@ -147,67 +151,73 @@ class Given:
             gone = f"{name} is not followed any more: see the events"
             raise CommandError(gone if told is None else told.text)
         cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
-        cost = f"{cost}, budget {1e9 * now.dithering.budget_m:.3g} nm"
+        cost = f"{cost}, budget {1e9 * now.dither_policy.budget_m:.3g} nm"
         if dither.start_seq is None:
-            return Answer(f"{name} {SILENT}: {cost}", final=False)
-        return Answer(f"{name} plays from frame {dither.start_seq}: {cost}")
+            return CommandResult(f"{name} {SILENT}: {cost}", final=False)
+        return CommandResult(f"{name} plays from frame {dither.start_seq}: {cost}")
 
-    def _loop(self, now: TrackerState) -> Answer:
+    def _loop(self, now: TrackerState) -> CommandResult:
         asked, found = self.then.loop_command, now.loop_command
         if asked is None or found is None or asked.id != found.id:
-            return Answer(f"{SILENT}: another change of the loop came after it")
+            return CommandResult(f"{SILENT}: another change of the loop came after it")
         match found.state:
             case CommandState.ASKED:
-                return Answer(f"{found.text}: {SILENT}", final=False)
+                return CommandResult(f"{found.text}: {SILENT}", final=False)
             case CommandState.ACCEPTED:
-                return Answer(f"the RTC has accepted: {found.text}")
+                return CommandResult(f"the RTC has accepted: {found.text}")
             case CommandState.REFUSED:
                 raise CommandError(f"the RTC refused: {found.reason}")
             case CommandState.FAILED:
                 raise LinkError(found.reason)
 
 
-def _pointing(now: TrackerState) -> Answer:
+def _pointing(now: TrackerState) -> CommandResult:
     where = now.pointing
     if where is None:
-        return Answer("the pointing is not known")
-    return Answer(
+        return CommandResult("the pointing is not known")
+    return CommandResult(
         f"the telescope looks at elevation {where.elevation_deg:g} deg, azimuth "
         f"{where.azimuth_deg:g} deg"
     )
 
 
-def _stopped(now: TrackerState) -> Answer:
+def _stopped(now: TrackerState) -> CommandResult:
     playing = None if now.rtc is None else now.rtc.dither_id
     text = f"{now.stopped_because}; nothing is dithered, made or sent until it is released"
     if playing is None:
-        return Answer(text)
-    return Answer(f"{text}; the RTC's status still shows {playing}, it was told to stop it", False)
+        return CommandResult(text)
+    return CommandResult(
+        f"{text}; the RTC's status still shows {playing}, it was told to stop it", False
+    )
 
 
-def _no_dither(now: TrackerState) -> Answer:
+def _no_dither(now: TrackerState) -> CommandResult:
     playing = None if now.rtc is None else now.rtc.dither_id
     off = "no dither is started until one is asked for"
     if playing is None:
-        return Answer(f"no dither plays; {off}")
-    return Answer(f"the RTC was told to stop {playing}, its status still shows it; {off}", False)
+        return CommandResult(f"no dither plays; {off}")
+    return CommandResult(
+        f"the RTC was told to stop {playing}, its status still shows it; {off}", False
+    )
 
 
-def _alarm(now: TrackerState, name: str) -> Answer:
+def _alarm(now: TrackerState, name: str) -> CommandResult:
     """Tell what is kept of an alarm that was acknowledged or muted."""
-    note = next((note for note in now.notes if note.name == name), Note(name=name))
+    record = next(
+        (record for record in now.alarm_records if record.name == name), AlarmRecord(name=name)
+    )
     said = []
-    if note.acknowledged is not None:
+    if record.acknowledged is not None:
         said.append("acknowledged; it stays until it is over")
-    elif note.worst is None:
+    elif record.worst is None:
         said.append("over and done with")
-    if note.muted is not None:
-        left_s = ((note.muted.until_ns_utc or 0) - note.muted.t_ns_utc) / 1e9
+    if record.muted is not None:
+        left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
         said.append(f"muted for {left_s:.0f} s, with {len(muted(now))} muted in all")
-    return Answer(f"{name} is {', '.join(said)}")
+    return CommandResult(f"{name} is {', '.join(said)}")
 
 
-def _measurement(now: TrackerState, name: str) -> Answer:
+def _measurement(now: TrackerState, name: str) -> CommandResult:
     record = now.measurement(name)
     if record is None:
         raise CommandError(f"{name} is not known any more")
@@ -217,13 +227,13 @@ def _measurement(now: TrackerState, name: str) -> Answer:
         case MeasureState.FAILED:
             raise LinkError(record.reason)
         case MeasureState.WAITING:
-            return Answer(f"{name} waits for the dither that plays to end", final=False)
+            return CommandResult(f"{name} waits for the dither that plays to end", final=False)
         case MeasureState.ASKED:
-            return Answer(f"{name} {SILENT}", final=False)
+            return CommandResult(f"{name} {SILENT}", final=False)
         case _ if record.start_seq is None:
-            return Answer(f"{name} is {record.state}")
+            return CommandResult(f"{name} is {record.state}")
         case _:
-            return Answer(f"{name} is {record.state}, from frame {record.start_seq}")
+            return CommandResult(f"{name} is {record.state}, from frame {record.start_seq}")
 
 
 def _why_not(record: ReconstructorRecord) -> str:

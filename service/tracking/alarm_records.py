@@ -1,0 +1,315 @@
+"""Operators and alarms: rules of their own that raise some, and who has seen which.
+
+A rule forbids some acts while a condition on what is told or known holds ("do not publish while the
+shutter is shut"); one that holds is an alarm like others. Its condition is on a value that the
+observatory tells for a time, or on a field of the state.
+
+As LSST's ts_watcher has it: an alarm is acknowledged, not dismissed; one that goes unseen stays
+as stale; the worst it has been is kept; an acknowledgement holds until the alarm is over, or worse
+than whoever gave it has seen. What an operator's order ends has been seen.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import replace
+from difflib import get_close_matches
+from typing import Any, Final
+
+from service.errors import CommandError, UnknownIdError
+from service.tracking import commands as cmd
+from service.tracking.alarms import (
+    ALARMS,
+    Alarm,
+    AlarmDefinition,
+    AlarmRecord,
+    AlarmState,
+    OperatorNote,
+    Severity,
+)
+from service.tracking.events import Tick
+from service.tracking.policy import SECOND_NS, Rule
+from service.tracking.state import ObservatoryValue, Orders, TrackerState
+from service.tracking.step_context import StepContext
+from service.tracking.validity import end_alarm
+
+RAISED_AGAIN_S = 60.0
+"""After a restart of the service, for an alarm that lasts to be raised again."""
+
+
+def follow(context: StepContext) -> None:
+    """Keep the notes in step with the alarms, and with the time."""
+    timely = isinstance(context.event, Tick)
+    if context.state.alarms is context.before.alarms and not timely:
+        return
+    notes = {record.name: record for record in context.state.alarm_records}
+    raised = {alarm.name: alarm for alarm in context.state.alarms}
+    for alarm in raised.values():
+        notes[alarm.name] = _raised(notes.get(alarm.name, AlarmRecord(name=alarm.name)), alarm)
+    for name, record in notes.items():
+        if name not in raised:
+            notes[name] = _not_raised(context, record)
+    _keep(context, {name: _unmuted(record, context.now_ns) for name, record in notes.items()})
+
+
+def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
+    """Return what is kept of an alarm that lasts."""
+    known = next(
+        (record for record in state.alarm_records if record.name == alarm.name),
+        AlarmRecord(name=alarm.name),
+    )
+    return replace(_raised(known, alarm), text=alarm.text)
+
+
+def stale(state: TrackerState) -> tuple[AlarmRecord, ...]:
+    """Return the alarms that have gone and nobody has seen."""
+    return tuple(record for record in state.alarm_records if record.alarm_state is AlarmState.STALE)
+
+
+def muted(state: TrackerState) -> tuple[AlarmRecord, ...]:
+    """Return the alarms that are muted, whether they last or not."""
+    return tuple(record for record in state.alarm_records if record.muted is not None)
+
+
+def worst(state: TrackerState) -> Severity | None:
+    """Return the most severe of what lasts, or went unseen; None: there is nothing."""
+    found: Severity | None = None
+    for record in state.alarm_records:
+        if record.worst is not None and record.worst.above(found):
+            found = record.worst
+    return found
+
+
+def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
+    """Note that somebody knows of an alarm; one that is over is done with.
+
+    Raises
+    ------
+    CommandError
+        If it has been worse than what was seen of it.
+    UnknownIdError
+        If no alarm has this name.
+    """
+    notes, record = _with_record(context, command.name)
+    seen, worst_yet = command.severity, record.worst
+    if seen is not None and worst_yet is not None and worst_yet.above(seen):
+        raise CommandError(
+            f"{record.name} has been {worst_yet}, and {seen} was seen of it: look again"
+        )
+    known = replace(record, acknowledged=_operator_note(context, command))
+    notes[record.name] = known if record.over_ns_utc is None else _done_with(record)
+    _keep(context, notes)
+    context.log("alarm.acknowledged", f"{record.name} {command.signed}")
+
+
+def mute(context: StepContext, command: cmd.MuteAlarm) -> None:
+    """Keep an alarm from being shown and told for a time; all it forbids, it goes on to forbid.
+
+    Raises
+    ------
+    UnknownIdError
+        If no alarm has this name.
+    """
+    notes, record = _with_record(context, command.name)
+    until_ns = context.now_ns + round(command.for_s * SECOND_NS)
+    notes[record.name] = replace(
+        record, muted=replace(_operator_note(context, command), until_ns_utc=until_ns)
+    )
+    _keep(context, notes)
+    context.log("alarm.muted", f"{record.name} for {command.for_s:.0f} s {command.signed}")
+
+
+def unmute(context: StepContext, command: cmd.UnmuteAlarm) -> None:
+    """Show and tell an alarm again.
+
+    Raises
+    ------
+    UnknownIdError
+        If no alarm has this name.
+    """
+    notes, record = _with_record(context, command.name)
+    notes[record.name] = replace(record, muted=None)
+    _keep(context, notes)
+    context.log("alarm.unmuted", f"{record.name} {command.signed}")
+
+
+def take_over(context: StepContext, orders: Orders) -> None:
+    """Know what was known before a restart; what lasted then has yet to be raised again."""
+    over_ns = context.now_ns
+    context.state = replace(
+        context.state,
+        alarm_records=tuple(
+            replace(record, over_ns_utc=record.over_ns_utc or over_ns) if record.worst else record
+            for record in orders.seen
+        ),
+    )
+
+
+def _raised(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
+    severity = alarm.definition.severity
+    worse = severity.above(record.worst)
+    if record.worst is not None and record.over_ns_utc is None and not worse:
+        return record
+    return replace(
+        record,
+        worst=severity if worse else record.worst,
+        since_ns_utc=alarm.since_ns_utc,
+        text=alarm.text,
+        over_ns_utc=None,
+        acknowledged=None if worse else record.acknowledged,
+    )
+
+
+def _not_raised(context: StepContext, record: AlarmRecord) -> AlarmRecord:
+    """Return the note of an alarm that does not last."""
+    if record.worst is None:
+        return record
+    if record.over_ns_utc is None:
+        ordered = isinstance(context.event, cmd.Instruction)
+        if ordered or record.acknowledged is not None:
+            return _done_with(record)
+        last = next((a.text for a in context.before.alarms if a.name == record.name), record.text)
+        return replace(record, over_ns_utc=context.now_ns, text=last)
+    waited_ns = context.now_ns - record.over_ns_utc
+    if record.acknowledged is not None and waited_ns > RAISED_AGAIN_S * SECOND_NS:
+        return _done_with(record)
+    return record
+
+
+def _done_with(record: AlarmRecord) -> AlarmRecord:
+    return AlarmRecord(name=record.name, muted=record.muted)
+
+
+def _unmuted(record: AlarmRecord, now_ns: int) -> AlarmRecord:
+    """Return a note without a mute that has had its time."""
+    until_ns = None if record.muted is None else record.muted.until_ns_utc
+    return record if until_ns is None or now_ns < until_ns else replace(record, muted=None)
+
+
+def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord], AlarmRecord]:
+    """Return all notes by name, and one of them, or a new one."""
+    notes = {record.name: record for record in context.state.alarm_records}
+    own = {f"{PREFIX}{rule.name}" for rule in context.policy.rules}
+    if name not in notes and name not in ALARMS and name not in own:
+        raise UnknownIdError(f"alarm {name}: nobody has heard of it")
+    return notes, notes.get(name, AlarmRecord(name=name))
+
+
+def _keep(context: StepContext, notes: dict[str, AlarmRecord]) -> None:
+    """Keep what says something, where it is not what is kept already."""
+    kept = tuple(record for record in notes.values() if record != AlarmRecord(name=record.name))
+    if kept != context.state.alarm_records:
+        context.state = replace(context.state, alarm_records=kept)
+
+
+def _operator_note(context: StepContext, command: cmd.Instruction) -> OperatorNote:
+    by = command.by or "an operator"
+    return OperatorNote(by=by, reason=command.reason, t_ns_utc=context.now_ns)
+
+
+PREFIX = "rule."
+"""Of the alarms of rules: no other alarm has a dot in its name."""
+
+_COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+
+FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
+    "state.mode": lambda state: state.mode.value,
+    "state.loop": lambda state: None if state.rtc is None else state.rtc.loop.value,
+    "state.n_controlled": lambda state: None if state.rtc is None else state.rtc.n_controlled,
+    "state.magnitude": lambda state: None if state.rtc is None else state.rtc.magnitude,
+    "state.elevation_deg": lambda state: (
+        None if state.pointing is None else state.pointing.elevation_deg
+    ),
+    "state.azimuth_deg": lambda state: (
+        None if state.pointing is None else state.pointing.azimuth_deg
+    ),
+}
+"""What a condition may ask of the state; nothing where it is not known."""
+
+
+def judge_rules(context: StepContext) -> None:
+    """Raise the alarms of the rules that hold, and end those of the others."""
+    raised = {alarm.name: alarm.text for alarm in context.state.alarms}
+    for rule in context.policy.rules:
+        name, found = f"{PREFIX}{rule.name}", _found(context, rule)
+        holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
+        text = f"{rule.text} ({rule.about} is {'not known' if found is None else as_text(found)})"
+        if holds and raised.get(name) != text:
+            context.raise_alarm(name, text, _kind(rule))
+        elif not holds and name in raised:
+            end_alarm(context, name)
+
+
+def set_value(context: StepContext, command: cmd.SetValue) -> None:
+    """Take a value that a rule asks for; it counts for as long as was said.
+
+    Raises
+    ------
+    CommandError
+        If it is of another kind than the rule compares it with.
+    UnknownIdError
+        If no rule asks for it.
+    """
+    asked = {rule.about: rule for rule in context.policy.rules if rule.about not in FIELDS}
+    if command.name not in asked:
+        near = get_close_matches(command.name, asked, n=1)
+        known = ", ".join(sorted(asked)) or "none"
+        hint = f", did you mean {near[0]}?" if near else f"; asked for: {known}"
+        raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
+    rule = asked[command.name]
+    if kind_of(command.value) != kind_of(rule.than):
+        raise CommandError(
+            f"{command.name}: found {as_text(command.value)}, expected {kind_of(rule.than)}: rule "
+            f"{rule.name} compares it with {as_text(rule.than)}"
+        )
+    until_ns = context.now_ns + round(command.for_s * SECOND_NS)
+    told = ObservatoryValue(
+        name=command.name, value=command.value, until_ns_utc=until_ns, by=command.by
+    )
+    others = tuple(each for each in context.state.observatory_values if each.name != command.name)
+    context.state = replace(context.state, observatory_values=(*others, told))
+
+
+def changes_value(state: TrackerState, command: cmd.SetValue, now_ns: int) -> bool:
+    """Return whether a value is told that differs from what is known."""
+    return not any(
+        each.name == command.name and each.until_ns_utc > now_ns and each.value == command.value
+        for each in state.observatory_values
+    )
+
+
+def kind_of(value: cmd.Value) -> str:
+    """Return what a value is, in words."""
+    if isinstance(value, bool):
+        return "true or false"
+    return "a text" if isinstance(value, str) else "a number"
+
+
+def as_text(value: cmd.Value) -> str:
+    """Return a value as TOML and JSON write it."""
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _found(context: StepContext, rule: Rule) -> cmd.Value | None:
+    if rule.about in FIELDS:
+        return FIELDS[rule.about](context.state)
+    told = (each for each in context.state.observatory_values if each.name == rule.about)
+    return next((each.value for each in told if each.until_ns_utc > context.now_ns), None)
+
+
+def _kind(rule: Rule) -> AlarmDefinition:
+    return AlarmDefinition(
+        severity=rule.severity,
+        means=rule.text,
+        do="see to it, or change the rule in the settings",
+        blocks=rule.blocks,
+        because=rule.text if rule.blocks else "",
+    )

@@ -1,0 +1,457 @@
+"""Windows, and looks at ordinary telemetry, become the registration, or a reason why not.
+
+One window far out may be a jump or a mistake. It is held, nothing is made from α meanwhile, and
+the next window decides: one that agrees with it makes it a jump, one that agrees with all before
+makes it an outlier. A jump that one window alone cannot tell from noise is told by two together.
+Where windows scatter by more than they say, they must agree for longer than turbulence is alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation import kalman
+from service.estimation.kalman import Joint
+from service.estimation.passive import PassiveEstimate
+from service.estimation.random_dither import RandomEstimate
+from service.estimation.windows import RefusalKind
+from service.model.misregistration import Misregistration, step_text
+from service.tracking import alarms, filtering, jumps, refusals, validity
+from service.tracking import events as ev
+from service.tracking.acquisition_stages import count_miss
+from service.tracking.dither import found_again
+from service.tracking.dither_plan import why_none as why_no_dither
+from service.tracking.filtering import FilterUpdate, WindowEstimate
+from service.tracking.jumps import Innovation
+from service.tracking.loop import loop_numbers, same_numbers
+from service.tracking.policy import SECOND_NS
+from service.tracking.registration import (
+    HistoryEntry,
+    PassiveState,
+    PointedEstimate,
+    Registration,
+    Source,
+    SuspectedJump,
+    TimedEstimate,
+)
+from service.tracking.state import Level, TrackerState
+from service.tracking.step_context import StepContext
+
+Array = NDArray[Any]
+
+TOO_EARLY = (
+    "it began before α came into doubt and agrees with what was known then: only one taken since "
+    "can tell"
+)
+
+
+def on_window(context: StepContext, event: ev.WindowFitted) -> None:
+    """Fold one window's estimate into the registration, or refuse it with its reason."""
+    estimate = event.estimate
+    when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+    why = filtering.why_no_window(context, estimate, when)
+    if why is not None:
+        kind, reason = why
+        reject_window(context, reason, kind)
+        return
+    refusals.use(context)
+    if validity.tells_of(context.state, alarms.DITHER_LOST, when):
+        found_again(context)
+    random = isinstance(estimate, RandomEstimate)
+    for name in (alarms.MISALIGNED, *(() if random else (alarms.WRONG_ANSWER,))):
+        if validity.tells_of(context.state, name, when):
+            context.clear_alarm(name)
+    registration = context.registration
+    modes, gains, gain_sigma = filtering.gains_of(estimate)
+    measured = WindowEstimate(
+        alpha=estimate.alpha,
+        covariance=estimate.covariance,
+        t_ns_utc=estimate.t_ns_utc,
+        pointing=validity.pointing_at(context.state, estimate.t_ns_utc),
+        began_ns_utc=when.began_ns_utc,
+        source=Source.RANDOM if random else Source.LOCK_IN,
+        optical_gain=float(gains.mean()),
+        optical_gains=filtering.followed_gains(
+            () if registration is None else registration.optical_gains,
+            modes,
+            gains[: len(modes)],
+            gain_sigma,
+            estimate.t_ns_utc,
+        ),
+        floor=filtering.model_error_of(registration, estimate, context.policy),
+        misfit=estimate.misfit,
+    )
+    process_window(context, measured)
+
+
+def on_lost(context: StepContext, event: ev.WindowLost) -> None:
+    """Count a window that nothing could be made of."""
+    reject_window(context, event.refused.reason, event.refused.kind)
+
+
+def reject_window(context: StepContext, reason: str, kind: RefusalKind = RefusalKind.OTHER) -> None:
+    """Count a window that gave nothing, and say why."""
+    count_miss(context, kind)
+    if kind is RefusalKind.MISALIGNED:
+        context.raise_alarm(alarms.MISALIGNED, reason)
+    if kind is RefusalKind.MISTOLD:
+        context.raise_alarm(alarms.WRONG_ANSWER, reason)
+    level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
+    context.log("window.refused", reason, level)
+    refusals.refuse(context, reason, kind)
+
+
+def process_window(context: StepContext, measured: WindowEstimate) -> None:
+    """Fold a dithered window in, hold it, or have it decide about the one held before."""
+    registration = context.registration
+    if registration is None:
+        joint = kalman.begin_joint(measured.alpha.vector, measured.covariance)
+        filtering.accept(context, FilterUpdate(joint=joint, n_windows=1, innovation=0.0), measured)
+        return
+    first = jumps.previous_window(registration)
+    both = jumps.pair_innovation(registration, measured, context.policy)
+    if first is not None and both.is_outlier:
+        if jumps.jump_lasts(registration, first, measured, both):
+            _jump(context, registration, first, measured)
+        else:
+            _suspect_jump(context, registration, measured, both, first)
+        return
+    far = jumps.window_innovation(registration, measured, context.policy)
+    if (
+        registration.doubt
+        and not far.is_outlier
+        and validity.precedes(context.state, measured.when, registration.doubted_ns_utc)
+    ):
+        refusals.count(context)
+        context.log("window.refused", TOO_EARLY)
+        return
+    if registration.suspected_jump is not None:
+        text = (
+            f"the window {_away(registration.suspected_jump, registration)} from α was not "
+            f"confirmed: the one after "
+            f"it lies {_away(measured, registration)} away"
+        )
+        n_outlying = context.state.windows_outlying + 1
+        context.state = replace(context.state, windows_outlying=n_outlying)
+        context.warn("window.outlier", text)
+        registration = replace(
+            registration, scatter=kalman.learnt(registration.scatter, kalman.JUMP_THRESHOLD)
+        )
+    if far.is_outlier:
+        _suspect_jump(context, registration, measured, far)
+        return
+    prior = filtering.brought_forward(context, registration, measured.t_ns_utc)
+    update = FilterUpdate(
+        joint=kalman.corrected(prior, measured.alpha.vector, measured.covariance),
+        n_windows=filtering.counted(context, registration, prior),
+        innovation=_innovation(prior, measured),
+        scatter=kalman.learnt(registration.scatter, far.mahalanobis_squared),
+    )
+    filtering.accept(context, update, measured)
+
+
+def _suspect_jump(
+    context: StepContext,
+    registration: Registration,
+    measured: WindowEstimate,
+    far: Innovation,
+    first: TimedEstimate | None = None,
+) -> None:
+    """Put a window that is far out aside, and doubt α until another one has come.
+
+    ``first``: the one before, which tells the same place; together they are so ``far``.
+    """
+    innovation = far.mahalanobis_squared
+    text = (
+        f"a window lies {_away(measured, registration)} from α (innovation {innovation:.0f}, "
+        f"expected 4, "
+        f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
+        "sent meanwhile"
+    )
+    candidate = SuspectedJump(
+        alpha=measured.alpha,
+        covariance=measured.covariance,
+        t_ns_utc=measured.t_ns_utc,
+        held_ns_utc=context.now_ns,
+        began_ns_utc=(first or measured).began_ns_utc,
+    )
+    doubt = "a jump is suspected"
+    validity.store_registration(
+        context, replace(_doubted(registration, doubt, measured.t_ns_utc), suspected_jump=candidate)
+    )
+    filtering.remember(
+        context, filtering.entry_of(measured, registration, innovation, entered=False)
+    )
+    if first is None or registration.suspected_jump is None:
+        context.warn("registration.jump-suspected", text)
+    context.raise_alarm(alarms.SUSPECTED, text)
+    validity.want_window(context, doubt)
+    validity.age(context)
+
+
+def _jump(
+    context: StepContext, registration: Registration, first: TimedEstimate, measured: WindowEstimate
+) -> None:
+    """Go to the new place, which two windows have now seen.
+
+    The first of them is used if it is wholly of the new place.
+    """
+    policy = context.policy
+    prior = filtering.brought_forward(context, registration, measured.t_ns_utc)
+    noise = measured.covariance
+    whole = jumps.wholly_after(first, measured, registration.alpha, policy)
+    if whole:
+        elapsed_s = max(measured.t_ns_utc - first.t_ns_utc, 0) / SECOND_NS
+        noise = first.covariance + np.diag(policy.drift_rate**2 * elapsed_s)
+    joint = kalman.widened(prior, noise)
+    if whole:
+        joint = kalman.corrected(joint, first.alpha.vector, noise)
+    update = FilterUpdate(
+        joint=kalman.corrected(joint, measured.alpha.vector, measured.covariance),
+        n_windows=2 if whole else 1,
+        innovation=_innovation(prior, measured),
+        scatter=registration.scatter,
+        jumped=True,
+    )
+    validity.store_registration(context, replace(registration, passive_after_ns_utc=first.t_ns_utc))
+    both = whole and registration.suspected_jump is not None
+    filtering.accept(context, update, measured, n_accepted=2 if both else 1)
+    context.warn(
+        "registration.jump", f"jumped by {_away(measured, registration)}, as two windows have seen"
+    )
+
+
+def _doubted(registration: Registration, doubt: str, since_ns_utc: int) -> Registration:
+    """Return what is known in doubt, not since earlier than it already is."""
+    since_ns = max(registration.doubted_ns_utc if registration.doubt else 0, since_ns_utc)
+    return replace(registration, doubt=doubt, doubted_ns_utc=since_ns, doubt_voids=True)
+
+
+def _innovation(prior: Joint, measured: WindowEstimate) -> float:
+    return kalman.innovation(prior, measured.alpha.vector, measured.covariance)
+
+
+def _away(window: TimedEstimate, registration: Registration) -> str:
+    return step_text(window.alpha.vector - registration.alpha.vector)
+
+
+def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
+    """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
+    reason = _why_passive_unusable(context.state, event) or _why_known_already(context.state, event)
+    if reason is not None:
+        note_passive_unavailable(context, f"a look was not used: {reason}")
+        return
+    registration, estimate = context.registration, event.estimate
+    if registration is None:
+        _show_passive_alone(context, event)
+        return
+    registration = _expecting(registration, estimate.bias_excess)
+    forward = filtering.brought_forward(context, registration, event.t_ns_utc)
+    prior = kalman.allowing(forward, estimate.bias_excess)
+    if _mixed(registration):
+        text = "not used: its telemetry may be from both sides of a jump"
+        bias = filtering.bias_of(
+            filtering.joint_of(registration), event.t_ns_utc, _loop(context.state, registration)
+        )
+        validity.store_registration(context, replace(registration, bias=bias))
+        _show(context, event, _passive_sigma(estimate, prior), prior.bias, text)
+        return
+    measured = estimate.alpha.vector
+    window = PointedEstimate(
+        alpha=estimate.alpha,
+        covariance=prior.scatter * estimate.covariance,
+        t_ns_utc=event.t_ns_utc,
+        pointing=validity.pointing_at(context.state, event.t_ns_utc),
+    )
+    far = jumps.passive_innovation(
+        registration, filtering.joint_of(registration), window, context.policy
+    )
+    if far > jumps.PASSIVE_LIMIT:
+        _ask_for_window(context, registration, event, prior, far)
+        return
+    joint = kalman.scattered(
+        kalman.corrected(prior, measured, estimate.covariance, kalman.PASSIVE), far
+    )
+    registration = _registration_after_passive(context, registration, joint, event)
+    validity.store_registration(context, registration)
+    validity.age(context)
+    sigma = _passive_sigma(estimate, prior)
+    entry = HistoryEntry(
+        t_ns_utc=event.t_ns_utc,
+        measured=Misregistration.from_vector(measured - joint.bias),
+        measured_sigma=sigma,
+        filtered=registration.alpha,
+        filtered_sigma=registration.sigma,
+        innovation=kalman.innovation(prior, measured, estimate.covariance, kalman.PASSIVE),
+        misfit=estimate.misfit,
+        source=Source.PASSIVE,
+    )
+    filtering.remember(context, entry)
+    _show(context, event, sigma, joint.bias, "agrees with α and with what is known of its own bias")
+
+
+def note_passive_unavailable(context: StepContext, why: str) -> None:
+    """Note why ordinary telemetry says nothing of α now."""
+    context.state = replace(context.state, passive_unavailable_reason=why)
+
+
+def fit_begins_at(state: TrackerState) -> Misregistration | None:
+    """Return about what a look is to be fitted: α, or the last look; None: the nominal rotation."""
+    if state.registration is not None:
+        return state.registration.alpha
+    last = state.passive
+    return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
+
+
+def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str | None:
+    """Return why a look says nothing of the telescope as it is, or None."""
+    of_loop = loop_numbers(state.rtc)
+    if event.loop and of_loop and not same_numbers(event.loop, of_loop):
+        return "the loop has changed since"
+    return filtering.why_no_measurement(
+        state, validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
+    )
+
+
+def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
+    """Return which later telemetry has told more than a look that was long under way, or None."""
+    registration = state.registration
+    if registration is None or not registration.window_began_ns_utc:
+        return None
+    since = validity.telemetry_span(
+        registration.window_began_ns_utc, registration.window_began_ns_utc
+    )
+    if validity.precedes(state, since, event.t_ns_utc):
+        return None
+    return "a dithered window taken since has been fitted before it"
+
+
+def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
+    """Show a look while α is not known: it is all there is, and no more than it says it is."""
+    step = event.estimate.alpha.vector - context.policy.start.vector
+    if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
+        text = (
+            f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
+            "begins, the nominal rotation; let the service acquire, or dither"
+        )
+        _show(context, event, np.full(4, np.inf), np.zeros(4), text)
+        return
+    text = "no dithered estimate to compare with: nothing is made from this reading alone"
+    _show(context, event, event.estimate.sigma, np.zeros(4), text)
+
+
+def _expecting(registration: Registration, excess: Array) -> Registration:
+    """Return what is known with the bias as large as the first look at it says that it may be.
+
+    A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
+    told with less patience.
+    """
+    if registration.bias is not None and registration.bias.looked_ns_utc:
+        return registration
+    return replace(
+        registration,
+        bias=filtering.bias_of(kalman.forget(filtering.joint_of(registration), excess), 0, ()),
+    )
+
+
+def _loop(state: TrackerState, registration: Registration) -> tuple[float, ...]:
+    """Return the loop that is looked at; while no RTC is there, the one of the last look."""
+    if state.rtc is not None:
+        return loop_numbers(state.rtc)
+    return () if registration.bias is None else registration.bias.loop
+
+
+def _mixed(registration: Registration) -> bool:
+    """Return whether a look may be at telemetry from before a jump and from after it.
+
+    It began no earlier than the one before it ended.
+    """
+    began_ns_utc = registration.bias.looked_ns_utc if registration.bias is not None else 0
+    jumped_ns_utc = registration.passive_after_ns_utc
+    return registration.suspected_jump is not None or (
+        jumped_ns_utc > 0 and began_ns_utc < jumped_ns_utc
+    )
+
+
+def _ask_for_window(
+    context: StepContext,
+    registration: Registration,
+    event: ev.PassiveFitted,
+    prior: Joint,
+    far: float,
+) -> None:
+    """Forget the bias and want a dithered window: the wind has changed or the mirror has moved.
+
+    A look alone is no match for windows: α stays valid, and nothing is made or sent until a window
+    taken since has told. It is an alarm where none can, or none has when a second look disagrees.
+    """
+    text = (
+        "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
+        "dithered window must tell which"
+    )
+    registration = context.registration or registration
+    waits, void = bool(registration.doubt), bool(registration.doubt) and registration.doubt_voids
+    why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
+    gone = kalman.forget(prior, event.estimate.bias_excess)
+    after = _registration_after_passive(context, registration, gone, event)
+    bias = filtering.bias_of(gone, event.t_ns_utc, _loop(context.state, registration))
+    doubted = replace(_doubted(after, text, event.t_ns_utc), bias=bias, doubt_voids=void)
+    validity.store_registration(context, doubted)
+    context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
+    validity.want_window(context, text)
+    if why_none is not None or waits:
+        cannot = "none has since the last look that did" if why_none is None else why_none
+        context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
+    validity.age(context)
+    _show(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
+
+
+def _registration_after_passive(
+    context: StepContext, registration: Registration, joint: Joint, event: ev.PassiveFitted
+) -> Registration:
+    """Return the registration as the filter has it after a look."""
+    loop = _loop(context.state, registration)
+    return replace(
+        registration,
+        alpha=Misregistration.from_vector(joint.alpha),
+        covariance=joint.alpha_covariance,
+        t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
+        arrived_ns_utc=context.now_ns,
+        bias=filtering.bias_of(
+            joint,
+            event.t_ns_utc,
+            loop,
+            jumps.sum_of(registration, filtering.joint_of(registration)),
+        ),
+        pointing=validity.pointing_at(context.state, event.t_ns_utc),
+    )
+
+
+def _passive_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
+    """Return ``(4,)`` 1 σ of the estimate as a reading of α: its scatter, and that of its bias."""
+    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[4:])
+
+
+def _show(
+    context: StepContext,
+    event: ev.PassiveFitted,
+    sigma: Array,
+    bias: Array,
+    text: str,
+    *,
+    consistent: bool = True,
+) -> None:
+    watchdog = PassiveState(
+        alpha=event.estimate.alpha,
+        sigma=sigma,
+        misfit=event.estimate.misfit,
+        t_ns_utc=event.t_ns_utc,
+        consistent=consistent,
+        text=text,
+        bias=bias,
+    )
+    context.state = replace(context.state, passive=watchdog, passive_unavailable_reason="")

@@ -32,10 +32,10 @@ from service.web import (
     reading,
     recordings,
     refits,
+    schemas,
     session,
     stream,
     trends,
-    views,
 )
 from service.web.authentication import OPEN, SCHEMES, Authentication, Hosts, needs, scope_of
 from service.web.connections import Idempotency, RequestId, server_config
@@ -169,8 +169,8 @@ class _Application(FastAPI):
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()
-            schemas = {"Problem": problems.Problem.model_json_schema()} | views.schemas()
-            document["components"]["schemas"] |= schemas | self._tell_bodies(document)
+            described = {"Problem": problems.Problem.model_json_schema()} | schemas.schemas()
+            document["components"]["schemas"] |= described | self._tell_bodies(document)
             document["components"]["securitySchemes"] = SCHEMES
             self._tell_scopes(document)
             for operations in document["paths"].values():
@@ -178,7 +178,7 @@ class _Application(FastAPI):
                     _tell_operation(method, operation, document["components"]["schemas"])
         return super().openapi()
 
-    def _tell_bodies(self, document: dict[str, Any]) -> dict[str, views.Schema]:
+    def _tell_bodies(self, document: dict[str, Any]) -> dict[str, schemas.Schema]:
         """Say of each operation what it reads, and return the schemas of that."""
         read = {
             f"{method.lower()} {route.path_format}": found.call
@@ -188,11 +188,11 @@ class _Application(FastAPI):
             for method in route.methods or ()
             if isinstance(found.call, commands.Body)
         }
-        bodies, schemas = commands.bodies(read)
+        bodies, found = commands.bodies(read)
         for operation, body in bodies.items():
             method, _, path = operation.partition(" ")
             document["paths"][path][method]["requestBody"] = body
-        return schemas
+        return found
 
     def _tell_scopes(self, document: dict[str, Any]) -> None:
         """Say of each operation which key it needs."""
@@ -203,7 +203,7 @@ class _Application(FastAPI):
                 document["paths"][route.path_format][method.lower()] |= security
 
 
-def _tell_operation(method: str, operation: dict[str, Any], schemas: dict[str, Any]) -> None:
+def _tell_operation(method: str, operation: dict[str, Any], known: dict[str, Any]) -> None:
     """Say in one line what an operation does, what its answers are, and which are not sent again.
 
     FastAPI's own summary is the name of a function.
@@ -216,7 +216,7 @@ def _tell_operation(method: str, operation: dict[str, Any], schemas: dict[str, A
         contents = found.get("content", {}).values()
         names = [one["schema"].get("$ref", "").rpartition("/")[2] for one in contents]
         if found["description"] == "Successful Response":
-            told = schemas.get(names[0], {}) if names else {}
+            told = known.get(names[0], {}) if names else {}
             found["description"] = told.get("description", "Done").partition("\n\n")[0]
         if any(name.endswith("AcceptedView") for name in names):
             found["headers"] = {"Location": _LOCATION}

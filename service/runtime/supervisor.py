@@ -69,9 +69,7 @@ ANSWERED_WITHIN_S = 3.0
 """For the RTC, or the gate, to answer while whoever gave an order waits."""
 
 ASK_AGAIN_S = 0.02
-
 OPERATOR = Actor()
-
 _LEVELS = {Level.ALARM: "error"}
 """Names of structlog's where they are others."""
 
@@ -97,13 +95,11 @@ class Supervisor:
         self._workers = workers
         self.archive = archive
         """Products and their history; a call waits for the disk."""
-
         self.newest_frames: FrameBlock | None = None
         """The last telemetry that came; None: none has."""
-
         self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
         self._actions = actions
-        self._telemetry_recorder = retention
+        self._retention = retention
         self.recordings = TelemetryRecorder(
             archive=archive,
             retention=retention,
@@ -125,7 +121,6 @@ class Supervisor:
         self._telemetry_executor = ThreadPoolExecutor(1, "telemetry")
         self._telemetry_lock = asyncio.Lock()
         """Held by whoever has, or changes, the estimators."""
-
         self._running: set[asyncio.Task[None]] = set()
         self._broken = ""
         """The last fault that nobody foresaw."""
@@ -249,7 +244,7 @@ class Supervisor:
             group.create_task(self._recorder.run())
             group.create_task(self._recorder.save())
             group.create_task(self.recordings.run())
-            group.create_task(self._recorder.keep_house(self._telemetry_recorder))
+            group.create_task(self._recorder.keep_house(self._retention))
             description = await self._described()
             self._engine.set_description(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"

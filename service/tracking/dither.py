@@ -33,7 +33,7 @@ from service.tracking.dither_request import (
 )
 from service.tracking.policy import SECOND_NS
 from service.tracking.running_operations import GONE_WITHIN_S
-from service.tracking.state import Level
+from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
@@ -79,20 +79,18 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
         _show(context, DitherPhase.OFF, forbidden)
         return
     mode_proof.give_up(context, rtc)
-    wanted_dither, plan = dither_plan.wanted(context, rtc)
+    wanted, plan = dither_plan.wanted(context, rtc)
     context.dither_policy = replace(
         context.dither_policy,
         plan=plan,
-        next_ns_utc=wanted_dither.next_ns_utc
-        if wanted_dither.next_ns_utc > context.now_ns
-        else None,
-        avoided_hz=wanted_dither.parameters.avoid_hz,
+        next_ns_utc=wanted.next_ns_utc if wanted.next_ns_utc > context.now_ns else None,
+        avoided_hz=wanted.parameters.avoid_hz,
     )
-    _show(context, wanted_dither.phase, wanted_dither.reason)
+    _show(context, wanted.phase, wanted.reason)
     if dither is not None:
-        _end_when_done(context, rtc, dither, wanted_dither)
+        _end_when_done(context, rtc, dither, wanted)
     elif not _adopt(context, rtc):
-        _begin(context, rtc, wanted_dither)
+        _begin(context, rtc, wanted)
 
 
 def ask_for(context: StepContext, dither: Dither) -> None:
@@ -115,9 +113,8 @@ def drop(context: StepContext) -> None:
 
 def make_way(context: StepContext) -> None:
     """Stop the dither that runs, if one does; follow and adopt it no more."""
-    running = (
-        context.dither.id if context.dither is not None else context.rtc and context.rtc.dither_id
-    )
+    dither, rtc = context.dither, context.rtc
+    running = dither.id if dither is not None else rtc and rtc.dither_id
     if running:
         _note_stop(context, running)
         context.dither = None
@@ -192,7 +189,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         context.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
         return
     if context.state.dither_losses:
-        context.put_off(dither_s=_patience_s(context))
+        context.put_off(dither_s=_patience_s(context.state))
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
     _lose(context, dither, text)
 
@@ -206,11 +203,8 @@ def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
     dither = context.dither
     if dither is None or dither.id != event.id:
         return
-    text = (
-        f"the RTC accepted {dither.id}, and for {event.silent_s:.1f} s its frames have held none "
-        "of it: α is not measured"
-    )
-    if event.silent_s < _patience_s(context):
+    text = f"the RTC accepted {dither.id}: its frames held none of it for {event.silent_s:.1f} s"
+    if event.silent_s < _patience_s(context.state):
         context.raise_alarm(alarms.DITHER_LOST, text)
     else:
         _lose(context, dither, text)
@@ -307,7 +301,7 @@ def forget_unwanted(context: StepContext) -> None:
         context.clear_alarm(alarms.NOT_STOPPED)
 
 
-def _begin(context: StepContext, rtc: Status, wanted_dither: WantedDither) -> None:
+def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     """Ask for a dither if it is time, and nothing left behind is in its way."""
     loud_ns = context.dither_policy.loud_ns_utc
     if loud_ns and context.now_ns < loud_ns + round(CALM_S * SECOND_NS):
@@ -319,14 +313,12 @@ def _begin(context: StepContext, rtc: Status, wanted_dither: WantedDither) -> No
         # left behind by this service: its window of another length, or to stop
         context.put_off(dither_s=2.0)
         make_way(context)
-    elif context.now_ns >= wanted_dither.next_ns_utc and not dither_plan.awaits_a_result(
-        context, wanted_dither
-    ):
-        _ask(context, rtc, wanted_dither)
+    elif context.now_ns >= wanted.next_ns_utc and not dither_plan.awaits_a_result(context, wanted):
+        _ask(context, rtc, wanted)
 
 
-def _ask(context: StepContext, rtc: Status, wanted_dither: WantedDither) -> None:
-    dither = plan_dither(rtc, context.policy, context.now_ns, choice=wanted_dither.parameters)
+def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
+    dither = plan_dither(rtc, context.policy, context.now_ns, choice=wanted.parameters)
     reason = why_unusable(dither, rtc, context.policy)
     if reason is not None:
         text = (
@@ -336,54 +328,44 @@ def _ask(context: StepContext, rtc: Status, wanted_dither: WantedDither) -> None
         context.put_off(dither_s=60.0)
         context.raise_alarm(alarms.NO_DITHER, text)
         return
-    shaken = on_vibrations(dither, wanted_dither.parameters.avoid_hz)
+    shaken = on_vibrations(dither, wanted.parameters.avoid_hz)
     if shaken and dither.frequency_hz != context.dither_policy.lines_hz:
         text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"
         context.warn("dither.on-vibrations", text)
-    if wanted_dither.phase is DitherPhase.PROVE:
-        mode_proof.begin(context, wanted_dither.parameters.modes)
+    if wanted.phase is DitherPhase.PROVE:
+        mode_proof.begin(context, wanted.parameters.modes)
     context.dither_policy = replace(
         context.dither_policy,
-        lines_hz=wanted_dither.parameters.last_hz
-        if wanted_dither.parameters.modes
-        else dither.frequency_hz,
-        results_due=context.state.windows_accepted + wanted_dither.parameters.n_windows,
+        lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
+        results_due=context.state.windows_accepted + wanted.parameters.n_windows,
         ended_ns_utc=None,
         next_ns_utc=None,
     )
     ask_for(context, dither)
 
 
-def _end_when_done(
-    context: StepContext, rtc: Status, dither: Dither, wanted_dither: WantedDither
-) -> None:
+def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: WantedDither) -> None:
     """Stop a dither that has done its work, or is no longer the one to ask for."""
     left_s = dither.request.duration_s - (context.now_ns - dither.asked_ns_utc) / SECOND_NS
     deaf = dither.id == context.dither_policy.stopped_id
     if dither.start_seq is None or left_s < SOON_OVER_S or deaf:
         return
-    seen = (
-        context.registration is not None
-        and context.registration.window_ns_utc > dither.asked_ns_utc
-    )
-    pause_s = (wanted_dither.next_ns_utc - context.now_ns) / SECOND_NS
-    done = (
-        seen
-        and wanted_dither.phase is DitherPhase.SPARSE
-        and pause_s >= dither_plan.SHORTEST_PAUSE_S
-    )
+    registration = context.registration
+    seen = registration is not None and registration.window_ns_utc > dither.asked_ns_utc
+    pause_s = (wanted.next_ns_utc - context.now_ns) / SECOND_NS
+    done = seen and wanted.phase is DitherPhase.SPARSE and pause_s >= dither_plan.SHORTEST_PAUSE_S
     weak = (
-        wanted_dither.phase is DitherPhase.ACQUIRE
-        and 2.0 * total_m(dither.request) < wanted_dither.parameters.total_m
+        wanted.phase is DitherPhase.ACQUIRE
+        and 2.0 * total_m(dither.request) < wanted.parameters.total_m
     )
-    moved = dither_plan.why_moved(dither, rtc, context.policy, wanted_dither.parameters.shunned)
-    if wanted_dither.phase is DitherPhase.PROVE and not proves(dither.request):
-        moved = wanted_dither.reason
+    moved = dither_plan.why_moved(dither, rtc, context.policy, wanted.parameters.shunned)
+    if wanted.phase is DitherPhase.PROVE and not proves(dither.request):
+        moved = wanted.reason
     if done or weak or moved:
         # the next one must not overtake the command to stop
         context.put_off(dither_s=1.0)
         weakness = "" if done or moved else " is too weak"
-        text = f"{dither.id}{weakness}: {moved or wanted_dither.reason}"
+        text = f"{dither.id}{weakness}: {moved or wanted.reason}"
         context.log("dither.stopped", text, Level.INFO if moved or weakness else Level.DEBUG)
         make_way(context)
 
@@ -426,11 +408,8 @@ def _account(context: StepContext, rtc: Status) -> None:
     since_ns = context.now_ns if dithering.seen_ns_utc is None else dithering.seen_ns_utc
     share = -np.expm1(-max(context.now_ns - since_ns, 0) / (MEMORY_S * SECOND_NS))
     passive_ns = dithering.passive_ns_utc
-    if (
-        registration is not None
-        and registration.window_ns_utc
-        and registration.arrived_ns_utc > registration.window_ns_utc
-    ):
+    windows_ns = 0 if registration is None else registration.window_ns_utc
+    if registration is not None and windows_ns and registration.arrived_ns_utc > windows_ns:
         passive_ns = registration.arrived_ns_utc
     context.dither_policy = replace(
         dithering,
@@ -477,8 +456,8 @@ def _lose(context: StepContext, dither: Dither, text: str) -> None:
     context.state = replace(context.state, dither_lost=dither.id, dither_losses=losses)
 
 
-def _patience_s(context: StepContext) -> float:
-    return min(PATIENCE_S * 2.0**context.state.dither_losses, LONGEST_PATIENCE_S)
+def _patience_s(state: TrackerState) -> float:
+    return min(PATIENCE_S * 2.0**state.dither_losses, LONGEST_PATIENCE_S)
 
 
 def _note_stop(context: StepContext, dither_id: str) -> None:

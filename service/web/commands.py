@@ -51,7 +51,8 @@ from service.tracking.state import TrackerState
 from service.web.authentication import actor_of
 from service.web.numbers import MatrixId
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.web.views import RECONSTRUCTORS, Schema, ServiceDep, explained, found_or_refuse, tagged
+from service.web.schemas import Schema, explained
+from service.web.views import RECONSTRUCTORS, ServiceDep, found_or_refuse, tagged
 
 # --- what is asked: JSON, read into a record
 

@@ -18,16 +18,8 @@ from service.files import parse_alpha, parse_modes
 from service.model.kinds import Method
 from service.runtime.uploads import FitJob, FitQueue, FitState
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.views import (
-    SCHEMAS,
-    ServiceDep,
-    answer,
-    beside_the_four,
-    define_view,
-    found_or_refuse,
-    shows,
-    to_json,
-)
+from service.web.schemas import SCHEMAS, beside_the_four, shows
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, to_json
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 

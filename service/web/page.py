@@ -26,7 +26,8 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.web.authentication import OPEN
 from service.web.connections import Middleware
-from service.web.views import ServiceDep, answer, define_view, shows
+from service.web.schemas import shows
+from service.web.views import ServiceDep, answer, define_view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"])
 

@@ -12,7 +12,8 @@ from pydantic import Field
 from service.archive.trends import TREND_S, TrendSample
 from service.web.problems import INVALID
 from service.web.reading import TimeParameters
-from service.web.views import ServiceDep, answer, define_view, shows
+from service.web.schemas import shows
+from service.web.views import ServiceDep, answer, define_view
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 

@@ -4,7 +4,6 @@ What is not so yet is listed here by name. No list may grow, and what has been m
 """
 
 import ast
-import itertools
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
@@ -37,30 +36,6 @@ WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
 def trees():
     paths = sorted(path for top in HELD for path in (ROOT / top).rglob("*.py"))
     return {path: ast.parse(path.read_text(encoding="utf-8")) for path in paths}
-
-
-def records():
-    """Every class as (name, its fields)."""
-    for tree in trees().values():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef):
-                stated = [line.target for line in node.body if isinstance(line, ast.AnnAssign)]
-                yield node.name, {name.id for name in stated if isinstance(name, ast.Name)}
-
-
-def test_no_two_classes_have_one_name():
-    names = [name for name, _ in records()]
-    assert {name for name in names if names.count(name) > 1} == set()
-
-
-def test_no_two_records_say_the_same():
-    """Four fields or more in common, and four fifths of the smaller one's."""
-    found = set()
-    for (one, these), (other, those) in itertools.combinations(records(), 2):
-        n_common = len(these & those)
-        if n_common >= 4 and n_common >= 0.8 * min(len(these), len(those)):
-            found.add(" and ".join(sorted((one, other))))
-    assert found == set(), "let one of them be the other, or hold it"
 
 
 def test_a_file_is_read_in_a_sitting():

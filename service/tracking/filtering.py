@@ -348,7 +348,7 @@ def why_no_window(
     reason = why_no_measurement(context.state, when)
     if reason is not None:
         return RefusalKind.VOID, reason
-    odd = mode_proof.why_void(context, estimate)
+    odd = mode_proof.why_tells_nothing(context, estimate)
     if odd is not None:
         return RefusalKind.VOID, odd
     lag = float(np.median(estimate.lag_frames))

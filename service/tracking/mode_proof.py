@@ -87,7 +87,7 @@ def shunned_modes(state: TrackerState) -> frozenset[int]:
     return state.mode_proof.contrary - proven_modes(state)
 
 
-def why_void(context: StepContext, estimate: DitheredEstimate) -> str | None:
+def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str | None:
     """Return why a window of these modes does not tell of α, or None.
 
     What the loop makes of a line is fitted with the gain of the line's own mode.

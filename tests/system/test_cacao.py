@@ -62,7 +62,7 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
         night.service("auto")
         loop = night.start("loop", ["tests.system.milk_loop", str(folder), str(plant)])
         wait_for(lambda: "runs" in loop.log, 20.0, lambda: loop.log)
-        bridge = night.start("bridge", ["service", "cacao", "--config", str(config)])
+        bridge = night.start("bridge", ["pyrcal", "cacao", "--config", str(config)])
         night.wait_for_rtc(bridge)
         known = wait_for(
             lambda: night.state["registration"], 30.0, lambda: (night.state, bridge.log)
@@ -114,7 +114,7 @@ def test_no_frame_is_lost_or_taken_for_another(tmp_path, hz, n_slopes, most_of_a
         held = subscribe_frames(session, "ao/v1/small/tel/frames", take)
         writer = Process("writer", ["tests.system.milk_stream", *where], folder)
         wait_for(lambda: "runs" in writer.log, 20.0, lambda: writer.log)
-        bridge = Process("bridge", ["service", "cacao", "--config", str(config)], folder)
+        bridge = Process("bridge", ["pyrcal", "cacao", "--config", str(config)], folder)
         try:
             wait_for(lambda: came["n"], 20.0, lambda: bridge.log)
             begun, began_s = came["next"] - came["n"], time.monotonic()

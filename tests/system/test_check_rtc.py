@@ -56,7 +56,7 @@ def checked(folder, *options, faults=()):
 def checked_beside(folder, rtc_words, *options):
     """The same of an RTC that a module and its words start."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    words = ["service", "check-rtc", "--instrument", str(INSTRUMENT), "--listen", endpoint]
+    words = ["pyrcal", "check-rtc", "--instrument", str(INSTRUMENT), "--listen", endpoint]
     check = Process("check", [*words, "--json", *options], folder)
     rtc = Process("rtc", rtc_words(endpoint), folder)
     try:
@@ -118,7 +118,7 @@ def test_where_nobody_can_be_asked_nothing_is_moved(tmp_path):
 
 
 def test_no_rtc_is_neither_right_nor_wrong(tmp_path):
-    words = ["service", "check-rtc", "--wait", "1", "--listen", f"tcp/127.0.0.1:{free_port()}"]
+    words = ["pyrcal", "check-rtc", "--wait", "1", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     check = Process("check", words, tmp_path)
     assert check.ended(30.0) == 2
     assert "nothing of an RTC of system flao-lbt was heard within 1 s" in check.log

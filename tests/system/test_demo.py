@@ -26,7 +26,7 @@ def night(tmp_path):
 
 
 def demo(night, *words):
-    given = ["service", "demo", "--port", str(night.port), "--dir", str(night.directory / "demo")]
+    given = ["pyrcal", "demo", "--port", str(night.port), "--dir", str(night.directory / "demo")]
     given += ["--zenoh-port", night.zenoh.rpartition(":")[2]]
     return night.start("demo", [*given, *words])
 

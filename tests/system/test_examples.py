@@ -54,10 +54,10 @@ def test_the_rtc_is_registered_and_swaps_a_matrix_that_a_subscriber_gets_too(tmp
         night.no_frame_is_lost()
 
         where = ["--connect", night.zenoh, "--instrument", str(INSTRUMENT), "--seconds", "2"]
-        check = night.start("check", ["service", "check-rtc", *where, "--yes"])
+        check = night.start("check", ["pyrcal", "check-rtc", *where, "--yes"])
         assert check.ended(40.0) == 0, check.log
         assert "a service drives this RTC: end it first" in check.log
-        words = ["service", "check-rtc", "--connect", night.zenoh, "--passive", "--seconds", "2"]
+        words = ["pyrcal", "check-rtc", "--connect", night.zenoh, "--passive", "--seconds", "2"]
         passive = night.start("passive", words)
         assert passive.ended(40.0) == 0, passive.log
         assert f"the RTC there is that of system {SYSTEM}" in passive.log

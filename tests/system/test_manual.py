@@ -116,7 +116,7 @@ def test_a_night_is_rehearsed_with_the_bench_of_the_manual(desk, tmp_path):
 
         def start(words, *own):
             words = [str(desk / word) if word == "bench.toml" else word for word in words]
-            return night.start(words[0], ["service", *words, *own])
+            return night.start(words[0], ["pyrcal", *words, *own])
 
         own = ["--listen", night.zenoh, "--port", str(night.port)]
         own += ["--data-dir", str(night.directory / "data")]

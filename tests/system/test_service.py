@@ -71,7 +71,7 @@ def test_in_auto_the_registration_is_found_and_the_loop_served_first_its_modes_t
     assert all(record["applied_frame_seq"] > 0 for record in own[:2])
     night.no_frame_is_lost()
     night.check_alarms("watchdog")
-    status = night.start("status", ["service", "status", "--url", str(night.client.base_url)])
+    status = night.start("status", ["pyrcal", "status", "--url", str(night.client.base_url)])
     assert status.ended(20.0) in {0, 1}, status.log
     assert f"loop closed at 1000 Hz, {N_TARGET} of 90 modes" in status.log
 

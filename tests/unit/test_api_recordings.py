@@ -116,7 +116,7 @@ async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, 
     name = await begun(client)
     keeper.tap.recorder.put(RecordedKind.FRAMES, bytes(2000))
     if limit == "full":
-        monkeypatch.setattr(keeper, "_keeping", RetentionPolicy(reserve_gb=1e9))
+        monkeypatch.setattr(keeper, "_retention", RetentionPolicy(reserve_gb=1e9))
     else:
         monkeypatch.setattr(telemetry_recorder, limit, 1e-6)
     running = asyncio.create_task(keeper.run())
@@ -128,7 +128,7 @@ async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, 
 
 
 async def test_a_disk_almost_full_takes_none(client, service, keeper, monkeypatch):
-    monkeypatch.setattr(keeper, "_keeping", RetentionPolicy(reserve_gb=1e9))
+    monkeypatch.setattr(keeper, "_retention", RetentionPolicy(reserve_gb=1e9))
     refused = await client.post("/v1/recordings", json=WANTED)
     assert_problem(refused, 409, "not-now", "nothing is recorded", "are free in")
     assert "are free in" in service.audited[-1].answer

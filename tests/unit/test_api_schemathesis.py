@@ -59,7 +59,7 @@ class Bridge(HandmadeBridge):
 
 
 class NoWorkers(SimpleNamespace):
-    trouble, busy_s, cpu_s = "", 0.0, {}
+    problem, busy_s, cpu_s = "", 0.0, {}
 
     async def call(self, *_):
         raise WorkerError("nobody is there")

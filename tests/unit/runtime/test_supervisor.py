@@ -296,7 +296,7 @@ async def test_frames_are_looked_at_before_what_was_told_after_them(
         send(bridge._intake, 0)
         await until(lambda: bridge._intake.events() == [] and not bridge.drain())
         monkeypatch.setattr("service.runtime.engine.process_block", seen)
-        monkeypatch.setattr(supervisor._engine, "hear", lambda told: order.append(told.id))
+        monkeypatch.setattr(supervisor._engine, "receive", lambda told: order.append(told.id))
         send(bridge._intake, 10)
         applied(bridge._intake, "s1")
         send(bridge._intake, 20)

@@ -147,7 +147,7 @@ async def test_too_many_unfinished_fits_are_refused_before_anything_is_read(open
 
 
 async def test_an_upload_that_says_it_is_too_large_is_not_read(opened, tmp_path):
-    desk = opened(most_bytes=1_000_000)
+    desk = opened(max_bytes=1_000_000)
     untouched = in_chunks(HDF5)
     with pytest.raises(TooLargeError, match="found 2000 MB, expected at most 1 MB"):
         await desk.take(ASKED, untouched, 2_000_000_000)
@@ -156,7 +156,7 @@ async def test_an_upload_that_says_it_is_too_large_is_not_read(opened, tmp_path)
 
 
 async def test_an_upload_that_turns_out_too_large_is_removed(opened, tmp_path):
-    desk = opened(most_bytes=1_000_000)
+    desk = opened(max_bytes=1_000_000)
     with pytest.raises(TooLargeError):
         await taken(desk, length=900_000)
     assert not list((tmp_path / "uploads").iterdir())

@@ -26,7 +26,7 @@ from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record
 SECOND = 1_000_000_000
 
 
-def link(*fates, **changes):
+def link(*dispositions, **changes):
     """A link on which all is well but for what is given."""
     counts = dict.fromkeys(
         (
@@ -57,16 +57,16 @@ def link(*fates, **changes):
         "status_age_s": 0.2,
         "session_age_s": 60.0,
         "latency_p50_s": None,
-        "fates": fates,
+        "dispositions": dispositions,
     }
     return LinkStatistics(**(counts | values | changes))
 
 
-def fate(outcome, n, kind="frames", text="", age_s=0.1):
+def disposition(outcome, n, kind="frames", text="", age_s=0.1):
     return Disposition(kind=kind, outcome=outcome, n=n, age_s=age_s, text=text)
 
 
-WELL = (fate("used", 2000), fate("used", 10, "status"))
+WELL = (disposition("used", 2000), disposition("used", 10, "status"))
 
 
 def waits(link, state=None, *, preparing=False):
@@ -89,52 +89,56 @@ def test_nothing_is_complained_of_while_all_is_well():
     ["late", "nonfinite", "shape", "leap", "sequence", "malformed", "session", "of-tomorrow"],
 )
 def test_frames_that_come_and_are_not_used_are_named_whatever_the_reason(outcome):
-    text = complaints(link(fate(outcome, 900, text="found x, expected y")))["frames-unused"]
+    text = complaints(link(disposition(outcome, 900, text="found x, expected y")))["frames-unused"]
     assert outcome in text.partition(":")[0]
     assert "found x, expected y" in text
     assert "0 were used" in text
 
 
 def test_duplicates_are_missed_only_where_they_are_all_that_comes():
-    assert complaints(link(*WELL, fate("duplicate", 2000))) == {}
-    assert "duplicate" in complaints(link(fate("duplicate", 2000)))["frames-unused"]
+    assert complaints(link(*WELL, disposition("duplicate", 2000))) == {}
+    assert "duplicate" in complaints(link(disposition("duplicate", 2000)))["frames-unused"]
 
 
 def test_a_few_late_or_unfinite_frames_are_no_alarm_and_one_broken_batch_is():
-    assert complaints(link(*WELL, fate("late", 100), fate("nonfinite", 100))) == {}
-    assert "leap" in complaints(link(*WELL, fate("leap", 1)))["frames-unused"]
-    assert "leap" in complaints(link(*WELL, fate("leap", 0, age_s=9.0)))["frames-unused"]
-    assert complaints(link(*WELL, fate("leap", 0, age_s=11.0))) == {}
+    assert complaints(link(*WELL, disposition("late", 100), disposition("nonfinite", 100))) == {}
+    assert "leap" in complaints(link(*WELL, disposition("leap", 1)))["frames-unused"]
+    assert "leap" in complaints(link(*WELL, disposition("leap", 0, age_s=9.0)))["frames-unused"]
+    assert complaints(link(*WELL, disposition("leap", 0, age_s=11.0))) == {}
 
 
 def test_while_another_session_waits_to_be_taken_its_frames_are_not_missed():
-    frames = fate("session", 900)
+    frames = disposition("session", 900)
     assert complaints(link(frames, session_waiting="s2")) == {}
     assert complaints(link(*WELL, frames)) == {}
     assert "session" in complaints(link(frames))["frames-unused"]
 
 
 def test_messages_that_broke_the_contract_are_named_with_what_was_found():
-    bad = fate("malformed", 1, "status", "range: leak is 2")
+    bad = disposition("malformed", 1, "status", "range: leak is 2")
     assert "range: leak is 2" in complaints(link(*WELL, bad))["messages-refused"]
     assert complaints(link(*WELL, replace(bad, n=0, age_s=11.0))) == {}
 
 
 def test_a_flood_of_statuses_is_named_with_its_rate():
-    text = complaints(link(*WELL, fate("spared", 990, "status")))["status-flood"]
+    text = complaints(link(*WELL, disposition("spared", 990, "status")))["status-flood"]
     assert "500 a second" in text
 
 
 def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_last():
     state = TrackerState(system="small")
-    (made,) = detect_link_changes(link(fate("late", 900, text="x 1")), state, START_NS)
+    (made,) = detect_link_changes(link(disposition("late", 900, text="x 1")), state, START_NS)
     alarm = Alarm(
         name=made.name, since_ns_utc=START_NS, text=made.text, seen_ns_utc=START_NS + SECOND
     )
     state = replace(state, alarms=(alarm,))
-    (again,) = detect_link_changes(link(fate("late", 950, text="x 2")), state, START_NS + SECOND)
+    (again,) = detect_link_changes(
+        link(disposition("late", 950, text="x 2")), state, START_NS + SECOND
+    )
     assert again.text == made.text
-    (other,) = detect_link_changes(link(fate("shape", 950, text="y")), state, START_NS + SECOND)
+    (other,) = detect_link_changes(
+        link(disposition("shape", 950, text="y")), state, START_NS + SECOND
+    )
     assert "shape" in other.text
     assert detect_link_changes(link(*WELL), state, START_NS + 3 * SECOND) == []
     (over,) = detect_link_changes(link(*WELL), state, START_NS + 5 * SECOND)
@@ -175,8 +179,8 @@ def test_nothing_is_waited_for_while_all_is_well():
         (link(*WELL[:1], status_age_s=None), "status", "rtc", 1),
         (link(*WELL[:1], status_age_s=3.1), "status", "rtc", 1),
         (link(frame_age_s=3.1), "frames", "rtc", 0),
-        (link(fate("late", 500, text="x")), "frames-unused", "rtc", 1),
-        (link(fate("session", 500), session_waiting="s2"), "session", "rtc", 0),
+        (link(disposition("late", 500, text="x")), "frames-unused", "rtc", 1),
+        (link(disposition("session", 500), session_waiting="s2"), "session", "rtc", 0),
     ],
 )
 def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
@@ -277,7 +281,7 @@ def test_a_wait_is_on_record_once_it_lasts_and_not_again_and_again():
 
 
 def test_a_silent_token_has_the_link_opened_anew_ever_less_often():
-    revival, silent = Revival(), link(fate("used", 0, age_s=30.0))
+    revival, silent = Revival(), link(disposition("used", 0, age_s=30.0))
     assert [t for t in range(100) if revival.due(silent, float(t))] == [10, 31, 72]
     assert [t for t in range(100, 3000) if revival.due(silent, float(t))][-2:] == [2421, 2722]
     assert not revival.due(link(*WELL), 3000.0)
@@ -285,7 +289,13 @@ def test_a_silent_token_has_the_link_opened_anew_ever_less_often():
 
 
 @pytest.mark.parametrize(
-    "heard", [link(*WELL), link(fate("used", 5, "status")), link(fate("shape", 9)), link()]
+    "heard",
+    [
+        link(*WELL),
+        link(disposition("used", 5, "status")),
+        link(disposition("shape", 9)),
+        link(),
+    ],
 )
 def test_a_link_on_which_anything_comes_is_left_as_it_is(heard):
     gone = replace(heard, rtc_alive=False, dispositions=())

@@ -19,7 +19,7 @@ class Clocks:
 
     def __init__(self):
         self.now_s = self.service_s = 0.0
-        self.busy_s, self.cpu_s, self.trouble = 0.0, {}, ""
+        self.busy_s, self.cpu_s, self.problem = 0.0, {}, ""
 
     def monotonic(self):
         return self.now_s

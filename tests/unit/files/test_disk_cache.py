@@ -135,8 +135,8 @@ import sys
 from pathlib import Path
 import numpy as np
 from service.config import load_instrument
-from service.files.disk_cache import Prepared
-instrument, kept = load_instrument(sys.argv[2]), Prepared(Path(sys.argv[1]))
+from service.files.disk_cache import DiskCache
+instrument, kept = load_instrument(sys.argv[2]), DiskCache(Path(sys.argv[1]))
 for k in range(60):
     found = kept.arrays(instrument, ("numbers",), lambda: {"numbers": np.full(50_000, 7.0)})
     assert (found["numbers"] == 7.0).all() and len(found["numbers"]) == 50_000
@@ -147,7 +147,7 @@ for k in range(60):
 
 
 def test_processes_that_write_read_and_delete_at_once_do_not_disturb_each_other(tmp_path):
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     environment = os.environ | {"PYTHONPATH": str(root)}
     small = root / "tests" / "system" / "small.toml"
     command = [sys.executable, "-c", WRITER, str(tmp_path), str(small)]

@@ -99,6 +99,8 @@ class Page:
         def done():
             try:
                 element = self.driver.find_element("css selector", selector)
+                if not element.is_displayed():
+                    return False
                 if not self.driver.execute_async_script(AT_REST, element):
                     return False
                 act(element)

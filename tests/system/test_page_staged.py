@@ -293,6 +293,7 @@ def test_to_mute_one_asks_for_how_long_and_why(page):
 def test_a_reason_is_typed_and_nothing_else_happens_before_it_is_sent(page):
     proposed(page.service)
     page.until("!document.querySelector('#proposal-buttons').hidden")
+    page.until("document.querySelector('[data-order=approve]').ariaDisabled === 'false'")
     page.press("a")
     page.dialog("Approve cm-waits")
     assert page.js("document.activeElement.id") == "reason"
@@ -311,6 +312,7 @@ def test_a_reason_is_typed_and_nothing_else_happens_before_it_is_sent(page):
 def test_what_is_typed_before_a_dialog_is_there_does_nothing(page):
     proposed(page.service)
     page.until("!document.querySelector('#proposal-buttons').hidden")
+    page.until("document.querySelector('[data-order=approve]').ariaDisabled === 'false'")
     page.press("am")  # the dialog has to be read for: the m comes before it
     page.dialog("Approve cm-waits")
     assert page.js("document.body.dataset.page") == "operate"

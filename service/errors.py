@@ -9,7 +9,7 @@
     ├── WireError            bytes from the RTC that break the contract
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
-    │   ├── UnknownIdError   a reconstructor, session or product nobody has heard of
+    │   ├── UnknownIdError   an unknown reconstructor, session or product
     │   ├── StaleError       what it was decided on has changed since
     │   ├── UntaggedError    strictness was asked for, and not what it was decided on
     │   ├── TooLargeError    a request or an upload beyond the limit

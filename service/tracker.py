@@ -61,7 +61,7 @@ def step(
     CommandError
         If an operator's command cannot be carried out in this state; the state stands.
     UnknownIdError
-        If it names a reconstructor nobody has heard of.
+        If it names an unknown reconstructor.
     """
     if isinstance(event, Command):
         interlocks.require(state, event, policy, now_ns)

@@ -293,7 +293,7 @@ class Actions:
     async def _send(self, effect: ev.SendMatrix, state: TrackerState) -> Event | None:
         rtc, record = _there(state), state.reconstructor(effect.id)
         if record is None:
-            raise UnknownIdError(f"no reconstructor {effect.id}")
+            raise UnknownIdError(f"unknown reconstructor {effect.id}")
         matrix = await asyncio.to_thread(self.matrix, effect.id)
         commanded = self._commanded_modes or rtc.n_controlled
         if effect.gains is not None or commanded != effect.n_modes:

@@ -120,7 +120,7 @@ class Engine:
         CommandError
             If it is an operator's command that cannot be carried out now; the state stands.
         UnknownIdError
-            If it names a reconstructor nobody has heard of.
+            If it names an unknown reconstructor.
         """
         before = self.state
         self.state, effects = self._step(before, event, self.policy, self._driver.now_ns())

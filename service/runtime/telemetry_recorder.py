@@ -227,7 +227,7 @@ class TelemetryRecorder:
         if self._record is not None and self._record.id == recording_id:
             raise CommandError(f"{recording_id} is under way; end it first")
         if recording_id not in self._archive.recordings.stored():
-            raise UnknownIdError(f"recording {recording_id}: no such recording")
+            raise UnknownIdError(f"unknown recording {recording_id}")
         return self._archive.recordings.path_of(recording_id)
 
     async def run(self) -> None:

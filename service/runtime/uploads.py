@@ -190,7 +190,7 @@ class FitQueue:
         """
         found = self._jobs.get(fit_id)
         if found is None:
-            raise UnknownIdError(f"fit {fit_id}: nobody has heard of it since the service started")
+            raise UnknownIdError(f"unknown fit {fit_id}: the service has begun no such fit")
         return self._staged(found)
 
     async def give_up(self, fit_id: str) -> FitJob:

@@ -192,7 +192,7 @@ def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord
     notes = {record.name: record for record in context.state.alarm_records}
     own = {f"{PREFIX}{rule.name}" for rule in context.policy.rules}
     if name not in notes and name not in ALARMS and name not in own:
-        raise UnknownIdError(f"alarm {name}: nobody has heard of it")
+        raise UnknownIdError(f"unknown alarm {name}")
     return notes, notes.get(name, AlarmRecord(name=name))
 
 

@@ -268,7 +268,7 @@ def _give_up(moment: Moment, measurement_id: str) -> str | None:
         return "nothing is being measured" if going_on is None else None
     record = state.measurement(measurement_id)
     if record is None:
-        raise UnknownIdError(f"measurement {measurement_id}: nobody has heard of it")
+        raise UnknownIdError(f"unknown measurement {measurement_id}")
     over = f"{record.id} is {record.state}: there is nothing to give up"
     return None if record.under_way else over
 

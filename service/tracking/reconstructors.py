@@ -44,7 +44,7 @@ def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
     """
     record = state.reconstructor(matrix_id)
     if record is None:
-        raise UnknownIdError(f"no reconstructor {matrix_id}")
+        raise UnknownIdError(f"unknown reconstructor {matrix_id}")
     return record
 
 

@@ -320,7 +320,7 @@ async def dither(
 def _one(matrix_id: str) -> Callable[[TrackerState], Response]:
     """Return what shows a reconstructor."""
     return lambda state: tagged(
-        found_or_refuse(state.reconstructor(matrix_id), f"reconstructor {matrix_id}")
+        found_or_refuse(state.reconstructor(matrix_id), f"unknown reconstructor {matrix_id}")
     )
 
 

@@ -295,7 +295,7 @@ async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
     """Return what the figures of a finished fit are drawn from; 404 while there are none."""
     job = fits.job(fit_id)
     return Response(
-        found_or_refuse(job.figures, f"figures of {fit_id}, {job.state}"),
+        found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
         media_type="application/json",
     )
 

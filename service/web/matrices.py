@@ -116,7 +116,7 @@ async def measurements(service: ServiceDep) -> Response:
 async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
     """Return how a matrix was measured, or how far it is."""
     record = service.snapshot().tracker.measurement(measurement_id)
-    return answer(found_or_refuse(record, f"measurement {measurement_id}"))
+    return answer(found_or_refuse(record, f"unknown measurement {measurement_id}"))
 
 
 @router.delete("/measurements/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
@@ -177,7 +177,7 @@ async def noisy_matrices(service: ServiceDep) -> Response:
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of a noisy matrix, or how far it is."""
     record = service.snapshot().tracker.measurement(noisy_id)
-    return answer(found_or_refuse(record, f"noisy matrix {noisy_id}"), NOISY)
+    return answer(found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
 
 
 @noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})

@@ -269,7 +269,7 @@ async def reconstructors(service: ServiceDep) -> Response:
 async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
-    return tagged(found_or_refuse(record, f"reconstructor {matrix_id}"))
+    return tagged(found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
 
 
 @router.get(
@@ -336,7 +336,7 @@ async def gains(service: ServiceDep) -> Response:
 async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the optical gains that were measured when a reconstructor was made, for its modes."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
-    record = found_or_refuse(found, f"reconstructor {matrix_id}")
+    record = found_or_refuse(found, f"unknown reconstructor {matrix_id}")
     return _gain_table(record.id, record.optical_gains, record.n_modes)
 
 

@@ -90,7 +90,7 @@ async def recording(service: ServiceDep, recording_id: RecordingId) -> Response:
     """Return how far a recording is."""
     every = await run_in_threadpool(service.recordings.all)
     found = next((one for one in every if one.id == recording_id), None)
-    return answer(found_or_refuse(found, f"recording {recording_id}"))
+    return answer(found_or_refuse(found, f"unknown recording {recording_id}"))
 
 
 @router.post("/recordings/{id}/end", status_code=202, responses={**COMMAND, **UNKNOWN})

@@ -165,16 +165,16 @@ def tagged(record: object, of: View | None = None) -> Response:
     return shown
 
 
-def found_or_refuse(record: Record | None, what: str) -> Record:
+def found_or_refuse(record: Record | None, refusal: str) -> Record:
     """Return the record that was looked up.
 
     Raises
     ------
     UnknownIdError
-        If there is none of ``what`` was asked for.
+        If there is none: ``refusal`` says of what.
     """
     if record is None:
-        raise UnknownIdError(f"{what}: nobody has heard of it")
+        raise UnknownIdError(refusal)
     return record
 
 

@@ -669,7 +669,7 @@ async def test_a_query_that_cannot_be_used_is_refused(client, path):
     ("error", "status", "kind"),
     [
         (CommandError("no estimate yet: start a dither"), 409, "not-now"),
-        (UnknownIdError("reconstructor cm-1: nobody has heard of it"), 404, "unknown-id"),
+        (UnknownIdError("unknown reconstructor cm-1"), 404, "unknown-id"),
         (LinkError("the RTC did not answer within 1 s"), 504, "rtc-silent"),
         (ModelError("no such registration"), 500, "internal"),
         (StorageError("index.sqlite: cannot be used: disk is full"), 507, "archive-failed"),

@@ -40,7 +40,7 @@ class FakeDesk:
 
     def job(self, fit_id):
         if fit_id not in self.known:
-            raise UnknownIdError(f"fit {fit_id}: nobody has heard of it")
+            raise UnknownIdError(f"unknown fit {fit_id}")
         return self.known[fit_id]
 
     async def give_up(self, fit_id):

@@ -25,7 +25,7 @@ class FakeService:
 
     def matrix(self, matrix_id):
         if matrix_id != "cm-1":
-            raise UnknownIdError(f"reconstructor {matrix_id}: nobody has heard of it")
+            raise UnknownIdError(f"unknown reconstructor {matrix_id}")
         return invert(self.interaction, 4).matrix
 
 

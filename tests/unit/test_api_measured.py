@@ -145,7 +145,7 @@ async def test_a_measurement_can_be_given_up(client, service):
 @pytest.mark.parametrize(
     ("refusal", "status"),
     [
-        (UnknownIdError("measurement im-2: nobody has heard of it"), 404),
+        (UnknownIdError("unknown measurement im-2"), 404),
         (CommandError("im-2 is stored: there is nothing to give up"), 409),
     ],
 )

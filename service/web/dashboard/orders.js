@@ -5,6 +5,7 @@ import { busy } from "./work.js";
 import { DASH, MODES, SYMBOLS, clock, make, milliseconds, nanometres, number, present, put, registrationOf, verdict } from "./words.js";
 
 const NAME = "pyrcal.name"; // who sits here, kept by this browser
+const READ_WITHIN_S = 3; // what an order is about
 
 export class Orders {
   #service;
@@ -126,7 +127,7 @@ export class Orders {
 
   // Say what will happen, from what is there now; what is decided on is read for it, with its tag.
   async #look(name, value) {
-    const about = DECIDED_ON[name]?.(this, value);
+    const about = await this.#aboutWhat(name, value);
     const seen = about && (await this.#service.seen(about));
     this.#order = { ...ORDERS[name](this, value, seen?.body), name, value, tag: seen?.tag };
     this.#key = newKey();
@@ -136,6 +137,18 @@ export class Orders {
     choices.replaceChildren(...fields);
     choices.oninput = () => this.#tell();
     this.#tell();
+  }
+
+  // The list of reconstructors comes a moment after the state that permits an order about one.
+  async #aboutWhat(name, value) {
+    for (let left = READ_WITHIN_S; ; left -= 0.1) {
+      try {
+        return DECIDED_ON[name]?.(this, value);
+      } catch (error) {
+        if (left <= 0) throw error;
+      }
+      await new Promise((resolve) => setTimeout(resolve, 100));
+    }
   }
 
   // What was chosen in this dialog, by name; what was left empty is left out.

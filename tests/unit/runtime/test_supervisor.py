@@ -510,7 +510,7 @@ async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
         await until(lambda: len(trail(archive, "operator")) == 2)
     (asked, _), (refused, why) = trail(archive, "operator")
     assert (asked, refused) == ("Approve", "Approve.refused")
-    assert "no reconstructor cm-7" in why
+    assert "unknown reconstructor cm-7" in why
 
 
 async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):

@@ -253,7 +253,7 @@ def test_what_is_given_up_is_over_whatever_comes(story):
 
 
 def test_only_what_is_under_way_can_be_given_up(story):
-    with pytest.raises(UnknownIdError, match="im-1: nobody has heard of it"):
+    with pytest.raises(UnknownIdError, match="unknown measurement im-1"):
         story.tell(cmd.GiveUp(id="im-1"))
     begin(story)
     answer(story, MeasureState.STORED)

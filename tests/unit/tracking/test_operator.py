@@ -55,7 +55,7 @@ class TestApproval:
     @pytest.mark.parametrize("command", [cmd.Approve, cmd.Reject])
     def test_only_a_proposal_can_be_decided_on(self, story, command):
         refused(story, command(id="initial"), "initial is applied, not proposed")
-        refused(story, command(id="cm-9"), "no reconstructor cm-9", UnknownIdError)
+        refused(story, command(id="cm-9"), "unknown reconstructor cm-9", UnknownIdError)
 
     @pytest.mark.parametrize("command", [cmd.Approve, cmd.Reject])
     def test_what_the_gate_refused_cannot_be_approved(self, story, command):
@@ -155,7 +155,7 @@ class TestGoingBack:
         assert story.state.mode is Mode.HOLD
 
     def test_but_no_unknown_one(self, story):
-        refused(story, cmd.Publish(id="cm-9"), "no reconstructor cm-9", UnknownIdError)
+        refused(story, cmd.Publish(id="cm-9"), "unknown reconstructor cm-9", UnknownIdError)
 
     def test_while_the_gate_cannot_judge_only_what_has_been_in_use_is_sent(self, story):
         story.make("cm-3", MatrixState.REFUSED)

@@ -114,5 +114,5 @@ def test_a_restarted_service_still_knows_the_way_back_after_a_flood():
 
 
 def test_a_reconstructor_nobody_knows_is_named():
-    with pytest.raises(UnknownIdError, match="no reconstructor cm-9"):
+    with pytest.raises(UnknownIdError, match="unknown reconstructor cm-9"):
         turned(STATE, change_state, "cm-9", MatrixState.FAILED, "")

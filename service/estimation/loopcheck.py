@@ -7,8 +7,8 @@ itself is wrong.
 Every mode is looked at, on a few frames. Both sides are differenced twice: what else moves the
 mirror (turbulence played on it by day, a vibration) is slow, the sensor's noise is not. Then a mode
 that takes the share r of its steps shows r, whatever the turbulence does. A command that stays
-exactly where it was though it was asked to move is at a limit. ``control_law`` looks at a few modes, on
-every frame.
+exactly where it was though it was asked to move is at a limit. ``control_law`` looks at a few
+modes, on every frame.
 """
 
 from __future__ import annotations

@@ -65,19 +65,20 @@ def step(
     """
     if isinstance(event, Command):
         interlocks.require(state, event, policy, now_ns)
-    context = StepContext(state, event, policy, now_ns)
+    context = StepContext(state, policy, now_ns)
     alarm_records.judge_rules(context)
-    measuring.watch_measurement(context)
+    measuring.watch_measurement(context, event)
     REACTIONS[type(event)](context, event)
-    probation.follow(context)
+    probation.follow(context, event)
     alarm_records.judge_rules(context)
-    note_declined(context)
-    _go_on(context)
-    alarm_records.follow(context)
+    note_declined(context, rejected=isinstance(event, cmd.Reject))
+    _go_on(context, event)
+    ordered = isinstance(event, Command)
+    alarm_records.follow(context, timely=isinstance(event, ev.Tick), ordered=ordered)
     return context.state, tuple(context.effects)
 
 
-def _go_on(context: StepContext) -> None:
+def _go_on(context: StepContext, event: Event) -> None:
     """Let what runs go on, and decide what else is wanted: what has the mirror comes first."""
     if context.state.measuring is not None:
         return
@@ -85,10 +86,10 @@ def _go_on(context: StepContext) -> None:
     if context.state.stopped_because:
         resume.keep_stopped(context)
         return
-    acquisition.acquire(context)
+    acquisition.acquire(context, event)
     if context.acquisition.under_way:
         return
-    measuring.follow_noisy(context)
+    measuring.follow_noisy(context, event)
     if not measuring.awaits_its_dither(context.state):
         decide(context)
         offload.demand(context)

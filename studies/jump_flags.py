@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from service.config.policy import policy_of
 from service.config.settings import Settings
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.tracking.events import Tick
 from service.tracking.filtering import WindowEstimate
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source
@@ -124,7 +123,7 @@ def _flags(night: Night, rng: np.random.Generator, policy: Policy) -> list[tuple
     for k in range(1, night.n_windows + 1):
         end_s = k * WINDOW_S
         now_ns = START_NS + round((end_s + FIT_S) * SECOND_NS)
-        context = StepContext(state, Tick(), policy, now_ns)
+        context = StepContext(state, policy, now_ns)
         process_window(context, _measured(night, end_s, rng, policy))
         state = context.state
         new = [e for e in state.log if e.t_ns_utc == now_ns]

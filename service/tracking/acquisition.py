@@ -24,6 +24,7 @@ from service.tracking import events as ev
 from service.tracking import reconstructors, update_policy
 from service.tracking.alarms import ACQUISITION, Interlock
 from service.tracking.dither import allow, choose_dither, make_way
+from service.tracking.events import Event
 from service.tracking.loop import present
 from service.tracking.measuring import cut_off
 from service.tracking.policy import SECOND_NS
@@ -60,7 +61,7 @@ def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
     stages.abort(context, "by the operator", held_off=True)
 
 
-def acquire(context: StepContext) -> None:
+def acquire(context: StepContext, event: Event) -> None:
     """Take an acquisition further after an event, or begin one where the service needs it."""
     acquisition = context.acquisition
     if acquisition.stage is AcquisitionStage.INTERRUPTED:
@@ -68,17 +69,17 @@ def acquire(context: StepContext) -> None:
     elif not acquisition.under_way:
         if context.state.windows_accepted > context.before.windows_accepted:
             stages.go_on(context, replace(acquisition, misses=0))
-        _forget_when_over(context)
+        _forget_when_over(context, event)
         stages.tell_of_misses(context)
         why = stages.why_needed(context.state, context.policy, context.now_ns)
         if why is not None and context.rtc and ramping(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
-    elif isinstance(context.event, ev.RtcVanished):
+    elif isinstance(event, ev.RtcVanished):
         # the state before still knows in which session that was
         stages.go_on(context, _cut_off(context.before, "the RTC vanished"))
         _wait(context, NO_RTC)
     else:
-        _advance(context)
+        _advance(context, event)
 
 
 def left_behind(state: TrackerState) -> Acquisition | None:
@@ -132,11 +133,11 @@ def _own_loop_lost(context: StepContext) -> str | None:
     return None if alarm is None else alarm.name
 
 
-def _advance(context: StepContext) -> None:
+def _advance(context: StepContext, event: Event) -> None:
     """Take one that is under way further."""
     n_effects = len(context.effects)
-    if not _end_by_event(context):
-        _take_in(context)
+    if not _end_by_event(context, event):
+        _take_in(context, event)
     acted = len(context.effects) > n_effects
     if acted or not context.acquisition.under_way or context.rtc is None:
         return
@@ -146,11 +147,11 @@ def _advance(context: StepContext) -> None:
         stages.wide_capture_stage(context, context.rtc)
 
 
-def _end_by_event(context: StepContext) -> bool:
+def _end_by_event(context: StepContext, event: Event) -> bool:
     """End one that cannot go on after the event, or begin it anew; return whether that is so."""
     acquisition, state = context.acquisition, context.state
     late = context.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
-    match context.event:
+    match event:
         case cmd.StopDither():
             stages.abort(context, "because the dither was stopped")
         case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
@@ -164,13 +165,13 @@ def _end_by_event(context: StepContext) -> bool:
         case ev.Tick() if late:
             stages.restart(context, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
         case _:
-            return _end_by_answer(context)
+            return _end_by_answer(context, event)
     return True
 
 
-def _end_by_answer(context: StepContext) -> bool:
+def _end_by_answer(context: StepContext, event: Event) -> bool:
     acquisition = context.acquisition
-    match context.event:
+    match event:
         case ev.Answered(
             request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
         ):
@@ -182,16 +183,16 @@ def _end_by_answer(context: StepContext) -> bool:
     return True
 
 
-def _take_in(context: StepContext) -> None:
-    match context.event:
+def _take_in(context: StepContext, event: Event) -> None:
+    match event:
         case ev.WideCaptureFitted():
-            stages.on_wide_capture(context, context.event)
+            stages.on_wide_capture(context, event)
         case ev.WindowLost(refused=refused) if refused.kind is RefusalKind.NOT_FOUND:
             stages.on_missed(context, refused.reason)
         case ev.Answered(request=DitherRequest(), reply=Reply(accepted=False, reason=reason)):
             stages.on_missed(context, f"the RTC refused the dither: {reason}")
         case ev.MatrixMade():
-            _on_made(context, context.event)
+            _on_made(context, event)
         case _:
             pass
 
@@ -326,14 +327,14 @@ def _finish(context: StepContext, record: ReconstructorRecord) -> None:
     context.clear_alarm(ACQUISITION)
 
 
-def _forget_when_over(context: StepContext) -> None:
+def _forget_when_over(context: StepContext, event: Event) -> None:
     """Forget an acquisition that holds back the next, once it need not.
 
     One that had failed: when α is known without it, for whoever closed the loop has mended what it
     could not, and the next trouble is another one. One that an operator ended: then too, or when an
     operator sets the mode, which is to say what the service may do by itself.
     """
-    acquisition, event = context.acquisition, context.event
+    acquisition = context.acquisition
     if acquisition.stage is not AcquisitionStage.FAILED and not acquisition.held_off:
         return
     if acquisition.held_off and isinstance(event, cmd.SetMode):

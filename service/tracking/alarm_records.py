@@ -28,7 +28,6 @@ from service.tracking.alarms import (
     OperatorNote,
     Severity,
 )
-from service.tracking.events import Tick
 from service.tracking.policy import SECOND_NS, Rule
 from service.tracking.state import ObservatoryValue, Orders, TrackerState
 from service.tracking.step_context import StepContext
@@ -38,9 +37,12 @@ RAISED_AGAIN_S = 60.0
 """After a restart of the service, for an alarm that lasts to be raised again."""
 
 
-def follow(context: StepContext) -> None:
-    """Keep the notes in step with the alarms, and with the time."""
-    timely = isinstance(context.event, Tick)
+def follow(context: StepContext, *, timely: bool, ordered: bool) -> None:
+    """Keep the notes in step with the alarms, and with the time.
+
+    ``timely``: the time has gone on. ``ordered``: an operator has given a command, and what it ends
+    has been seen.
+    """
     if context.state.alarms is context.before.alarms and not timely:
         return
     notes = {record.name: record for record in context.state.alarm_records}
@@ -49,7 +51,7 @@ def follow(context: StepContext) -> None:
         notes[alarm.name] = _raised(notes.get(alarm.name, AlarmRecord(name=alarm.name)), alarm)
     for name, record in notes.items():
         if name not in raised:
-            notes[name] = _not_raised(context, record)
+            notes[name] = _not_raised(context, record, ordered=ordered)
     _keep(context, {name: _unmuted(record, context.now_ns) for name, record in notes.items()})
 
 
@@ -161,12 +163,11 @@ def _raised(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
     )
 
 
-def _not_raised(context: StepContext, record: AlarmRecord) -> AlarmRecord:
+def _not_raised(context: StepContext, record: AlarmRecord, *, ordered: bool) -> AlarmRecord:
     """Return the note of an alarm that does not last."""
     if record.worst is None:
         return record
     if record.over_ns_utc is None:
-        ordered = isinstance(context.event, cmd.Instruction)
         if ordered or record.acknowledged is not None:
             return _done_with(record)
         last = next((a.text for a in context.before.alarms if a.name == record.name), record.text)

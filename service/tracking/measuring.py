@@ -14,6 +14,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither import ask_for, make_way
 from service.tracking.dither_request import RANDOM_TOTAL_M, check_modes, cost_of, plan_random
+from service.tracking.events import Event
 from service.tracking.loop import present
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
@@ -107,14 +108,14 @@ def give_up(context: StepContext, measurement_id: str) -> None:
     context.put_off(dither_s=left_s, make_s=left_s)
 
 
-def watch_measurement(context: StepContext) -> None:
+def watch_measurement(context: StepContext, event: Event) -> None:
     """Give up a matrix that cannot come any more, before anybody else sees the event."""
     record, rtc = context.state.measuring, context.rtc
     if record is None:
         return
-    if isinstance(context.event, ev.RtcVanished):
+    if isinstance(event, ev.RtcVanished):
         fail(context, record, "the RTC vanished")
-    elif isinstance(context.event, ev.Tick):
+    elif isinstance(event, ev.Tick):
         closed = rtc is not None and rtc.loop != "open"
         _give_up_overdue(context, record, closed=closed)
 
@@ -268,14 +269,14 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
     make_way(context)
 
 
-def follow_noisy(context: StepContext) -> None:
+def follow_noisy(context: StepContext, event: Event) -> None:
     """Go on with the one under way: start its dither, note that it plays, or that it is over."""
     record, rtc = context.state.noisy_measurement, context.rtc
     if record is None:
         return
     waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
     match record.state:
-        case MeasureState.WAITING if isinstance(context.event, cmd.StopDither):
+        case MeasureState.WAITING if isinstance(event, cmd.StopDither):
             cut_off(context, "the operator stopped the dither")
         case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
@@ -283,7 +284,7 @@ def follow_noisy(context: StepContext) -> None:
             elif waited_s > FREE_WITHIN_S:
                 cut_off(context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
         case MeasureState.ASKED | MeasureState.RUNNING:
-            _follow_playing(context, record)
+            _follow_playing(context, record, event)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
             if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
@@ -322,8 +323,8 @@ def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -
     ask_for(context, dither)
 
 
-def _follow_playing(context: StepContext, record: MeasurementRecord) -> None:
-    match context.event:
+def _follow_playing(context: StepContext, record: MeasurementRecord, event: Event) -> None:
+    match event:
         case ev.Answered(
             request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
         ):

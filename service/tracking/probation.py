@@ -22,6 +22,7 @@ from service.tracking.alarms import (
     Interlock,
     alarm_blocks,
 )
+from service.tracking.events import Event
 from service.tracking.loop import CommandState, same_but_for_modes, why_open
 from service.tracking.operator import enter_hold, set_loop
 from service.tracking.policy import SECOND_NS
@@ -70,7 +71,7 @@ _WORSE = frozenset(
 )
 
 
-def follow(context: StepContext) -> None:
+def follow(context: StepContext, event: Event) -> None:
     """Begin a probation with every matrix that is applied, and end one that nothing can end."""
     if context.state.in_use != context.before.in_use:
         _on_swap(context, context.before.in_use, context.state.in_use)
@@ -82,19 +83,19 @@ def follow(context: StepContext) -> None:
     if told:
         _go_back(context, trial, told)
     else:
-        _go_on(context, trial)
+        _go_on(context, trial, event)
 
 
-def _go_on(context: StepContext, trial: Probation) -> None:
+def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
     match trial.state:
         case ProbationState.RUNNING | ProbationState.OVERDUE:
             _await_verdict(context, trial)
         case ProbationState.ROLLING_BACK:
-            _await_republished(context, trial)
+            _await_republished(context, trial, event)
         case ProbationState.WATCHED:
             _watch(context, trial)
         case ProbationState.OPENING:
-            _await_opening(context, trial)
+            _await_opening(context, trial, event)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
             _set(context, replace(trial, state=ProbationState.ROLLED_BACK))
             context.clear_alarm(LOOP_OPENED)
@@ -200,8 +201,8 @@ def _await_verdict(context: StepContext, trial: Probation) -> None:
         _set(context, replace(trial, state=ProbationState.OVERDUE, text="telemetry is late"))
 
 
-def _await_republished(context: StepContext, trial: Probation) -> None:
-    why = _why_stuck(context, trial)
+def _await_republished(context: StepContext, trial: Probation, event: Event) -> None:
+    why = _why_stuck(context, trial, event)
     if why:
         _keep(context, trial, why)
 
@@ -255,10 +256,10 @@ def _open(context: StepContext, trial: Probation) -> None:
     set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def _await_opening(context: StepContext, trial: Probation) -> None:
+def _await_opening(context: StepContext, trial: Probation, event: Event) -> None:
     """Ask again until the loop is open, or an operator says how to go on."""
     rtc, asked = context.rtc, context.state.loop_command
-    if isinstance(context.event, cmd.SetMode):
+    if isinstance(event, cmd.SetMode):
         _set(context, replace(trial, state=ProbationState.KEPT))
         context.clear_alarm(LOOP_OPENED)
     elif rtc is not None and not rtc.in_loop:
@@ -311,11 +312,10 @@ def _why_not_comparable(context: StepContext) -> str:
     return ""
 
 
-def _why_stuck(context: StepContext, trial: Probation) -> str:
+def _why_stuck(context: StepContext, trial: Probation, event: Event) -> str:
     """Return why the matrix before does not come into use again; empty: it is on its way."""
-    failed = context.event
-    if isinstance(failed, ev.JobFailed) and isinstance(failed.effect, ev.RepublishMatrix):
-        return failed.text
+    if isinstance(event, ev.JobFailed) and isinstance(event.effect, ev.RepublishMatrix):
+        return event.text
     sent = None if trial.rollback is None else context.state.reconstructor(trial.rollback)
     if sent is None:
         late = context.now_ns > trial.until_ns_utc + REPUBLISHED_WITHIN_S * SECOND_NS

@@ -10,7 +10,6 @@ from service.tracking.acquisition import inherit, left_behind
 from service.tracking.acquisition_stages import abort
 from service.tracking.alarm_records import take_over
 from service.tracking.alarms import STOPPED, Interlock
-from service.tracking.events import Tick
 from service.tracking.measuring import give_up
 from service.tracking.operator import change_mode
 from service.tracking.policy import SECOND_NS, Policy
@@ -163,7 +162,7 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     run agree with it nothing is made from it. An acquisition that was under way comes with it, and
     what an operator has ordered stands, whatever becomes of α.
     """
-    context = StepContext(state, Tick(), policy, now_ns)
+    context = StepContext(state, policy, now_ns)
     if saved.orders is not None and saved.system == state.system:
         obey(context, saved.orders)
         if saved.orders.stopped:

@@ -16,7 +16,7 @@ from service.tracking.alarms import (
     blocking_alarm,
 )
 from service.tracking.dither_request import Dither, DitherPolicyState
-from service.tracking.events import Effect, Event
+from service.tracking.events import Effect
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import Acquisition, Level, LogEntry, TrackerState
@@ -75,10 +75,11 @@ class _Part(Generic[T]):
 class StepContext:
     """One event being worked out: the state as it becomes, and what is to be done about it.
 
-    It lasts as long as ``service.tracker.step``; before and after it states are values.
+    It lasts as long as ``service.tracker.step``; before and after it states are values. It does not
+    hold the event: only the table of ``step`` and the operation that runs are given that.
     """
 
-    __slots__ = ("before", "effects", "event", "now_ns", "policy", "state")
+    __slots__ = ("before", "effects", "now_ns", "policy", "state")
 
     registration = _Part[Registration | None]("registration")
     """What is known of α; None: nothing."""
@@ -92,12 +93,11 @@ class StepContext:
     acquisition = _Part[Acquisition]("acquisition")
     """How far finding α from nothing has come."""
 
-    def __init__(self, state: TrackerState, event: Event, policy: Policy, now_ns: int) -> None:
+    def __init__(self, state: TrackerState, policy: Policy, now_ns: int) -> None:
         self.before = state
         """As nobody had seen the event yet."""
 
         self.state = state
-        self.event = event
         self.policy = policy
         self.now_ns = now_ns
         self.effects: list[Effect] = []

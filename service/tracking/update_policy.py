@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from service.control.expected_gain import explained_by_noise
 from service.model.misregistration import Misregistration, step_text
-from service.tracking.commands import Reject
-from service.tracking.events import Event
 from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.tracking.mode_limits import ModeLimit
 from service.tracking.policy import SECOND_NS, Policy
@@ -328,11 +326,12 @@ def note_limit(
         context.state = replace(context.state, mode_limit=replace(limit, n_modes=record.n_modes))
 
 
-def note_declined(context: StepContext) -> None:
+def note_declined(context: StepContext, *, rejected: bool) -> None:
     """Note that a reconstructor which had passed the gate was declined before it came into use.
 
     If it has more modes than are controlled, that is what it was made for: no more are tried for a
-    while, longer each time. An acquisition counts its own failures.
+    while, longer each time. An acquisition counts its own failures. ``rejected``: an operator has
+    done so now.
     """
     before, records = context.before, context.state.reconstructors
     if records is before.reconstructors or context.acquisition.under_way:
@@ -342,21 +341,21 @@ def note_declined(context: StepContext) -> None:
         return
     earlier = {record.id: record.state for record in before.reconstructors}
     for record in records:
-        wait_s = _wait_after(record, earlier.get(record.id), context.event)
+        wait_s = _wait_after(record, earlier.get(record.id), rejected=rejected)
         if wait_s is not None and record.n_modes > rtc.n_controlled:
             reason = f"{record.id} was {record.state}: {record.reason}"
             limit_modes(context, rtc.n_controlled, reason, wait_s)
 
 
 def _wait_after(
-    record: ReconstructorRecord, earlier: MatrixState | None, event: Event
+    record: ReconstructorRecord, earlier: MatrixState | None, *, rejected: bool
 ) -> float | None:
     """Return for how long more modes are not tried after what became of one; None: no matter."""
     if earlier is None or earlier is record.state:
         return None
     if record.state in _DECLINED:
         return FIRST_WAIT_S
-    if record.state is MatrixState.DISCARDED and isinstance(event, Reject):
+    if record.state is MatrixState.DISCARDED and rejected:
         return OPERATORS_WAIT_S
     return None
 

@@ -179,7 +179,7 @@ def moved(alpha=ALPHA, **by):
 
 def turned(state, act, *args, now_ns=START_NS, **kwargs):
     """The state after something was done to it while an event was worked out."""
-    context = StepContext(state, ev.Tick(), POLICY, now_ns)
+    context = StepContext(state, POLICY, now_ns)
     act(context, *args, **kwargs)
     return context.state
 

@@ -10,16 +10,13 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from service.tracking import (
-    acquisition,
     alarm_records,
     alarms,
     dither,
     interlocks,
-    measuring,
     mode_proof,
     offload,
     operator,
-    probation,
     reconstructors,
     refusals,
     resume,
@@ -32,6 +29,7 @@ from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.loop import CommandState
+from service.tracking.operations import acquisition, measurement, noisy_measurement, probation
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
@@ -67,8 +65,10 @@ def step(
         interlocks.require(state, event, policy, now_ns)
     context = StepContext(state, policy, now_ns)
     alarm_records.judge_rules(context)
-    measuring.watch_measurement(context, event)
-    REACTIONS[type(event)](context, event)
+    measurement.watch(context, event)
+    reaction = REACTIONS.get(type(event))
+    if reaction is not None:
+        reaction(context, event)
     probation.follow(context, event)
     alarm_records.judge_rules(context)
     note_declined(context, rejected=isinstance(event, cmd.Reject))
@@ -89,20 +89,27 @@ def _go_on(context: StepContext, event: Event) -> None:
     acquisition.acquire(context, event)
     if context.acquisition.under_way:
         return
-    measuring.follow_noisy(context, event)
-    if not measuring.awaits_its_dither(context.state):
+    noisy_measurement.follow(context, event)
+    if not noisy_measurement.awaits_its_dither(context.state):
         decide(context)
         offload.demand(context)
 
 
 def _on_tick(context: StepContext, _: ev.Tick) -> None:
+    """Let what depends on the time alone age: the RTC's silence, α, alarms."""
     rtc.on_tick(context)
     validity.age(context)
     refusals.follow(context)
     operator.close_again(context)
 
 
+def _on_log_event(context: StepContext, event: ev.LogEvent) -> None:
+    """Put it on record."""
+    context.log(event.name, event.text, event.level)
+
+
 def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
+    """Raise or end its alarm; stop a dither that the mirror does not follow."""
     if event.over:
         validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
@@ -112,8 +119,9 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
 
 
 def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
+    """Take α and what the dithered modes have shown from a window."""
     if context.state.measuring is not None:
-        window_processing.reject_window(context, measuring.MEASURING)
+        window_processing.reject_window(context, measurement.MEASURING)
         return
     mode_proof.learn(context, event.estimate)
     window_processing.on_window(context, event)
@@ -121,6 +129,7 @@ def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
 
 
 def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
+    """Propose a reconstructor that was made, or send it where that is what it was made for."""
     if context.acquisition.under_way:
         reconstructors.propose(context, made.record)
     elif probation.is_way_back(context.state, made):
@@ -130,13 +139,20 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
 
 
 def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
+    """Stop a dither that is stronger in the light than was asked for."""
     loud = dither.why_too_strong(context, event)
     if loud is not None:
-        measuring.cut_off(context, f"its dither was too strong: {event.text}")
+        noisy_measurement.cut_off(context, f"its dither was too strong: {event.text}")
         dither.stop_too_strong(context, event.id, loud)
 
 
+def _on_unusable(context: StepContext, event: ev.DitherUnusable) -> None:
+    """Put on record that windows of this dither cannot be cut."""
+    context.warn("dither.unusable", event.text)
+
+
 def _on_answer(context: StepContext, answered: ev.Answered) -> None:
+    """Note what the RTC says to a request, where the request came from."""
     reply = answered.reply
     match answered.request:
         case DitherRequest() as request:
@@ -144,7 +160,7 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
         case DitherStop():
             dither.on_stop_answer(context, reply)
         case MeasureRequest() as request:
-            measuring.on_answer(context, request, reply)
+            measurement.on_answer(context, request, reply)
         case OffloadRequest() as request:
             offload.on_answer(context, request, reply)
         case LoopRequest() | RampRequest() as request:
@@ -153,13 +169,14 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
+    """Note that something could not be done, where it was asked for."""
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
-            measuring.fail(context, context.state.measurement(name), failed.text)
+            measurement.fail(context, context.state.measurement(name), failed.text)
         case ev.Ask(request=OffloadRequest(id=name)):
             offload.on_failure(context, name, failed.text)
         case ev.FinishNoisy(record=noisy):
-            measuring.fail(context, noisy, failed.text)
+            measurement.fail(context, noisy, failed.text)
         case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
             operator.on_loop_answer(context, name, CommandState.FAILED, failed.text)
         case effect:
@@ -173,30 +190,28 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.RtcVanished: rtc.on_vanished,
     ev.ServicesMet: rtc.on_services,
     ev.ConditionChanged: _on_condition,
-    ev.LogEvent: lambda context, event: context.log(event.name, event.text, event.level),
-    ev.WideCaptureFitted: lambda _context, _event: None,  # an acquisition's
+    ev.LogEvent: _on_log_event,
     ev.WindowFitted: _on_window,
     ev.WindowLost: window_processing.on_lost,
     ev.PassiveFitted: window_processing.process_passive,
-    ev.PassiveUnavailable: lambda context, event: window_processing.note_passive_unavailable(
-        context, event.text
-    ),
+    ev.PassiveUnavailable: window_processing.on_passive_unavailable,
     ev.MatrixMade: _on_made,
     ev.MatrixFetched: reconstructors.on_fetched,
     ev.ModesRecognised: mode_proof.recognise,
     ev.MarginJudged: reconstructors.on_margin,
     ev.ProposalJudged: reconstructors.on_proposal_judged,
     Acknowledgement: reconstructors.on_acknowledgement,
-    ev.MatrixMeasured: lambda context, measured: measuring.on_measured(context, measured.record),
+    ev.MatrixMeasured: measurement.on_measured,
     ev.Answered: _on_answer,
     ev.DitherSilent: dither.on_silence,
+    ev.DitherUnusable: _on_unusable,
     ev.DitherMeasured: _on_dither_measured,
     ev.Compared: probation.on_compared,
     ev.LoopHeld: rtc.on_loop_held,
     ev.Vibrations: rtc.on_vibrations,
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
-    cmd.SetPointing: lambda context, command: validity.point(context, command.pointing),
+    cmd.SetPointing: operator.set_pointing,
     cmd.SetValue: alarm_records.set_value,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
@@ -206,9 +221,9 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     cmd.AbortAcquisition: acquisition.abort_on_command,
     cmd.StartDither: operator.start_dither,
     cmd.StopDither: dither.stop_by_operator,
-    cmd.Measure: measuring.measure,
-    cmd.GiveUp: lambda context, command: measuring.give_up(context, command.id),
-    cmd.MeasureNoisy: measuring.measure_noisy,
+    cmd.Measure: measurement.measure,
+    cmd.GiveUp: measurement.give_up_on_command,
+    cmd.MeasureNoisy: noisy_measurement.measure_noisy,
     cmd.AcknowledgeAlarm: alarm_records.acknowledge,
     cmd.MuteAlarm: alarm_records.mute,
     cmd.UnmuteAlarm: alarm_records.unmute,
@@ -218,4 +233,10 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     cmd.Publish: operator.publish,
     cmd.Rollback: operator.roll_back,
 }
-"""What each event, and each command, does: there is one for every kind of either."""
+"""What takes in each event and each command, before the operation that runs is given it.
+
+One entry for every kind of either but what an operation alone can use: ``TAKEN_BY_OPERATIONS``.
+"""
+
+TAKEN_BY_OPERATIONS: Final = frozenset({ev.WideCaptureFitted})
+"""Nothing of the state depends on these but an operation; without one they mean nothing."""

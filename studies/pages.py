@@ -15,11 +15,11 @@ from service.api import create_app
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS
+from service.tracking.operations.running import OPERATION_OF, CurrentOperation, ServiceState
 from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
-from service.tracking.running_operations import OPERATION_OF, CurrentOperation, ServiceState
 from service.tracking.state import AcquisitionStage, Mode
-from studies import reference
+from studies import dispatch, reference
 from studies.contract_tables import described, table, with_tables
 
 ROOT = Path(__file__).parents[1]
@@ -122,6 +122,7 @@ PAGES = {
     "reference/settings.md": reference.settings,
     "reference/instrument.md": reference.instrument,
     "reference/cli.md": reference.commands,
+    "understand/tracker.md": dispatch.page,
     "integrate/rest.md": rest,
     "operate/runbook.md": runbook,
 }

@@ -35,7 +35,7 @@ from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
-from service.tracking.measuring import MEASUREMENTS_KEPT
+from service.tracking.operations.measurement import MEASUREMENTS_KEPT
 from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
 from service.web.keys import KeyFile

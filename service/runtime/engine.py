@@ -37,9 +37,9 @@ from service.tracking import events as ev
 from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.dither import SILENT_S
 from service.tracking.events import Effect, Event
+from service.tracking.operations.running import OperationKind, under_way
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.running_operations import OperationKind, under_way
-from service.tracking.state import Level, TrackerState
+from service.tracking.state import TrackerState
 from service.wire import Status
 
 TOLD_S = 8.0
@@ -231,10 +231,10 @@ def process_blocks(
 
 def follow_state(
     bank: EstimatorBank, state: TrackerState, policy: Policy
-) -> tuple[EstimatorBank, ev.LogEvent | None]:
+) -> tuple[EstimatorBank, ev.DitherUnusable | None]:
     """Keep the streaming estimators in step with the RTC and the dither.
 
-    Returns the streams, and what to put on record when the dither cannot be read.
+    Returns the streams, and what to tell the tracker when the dither cannot be read.
     """
     if blocking_alarm(state, Interlock.ASK) is not None:
         return with_rtc(bank, None), None
@@ -244,8 +244,7 @@ def follow_state(
         return with_dither(bank, dither, policy.window_s), None
     except ModelError as error:
         unusable = None if dither is None else replace(dither, asked_ns_utc=0)
-        note = ev.LogEvent(name="dither.unusable", text=str(error), level=Level.WARNING)
-        return replace(bank, cutter=None, dither=unusable), note
+        return replace(bank, cutter=None, dither=unusable), ev.DitherUnusable(text=str(error))
 
 
 def detect_changes(was_silent_s: float, bank: EstimatorBank, state: TrackerState) -> list[Event]:

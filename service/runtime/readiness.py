@@ -15,9 +15,9 @@ from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
+from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.running_operations import operating
 from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.tracking.update_policy import PROPOSAL_STANDS_S, outdated

@@ -16,9 +16,9 @@ from service.tracking.alarm_records import muted, record_of, stale, worst
 from service.tracking.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
 from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
+from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
 from service.tracking.registration import Registration
-from service.tracking.running_operations import Operating, operating
 from service.tracking.sending import why_no_return
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status

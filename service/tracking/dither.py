@@ -19,6 +19,7 @@ from service.tracking import events as ev
 from service.tracking.dither_modes import N_LINES
 from service.tracking.dither_plan import WantedDither
 from service.tracking.dither_request import (
+    GONE_WITHIN_S,
     NOISY_DITHER,
     OWN_DITHER,
     Dither,
@@ -32,7 +33,6 @@ from service.tracking.dither_request import (
     why_unusable,
 )
 from service.tracking.policy import SECOND_NS
-from service.tracking.running_operations import GONE_WITHIN_S
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status

@@ -43,6 +43,9 @@ an operator, one that measures a noisy interaction matrix, and one that finds α
 
 OUR_DITHERS = (OWN_DITHER, ASKED_DITHER, NOISY_DITHER, ACQUIRING_DITHER)
 
+GONE_WITHIN_S = 3.0
+"""For a stop to be answered, and for the next status to show it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dither:

@@ -175,6 +175,14 @@ class LogEvent:
     level: Level = Level.INFO
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DitherUnusable:
+    """The dither that plays cannot be read from the frames; an acquisition ends with it."""
+
+    text: str
+    """Why."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WindowFitted:
     """The worker estimated α from one window."""
@@ -382,6 +390,7 @@ Event = (
     | Acknowledgement
     | Answered
     | DitherSilent
+    | DitherUnusable
     | DitherMeasured
     | Compared
     | LoopHeld

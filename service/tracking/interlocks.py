@@ -14,15 +14,15 @@ from typing import Final, get_args
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
-from service.tracking.acquisition_stages import why_not_now
 from service.tracking.alarm_records import PREFIX
 from service.tracking.alarms import ALARMS
 from service.tracking.commands import Command
 from service.tracking.loop import NO_RTC
+from service.tracking.operations.acquisition_stages import why_not_now
+from service.tracking.operations.running import OperationKind, RunningOperation, under_way
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import known_record
-from service.tracking.running_operations import OperationKind, RunningOperation, under_way
 from service.tracking.sending import beyond_judging, why_refused
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.tracking.update_policy import left_behind

@@ -17,9 +17,9 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, step_text,
 from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.alarms import Interlock
+from service.tracking.operations.running import ramping
 from service.tracking.policy import SECOND_NS, Offloading, Policy
 from service.tracking.registration import Offload, OffloadState, Registration, Validity
-from service.tracking.running_operations import ramping
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import settled

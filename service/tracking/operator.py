@@ -29,6 +29,7 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Level, Mode
 from service.tracking.step_context import StepContext
+from service.tracking.validity import point
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
@@ -140,6 +141,11 @@ def _republish(context: StepContext, source: str, why: str, *, anyway: bool = Fa
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
     reconstructors.make(context, ev.RepublishMatrix(source=source, why=why, anyway=anyway))
     enter_hold(context, why)
+
+
+def set_pointing(context: StepContext, command: cmd.SetPointing) -> None:
+    """Note where the telescope looks, as the observatory tells it."""
+    point(context, command.pointing)
 
 
 def enter_hold(context: StepContext, why: str) -> None:

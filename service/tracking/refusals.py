@@ -7,8 +7,8 @@ from dataclasses import replace
 from service.estimation.windows import RefusalKind
 from service.tracking import alarms
 from service.tracking.alarms import Interlock
+from service.tracking.operations.running import ramping
 from service.tracking.policy import SECOND_NS
-from service.tracking.running_operations import ramping
 from service.tracking.step_context import StepContext, says_the_same
 
 IN_A_ROW = 3

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 from service.tracking import commands as cmd
 from service.tracking import dither, offload
-from service.tracking.acquisition import inherit, left_behind
-from service.tracking.acquisition_stages import abort
 from service.tracking.alarm_records import take_over
 from service.tracking.alarms import STOPPED, Interlock
-from service.tracking.measuring import give_up
+from service.tracking.operations.acquisition import inherit, left_behind
+from service.tracking.operations.acquisition_stages import abort
+from service.tracking.operations.measurement import give_up
+from service.tracking.operations.running import ramping
 from service.tracking.operator import change_mode
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import prune
-from service.tracking.running_operations import ramping
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.validity import age, restore

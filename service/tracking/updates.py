@@ -6,10 +6,10 @@ from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
 from service.tracking.mode_proof import awaits_proof, n_proven_modes
+from service.tracking.operations.running import ramping
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import fetch, judge, make
-from service.tracking.running_operations import ramping
 from service.tracking.sending import why_no_return, why_unsendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext

@@ -22,12 +22,12 @@ from service.estimation.windows import RefusalKind
 from service.model.misregistration import Misregistration, step_text
 from service.tracking import alarms, filtering, jumps, refusals, validity
 from service.tracking import events as ev
-from service.tracking.acquisition_stages import count_miss
 from service.tracking.dither import found_again
 from service.tracking.dither_plan import why_none as why_no_dither
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
 from service.tracking.loop import loop_numbers, same_numbers
+from service.tracking.operations.acquisition_stages import count_miss
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
     HistoryEntry,
@@ -243,7 +243,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
     reason = _why_passive_unusable(context.state, event) or _why_known_already(context.state, event)
     if reason is not None:
-        note_passive_unavailable(context, f"a look was not used: {reason}")
+        _note_unavailable(context, f"a look was not used: {reason}")
         return
     registration, estimate = context.registration, event.estimate
     if registration is None:
@@ -294,8 +294,12 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     _show(context, event, sigma, joint.bias, "agrees with α and with what is known of its own bias")
 
 
-def note_passive_unavailable(context: StepContext, why: str) -> None:
+def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
     """Note why ordinary telemetry says nothing of α now."""
+    _note_unavailable(context, event.text)
+
+
+def _note_unavailable(context: StepContext, why: str) -> None:
     context.state = replace(context.state, passive_unavailable_reason=why)
 
 

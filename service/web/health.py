@@ -20,9 +20,9 @@ from service.link.statistics import LinkStatistics
 from service.runtime.snapshot import Snapshot, WorkerLoad
 from service.tracking.alarms import ARCHIVE_FAILED, WORKER_BEHIND, AlarmState, Responsible, Severity
 from service.tracking.dither_request import DitherPhase
+from service.tracking.operations.running import CurrentOperation, ServiceState
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
-from service.tracking.running_operations import CurrentOperation, ServiceState
 from service.tracking.state import Mode, TrackerState
 from service.web.authentication import OPEN
 from service.web.problems import problem, problem_response

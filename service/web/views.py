@@ -38,9 +38,9 @@ from service.tracking.dither_request import Dither, DitherPlan, DitherPolicyStat
 from service.tracking.interlocks import Permission
 from service.tracking.loop import LoopCommand
 from service.tracking.mode_limits import ModeLimit, ModeProof
+from service.tracking.operations.running import Operating
 from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
 from service.tracking.registration import HistoryEntry, Offload, PassiveState
-from service.tracking.running_operations import Operating
 from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState
 from service.wire import Pointing
 

@@ -24,9 +24,9 @@ from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
 from service.tracker import step
 from service.tracking.events import Effect, Event
+from service.tracking.operations.running import under_way
 from service.tracking.policy import Policy
 from service.tracking.resume import restored, resumed, saved_of
-from service.tracking.running_operations import under_way
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import new_lines
 from studies.campaign.golden_codec import Json, decoded, encoded

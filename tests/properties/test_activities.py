@@ -7,10 +7,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.interlocks import ALLOWS
+from service.tracking.operations.running import OperationKind, under_way
 from service.tracking.products import MeasureState
-from service.tracking.running_operations import OperationKind, under_way
 from service.wire import DitherStop
-from tests.unit.tracking.test_activity import (
+from tests.unit.tracking.operations.test_running import (
     ACTIVITIES,
     COMMANDS,
     LONGEST_S,

@@ -6,7 +6,7 @@ import pytest
 
 from service.tracking.alarms import Alarm, AlarmRecord, OperatorNote, Severity
 from service.tracking.commands import AcknowledgeAlarm, MuteAlarm, UnmuteAlarm
-from service.tracking.running_operations import ServiceState
+from service.tracking.operations.running import ServiceState
 from tests.unit.test_api import (  # noqa: F401
     SECOND,
     body_of,

@@ -15,8 +15,8 @@ from service.tracking.registration import Registration
 from service.tracking.resume import saved_of
 from service.tracking.state import Mode, Orders
 from service.wire import Pointing
+from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import START_NS, Story, moved, rtc
-from tests.unit.tracking.test_acquisition import Acquiring
 from tests.unit.tracking.test_watchdog import learnt, watch
 
 

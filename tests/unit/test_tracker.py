@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
-from service.tracker import REACTIONS, step
+from service.tracker import REACTIONS, TAKEN_BY_OPERATIONS, step
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.events import Event
@@ -157,4 +157,10 @@ def test_a_command_that_is_refused_changes_nothing():
 
 
 def test_there_is_a_reaction_to_every_event_and_command_and_to_nothing_else():
-    assert set(REACTIONS) == set(get_args(Event))
+    assert set(REACTIONS) == set(get_args(Event)) - TAKEN_BY_OPERATIONS
+
+
+def test_each_is_taken_in_by_one_function_that_says_what_it_does():
+    for kind, reaction in REACTIONS.items():
+        assert reaction.__name__ != "<lambda>", kind
+        assert reaction.__doc__, kind

@@ -11,8 +11,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import AckState, Pattern, Reply
-from tests.unit.tracking.situations import acknowledged, record, verdict
-from tests.unit.tracking.test_activity import (
+from tests.unit.tracking.operations.test_running import (
     acquiring,
     gathering,
     idle,
@@ -20,6 +19,7 @@ from tests.unit.tracking.test_activity import (
     own_dither,
     sending,
 )
+from tests.unit.tracking.situations import acknowledged, record, verdict
 
 
 def given(world, command):

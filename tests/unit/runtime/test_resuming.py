@@ -19,8 +19,8 @@ from service.tracking.resume import restored
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from studies.campaign.acquisition import Start
 from studies.campaign.observatory import Observatory
+from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import START_NS
-from tests.unit.tracking.test_acquisition import Acquiring
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 START = Start(instrument=str(SMALL), n_controlled=60, seed=0)

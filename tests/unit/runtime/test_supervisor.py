@@ -24,8 +24,8 @@ from tests.system.cable import free_port
 from tests.system.fake_rtc import client_session
 from tests.system.pace import Deadline, in_time, patience
 from tests.unit.test_link import applied, send
+from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import POLICY, Story, record
-from tests.unit.tracking.test_acquisition import Acquiring
 
 pytestmark = pytest.mark.timeout(60)
 

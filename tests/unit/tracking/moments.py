@@ -7,8 +7,8 @@ from service.tracking import events as ev
 from service.tracking.alarms import AlarmRecord, Severity
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
+from tests.unit.tracking.operations.test_running import ACTIVITIES
 from tests.unit.tracking.situations import POLICY, Story, moved, rtc
-from tests.unit.tracking.test_activity import ACTIVITIES
 
 SUM = "a" * 64
 

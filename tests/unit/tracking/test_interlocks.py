@@ -10,7 +10,7 @@ from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking.interlocks import ORDERS, Permission, permissions, permitted
 from tests.unit.tracking.moments import MOMENTS, in_use, meant, proposed, refused_since
-from tests.unit.tracking.test_activity import COMMANDS, ramping
+from tests.unit.tracking.operations.test_running import COMMANDS, ramping
 
 NAMED = [name for name in ORDERS if name != "set_value"]
 

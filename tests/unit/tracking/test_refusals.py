@@ -6,8 +6,8 @@ from service.estimation.windows import RefusalKind, WindowRefused
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import WINDOWS_REFUSED
+from service.tracking.operations.running import ServiceState, operating
 from service.tracking.refusals import IN_A_ROW
-from service.tracking.running_operations import ServiceState, operating
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
 

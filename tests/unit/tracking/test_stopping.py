@@ -6,13 +6,12 @@ from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.interlocks import ALLOWS
+from service.tracking.operations.running import under_way
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.running_operations import under_way
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.wire import DitherStop, Loop, LoopRequest
-from tests.unit.tracking.situations import POLICY, of_kind
-from tests.unit.tracking.test_activity import (
+from tests.unit.tracking.operations.test_running import (
     ACTIVITIES,
     acquiring,
     gathering,
@@ -23,6 +22,7 @@ from tests.unit.tracking.test_activity import (
     ramping,
     sending,
 )
+from tests.unit.tracking.situations import POLICY, of_kind
 from tests.unit.tracking.world import World
 
 STOP = cmd.StopEverything(by="Ada", reason="someone is on the platform")

@@ -11,8 +11,9 @@ from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition import PATIENCE_S
-from service.tracking.acquisition_stages import (
+from service.tracking.dither_request import lock_in_plan
+from service.tracking.operations.acquisition import PATIENCE_S
+from service.tracking.operations.acquisition_stages import (
     MAX_ATTEMPTS,
     MAX_MISSES,
     MISSES_BEFORE,
@@ -20,7 +21,6 @@ from service.tracking.acquisition_stages import (
     OUT_OF_HAND_S,
     wide_capture_dither,
 )
-from service.tracking.dither_request import lock_in_plan
 from service.tracking.products import MatrixState
 from service.tracking.state import AcquisitionStage, Mode
 from service.tracking.update_policy import fewer_than
@@ -618,7 +618,7 @@ def test_one_whose_dither_cannot_be_read_ends_and_says_why():
     story = Acquiring()
     story.tell(cmd.Acquire())
     story.open()
-    story.tell(ev.LogEvent(name="dither.unusable", text="600 frames cut a period"))
+    story.tell(ev.DitherUnusable(text="600 frames cut a period"))
     assert story.stage is AcquisitionStage.FAILED
     assert "600 frames cut a period" in story.text
 

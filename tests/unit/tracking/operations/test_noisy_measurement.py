@@ -8,7 +8,7 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.measuring import FREE_WITHIN_S
+from service.tracking.operations.noisy_measurement import FREE_WITHIN_S
 from service.tracking.products import MeasureState, ModeSet, NoisyFinding
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (

@@ -6,13 +6,13 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_stages import MAX_ATTEMPTS
+from service.tracking.operations.acquisition_stages import MAX_ATTEMPTS
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import AcquisitionStage, Mode, TrackerState
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
+from tests.unit.tracking.operations.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring
 from tests.unit.tracking.situations import POLICY, SECOND, foreign
-from tests.unit.tracking.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring
 
 N_MODES = 594
 OPEN = {"loop": "open", "gains": (0.0,) * N_MODES, "cm_id": "initial"}

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from service.tracking.alarms import STANDING_BY, Alarm, Severity
-from service.tracking.dither_request import OUR_DITHERS, OWN_DITHER
+from service.tracking.dither_request import GONE_WITHIN_S, OUR_DITHERS, OWN_DITHER
 from service.tracking.loop import NO_RTC, CommandState, LoopCommand, why_open
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Mode, TrackerState
-
-GONE_WITHIN_S = 3.0
-"""For a stop to be answered, and for the next status to show it."""
 
 ANSWERED_WITHIN_S = 30.0
 """A gain ramp that the RTC has neither accepted nor refused for so long is none."""

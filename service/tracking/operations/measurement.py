@@ -1,7 +1,4 @@
-"""Interaction matrices that are measured: by the RTC alone, or on sky by a random dither.
-
-Of a noisy one the sums are kept where the telemetry comes in; here is only how far each is.
-"""
+"""Interaction matrices that the RTC measures by itself, and the records of all measurements."""
 
 from __future__ import annotations
 
@@ -12,25 +9,15 @@ import numpy as np
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither import ask_for, make_way
-from service.tracking.dither_request import RANDOM_TOTAL_M, check_modes, cost_of, plan_random
+from service.tracking.dither import make_way
+from service.tracking.dither_request import check_modes
 from service.tracking.events import Event
 from service.tracking.loop import present
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MeasurementRecord, MeasureState
-from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.wire import DitherRequest, MatrixStrokes, MeasureRequest, Pattern, Reply, Status
-
-DURATION_S = 30.0
-"""Where none is asked for: an element is worth its noise by then, on a bright star."""
-
-FREE_WITHIN_S = 15.0
-"""For the service's own dither to be gone from the RTC's status."""
-
-MADE_WITHIN_S = 120.0
-"""For the fit and the archive."""
+from service.wire import MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 MEASUREMENTS_KEPT = 300
 
@@ -71,7 +58,7 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
     record = _planned(command, rtc, context.policy, context.now_ns)
     check_modes(record.modes, rtc)
-    _keep(context, record)
+    keep(context, record)
     context.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
     strokes = {field.name: getattr(record, field.name) for field in fields(MatrixStrokes)}
     context.ask(
@@ -79,6 +66,11 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
             request=MeasureRequest(pattern=command.pattern, n_average=record.n_average, **strokes)
         )
     )
+
+
+def give_up_on_command(context: StepContext, command: cmd.GiveUp) -> None:
+    """Wait no longer for a matrix because an operator says so."""
+    give_up(context, command.id)
 
 
 def give_up(context: StepContext, measurement_id: str) -> None:
@@ -91,13 +83,13 @@ def give_up(context: StepContext, measurement_id: str) -> None:
         return
     given_up = replace(record, state=MeasureState.GIVEN_UP)
     if record.pattern is None:
-        _keep(context, replace(given_up, reason="by the operator"))
+        keep(context, replace(given_up, reason="by the operator"))
         context.log("noisy-matrix.given-up", record.id)
         if context.dither is not None and context.dither.id == record.id:
             make_way(context)
         return
     text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
-    _keep(context, replace(given_up, reason=text))
+    keep(context, replace(given_up, reason=text))
     context.log("measurement.given-up", f"{record.id}: {text}")
     if record.opens_loop and record.closed_before:
         begin_closing(context)
@@ -108,7 +100,7 @@ def give_up(context: StepContext, measurement_id: str) -> None:
     context.put_off(dither_s=left_s, make_s=left_s)
 
 
-def watch_measurement(context: StepContext, event: Event) -> None:
+def watch(context: StepContext, event: Event) -> None:
     """Give up a matrix that cannot come any more, before anybody else sees the event."""
     record, rtc = context.state.measuring, context.rtc
     if record is None:
@@ -126,10 +118,15 @@ def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> No
     if record is not None:
         state = MeasureState.RUNNING if reply.accepted else MeasureState.REFUSED
         answered = replace(record, state=state, reason=reply.reason, start_seq=reply.start_seq)
-        on_measured(context, answered)
+        _note(context, answered)
 
 
-def on_measured(context: StepContext, record: MeasurementRecord) -> None:
+def on_measured(context: StepContext, event: ev.MatrixMeasured) -> None:
+    """Take over how far a measurement is, from whoever makes its matrix."""
+    _note(context, event.record)
+
+
+def _note(context: StepContext, record: MeasurementRecord) -> None:
     """Take over how far a measurement is; one that is over does not begin again."""
     known = context.state.measurement(record.id)
     if known is not None:
@@ -147,7 +144,7 @@ def on_measured(context: StepContext, record: MeasurementRecord) -> None:
     if record.state is MeasureState.FAILED:
         fail(context, record, record.reason)
         return
-    _keep(context, record)
+    keep(context, record)
     name, found = f"{_kind(record)}.{record.state}", record.finding
     match record.state:
         case MeasureState.RUNNING:
@@ -168,7 +165,7 @@ def fail(context: StepContext, record: MeasurementRecord | None, text: str) -> N
     """Note why there is no matrix, unless nobody waits for it any more."""
     known = None if record is None else context.state.measurement(record.id)
     if record is not None and (known is None or known.state is not MeasureState.GIVEN_UP):
-        _keep(context, replace(record, state=MeasureState.FAILED, reason=text))
+        keep(context, replace(record, state=MeasureState.FAILED, reason=text))
         context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
 
 
@@ -183,14 +180,14 @@ def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed:
     if context.now_ns - asked_ns > LONGEST_S * SECOND_NS:
         fail(context, record, f"no matrix came within {LONGEST_S:.0f} s")
     elif not (record.opens_loop and closed and record.start_seq is not None):
-        _keep(context, replace(record, overdue_since_ns_utc=None))
+        keep(context, replace(record, overdue_since_ns_utc=None))
     else:
         since_ns = record.overdue_since_ns_utc or context.now_ns
         if context.now_ns - since_ns > OVERDUE_S * SECOND_NS:
             text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
             fail(context, record, text)
         else:
-            _keep(context, replace(record, overdue_since_ns_utc=since_ns))
+            keep(context, replace(record, overdue_since_ns_utc=since_ns))
 
 
 def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
@@ -219,129 +216,7 @@ def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> 
     )
 
 
-def _keep(context: StepContext, record: MeasurementRecord) -> None:
+def keep(context: StepContext, record: MeasurementRecord) -> None:
+    """Keep what is known of a measurement in place of what was known before."""
     others = tuple(r for r in context.state.measurements if r.id != record.id)
     context.state = replace(context.state, measurements=(*others, record)[-MEASUREMENTS_KEPT:])
-
-
-def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
-    """Measure a noisy interaction matrix: first the dither that runs has to end.
-
-    Raises
-    ------
-    CommandError
-        If it costs more than the budget, or names an id that was used before.
-    """
-    rtc = present(context.rtc)
-    if context.state.measurement(command.id) is not None:
-        raise CommandError(f"{command.id} was measured before; ids are never reused")
-    duration_s = command.duration_s or DURATION_S
-    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, context.policy.dither_budget_m)
-    cost_of(total, context.policy, over_budget=command.over_budget)
-    dither = plan_random(
-        rtc,
-        context.policy,
-        context.now_ns,
-        dither_id=command.id,
-        modes=command.modes,
-        total_m=total,
-        duration_s=duration_s,
-    )
-    record = MeasurementRecord(
-        id=command.id,
-        state=MeasureState.WAITING,
-        pattern=None,
-        modes=dither.request.modes,
-        amplitude_m=dither.request.amplitude_m,
-        duration_s=duration_s,
-        window_s=dither.window_s,
-        seed=dither.request.seed,
-        asked_ns_utc=context.now_ns,
-        basis_id=rtc.basis_id,
-        config_id=rtc.config_id,
-    )
-    _keep(context, record)
-    text = (
-        f"{record.id}: {len(record.modes)} modes, {1e9 * record.total_m:.3g} nm RMS in all, "
-        f"{duration_s:g} s"
-    )
-    context.log("noisy-matrix.asked", text)
-    make_way(context)
-
-
-def follow_noisy(context: StepContext, event: Event) -> None:
-    """Go on with the one under way: start its dither, note that it plays, or that it is over."""
-    record, rtc = context.state.noisy_measurement, context.rtc
-    if record is None:
-        return
-    waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
-    match record.state:
-        case MeasureState.WAITING if isinstance(event, cmd.StopDither):
-            cut_off(context, "the operator stopped the dither")
-        case MeasureState.WAITING:
-            if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
-                _begin_noisy(context, record, rtc)
-            elif waited_s > FREE_WITHIN_S:
-                cut_off(context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
-        case MeasureState.ASKED | MeasureState.RUNNING:
-            _follow_playing(context, record, event)
-        case _:
-            # a simulated RTC may be ten times slower than its timestamps
-            if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
-                cut_off(context, "the worker did not answer")
-
-
-def cut_off(context: StepContext, why: str) -> None:
-    """End the one under way, if there is one, without a matrix."""
-    record = context.state.noisy_measurement
-    if record is not None:
-        fail(context, record, why)
-
-
-def awaits_its_dither(state: TrackerState) -> bool:
-    """Return whether another dither has to end first: until then the service begins none."""
-    record = state.noisy_measurement
-    return record is not None and record.state is MeasureState.WAITING
-
-
-def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -> None:
-    try:
-        dither = plan_random(
-            rtc,
-            context.policy,
-            context.now_ns,
-            dither_id=record.id,
-            modes=record.modes,
-            total_m=record.total_m,
-            duration_s=record.duration_s or DURATION_S,
-        )
-    except CommandError as error:  # the RTC is another than when it was asked for
-        fail(context, record, str(error))
-        return
-    window_s, seed = dither.window_s, dither.request.seed
-    _keep(context, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed))
-    ask_for(context, dither)
-
-
-def _follow_playing(context: StepContext, record: MeasurementRecord, event: Event) -> None:
-    match event:
-        case ev.Answered(
-            request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
-        ):
-            fail(context, record, f"the RTC refused the dither: {reason}")
-            return
-        case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
-            fail(context, record, text)
-            return
-        case _:
-            pass
-    dither, asked = context.dither, record.state is MeasureState.ASKED
-    if dither is not None and dither.id == record.id:
-        if asked and dither.start_seq is not None:
-            _keep(context, replace(record, state=MeasureState.RUNNING))
-    elif asked:
-        fail(context, record, "its dither never began")
-    else:
-        record = replace(record, state=MeasureState.FINISHING)
-        _keep(context, record)
-        context.ask(ev.FinishNoisy(record=record))

@@ -18,7 +18,6 @@ from dataclasses import replace
 
 from service.control.gate import FORGIVING_LEAK
 from service.estimation.windows import RefusalKind
-from service.tracking import acquisition_stages as stages
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors, update_policy
@@ -26,10 +25,11 @@ from service.tracking.alarms import ACQUISITION, Interlock
 from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.events import Event
 from service.tracking.loop import present
-from service.tracking.measuring import cut_off
+from service.tracking.operations import acquisition_stages as stages
+from service.tracking.operations.noisy_measurement import cut_off
+from service.tracking.operations.running import ramping
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.running_operations import ramping
 from service.tracking.sending import why_unsendable
 from service.tracking.state import Acquisition, AcquisitionStage, Interruption, Mode, TrackerState
 from service.tracking.step_context import StepContext
@@ -160,7 +160,7 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
             stages.restart(context, "the RTC began a new session")
         case ev.DitherMeasured(id=loud, text=text) if loud == state.dither_policy.loud_id and text:
             stages.give_up(context, text)
-        case ev.LogEvent(name="dither.unusable", text=text):
+        case ev.DitherUnusable(text=text):
             stages.give_up(context, f"its dither cannot be read: {text}")
         case ev.Tick() if late:
             stages.restart(context, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")

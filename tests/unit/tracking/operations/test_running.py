@@ -9,8 +9,8 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.operations.running import under_way
 from service.tracking.products import MatrixState, MeasureState, ModeSet
-from service.tracking.running_operations import under_way
 from service.tracking.state import AcquisitionStage, Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern
 from tests.unit.tracking.situations import POLICY, Story

@@ -5,14 +5,14 @@ import pytest
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition import ENOUGH_WINDOWS
-from service.tracking.acquisition_stages import MISSES_DESPITE
+from service.tracking.operations.acquisition import ENOUGH_WINDOWS
+from service.tracking.operations.acquisition_stages import MISSES_DESPITE
 from service.tracking.products import MatrixState
 from service.tracking.state import AcquisitionStage, Mode
 from service.wire import Loop, LoopRequest
+from tests.unit.tracking.operations.test_acquisition import CALM, DIVERGING, FAR, Acquiring
+from tests.unit.tracking.operations.test_acquisition_restart import Again
 from tests.unit.tracking.situations import foreign, moved
-from tests.unit.tracking.test_acquisition import CALM, DIVERGING, FAR, Acquiring
-from tests.unit.tracking.test_acquisition_restart import Again
 
 SLIPPED = ev.ConditionChanged(name="edge-slip", text="found")
 

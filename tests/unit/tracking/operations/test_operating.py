@@ -7,7 +7,7 @@ import pytest
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
-from service.tracking.running_operations import CurrentOperation, ServiceState, operating
+from service.tracking.operations.running import CurrentOperation, ServiceState, operating
 from service.tracking.state import Acquisition, AcquisitionStage, Mode
 from service.wire import Loop
 from tests.unit.tracking.situations import Story, rtc

@@ -1,0 +1,154 @@
+"""Noisy interaction matrices: measured on sky by random signs of many modes at once.
+
+The sums are kept where the telemetry comes in; here is only how far each measurement is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.errors import CommandError
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.dither import ask_for, make_way
+from service.tracking.dither_request import RANDOM_TOTAL_M, cost_of, plan_random
+from service.tracking.events import Event
+from service.tracking.loop import present
+from service.tracking.operations.measurement import fail, keep
+from service.tracking.policy import SECOND_NS
+from service.tracking.products import MeasurementRecord, MeasureState
+from service.tracking.state import TrackerState
+from service.tracking.step_context import StepContext
+from service.wire import DitherRequest, Reply, Status
+
+DURATION_S = 30.0
+"""Where none is asked for: an element is worth its noise by then, on a bright star."""
+
+FREE_WITHIN_S = 15.0
+"""For the service's own dither to be gone from the RTC's status."""
+
+MADE_WITHIN_S = 120.0
+"""For the fit and the archive."""
+
+
+def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
+    """Measure a noisy interaction matrix: first the dither that runs has to end.
+
+    Raises
+    ------
+    CommandError
+        If it costs more than the budget, or names an id that was used before.
+    """
+    rtc = present(context.rtc)
+    if context.state.measurement(command.id) is not None:
+        raise CommandError(f"{command.id} was measured before; ids are never reused")
+    duration_s = command.duration_s or DURATION_S
+    total = command.total_amplitude_m or min(RANDOM_TOTAL_M, context.policy.dither_budget_m)
+    cost_of(total, context.policy, over_budget=command.over_budget)
+    dither = plan_random(
+        rtc,
+        context.policy,
+        context.now_ns,
+        dither_id=command.id,
+        modes=command.modes,
+        total_m=total,
+        duration_s=duration_s,
+    )
+    record = MeasurementRecord(
+        id=command.id,
+        state=MeasureState.WAITING,
+        pattern=None,
+        modes=dither.request.modes,
+        amplitude_m=dither.request.amplitude_m,
+        duration_s=duration_s,
+        window_s=dither.window_s,
+        seed=dither.request.seed,
+        asked_ns_utc=context.now_ns,
+        basis_id=rtc.basis_id,
+        config_id=rtc.config_id,
+    )
+    keep(context, record)
+    text = (
+        f"{record.id}: {len(record.modes)} modes, {1e9 * record.total_m:.3g} nm RMS in all, "
+        f"{duration_s:g} s"
+    )
+    context.log("noisy-matrix.asked", text)
+    make_way(context)
+
+
+def follow(context: StepContext, event: Event) -> None:
+    """Go on with the one under way: start its dither, note that it plays, or that it is over."""
+    record, rtc = context.state.noisy_measurement, context.rtc
+    if record is None:
+        return
+    waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
+    match record.state:
+        case MeasureState.WAITING if isinstance(event, cmd.StopDither):
+            cut_off(context, "the operator stopped the dither")
+        case MeasureState.WAITING:
+            if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
+                _begin_noisy(context, record, rtc)
+            elif waited_s > FREE_WITHIN_S:
+                cut_off(context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
+        case MeasureState.ASKED | MeasureState.RUNNING:
+            _follow_playing(context, record, event)
+        case _:
+            # a simulated RTC may be ten times slower than its timestamps
+            if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
+                cut_off(context, "the worker did not answer")
+
+
+def cut_off(context: StepContext, why: str) -> None:
+    """End the one under way, if there is one, without a matrix."""
+    record = context.state.noisy_measurement
+    if record is not None:
+        fail(context, record, why)
+
+
+def awaits_its_dither(state: TrackerState) -> bool:
+    """Return whether another dither has to end first: until then the service begins none."""
+    record = state.noisy_measurement
+    return record is not None and record.state is MeasureState.WAITING
+
+
+def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -> None:
+    try:
+        dither = plan_random(
+            rtc,
+            context.policy,
+            context.now_ns,
+            dither_id=record.id,
+            modes=record.modes,
+            total_m=record.total_m,
+            duration_s=record.duration_s or DURATION_S,
+        )
+    except CommandError as error:  # the RTC is another than when it was asked for
+        fail(context, record, str(error))
+        return
+    window_s, seed = dither.window_s, dither.request.seed
+    keep(context, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed))
+    ask_for(context, dither)
+
+
+def _follow_playing(context: StepContext, record: MeasurementRecord, event: Event) -> None:
+    match event:
+        case ev.Answered(
+            request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
+        ):
+            fail(context, record, f"the RTC refused the dither: {reason}")
+            return
+        case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
+            fail(context, record, text)
+            return
+        case _:
+            pass
+    dither, asked = context.dither, record.state is MeasureState.ASKED
+    if dither is not None and dither.id == record.id:
+        if asked and dither.start_seq is not None:
+            keep(context, replace(record, state=MeasureState.RUNNING))
+    elif asked:
+        fail(context, record, "its dither never began")
+    else:
+        record = replace(record, state=MeasureState.FINISHING)
+        keep(context, record)
+        context.ask(ev.FinishNoisy(record=record))

@@ -47,6 +47,10 @@ RESEMBLANCE = 0.5
 ADVANTAGE = 2.0
 """Those told must do worse by this factor."""
 
+_ONE_MODE = 2
+"""Of more lines than this one alone that contradicts is a mode that answers otherwise: other axes
+would turn about half of them. The next modes that are dithered tell if it was the axes after all."""
+
 LAGS = np.arange(-3.0, 3.1, 0.5)
 """Frames by which slopes may lag the commands of their row and still be recognised."""
 
@@ -146,6 +150,8 @@ def of_answer(
     }
     best = max(every.values())
     if best < RESEMBLANCE or as_told * ADVANTAGE > best or lagging > best:
+        return SlopeConvention(wrong=unit)
+    if len(slopes) > _ONE_MODE and np.sum(_of_lines(as_seen, model) < RESEMBLANCE) == 1:
         return SlopeConvention(wrong=unit)
     alike = [setting for setting, much in every.items() if much > best - MIN_LEAD]
     found = min(alike, key=lambda setting: _n_changes(setting, reported))
@@ -258,7 +264,13 @@ def _planes(rows: Array, slopes: SlopeRecipe, mask: NDArray[np.bool_]) -> Array:
 
 def _resemblance(seen: Array, model: Array) -> float:
     """Return the mean correlation of the lines, -1..1: one sign for all, no lag."""
+    return float(np.mean(_of_lines(seen, model)))
+
+
+def _of_lines(seen: Array, model: Array) -> Array:
+    """Return the correlation of each line, ``(n_lines,)``, -1..1."""
     lines = (0, 1, 2)
     along = np.sum(seen * model.conj(), axis=lines).real
     size = np.sqrt(np.sum(np.abs(seen) ** 2, axis=lines) * np.sum(np.abs(model) ** 2, axis=lines))
-    return float(np.mean(along / size))
+    correlations: Array = along / size
+    return correlations

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.estimation.slope_convention import of_answer
 from service.estimation.windows import RefusalKind
 from service.model.instrument import FrameWindows
 from service.model.interaction import InteractionModel, rtc_valid_subapertures
@@ -213,3 +214,42 @@ def test_what_is_as_told_is_not_complained_of():
         assert not bench.read_slope_convention(rtc.own, None).wrong
         found = bench.fit(dithered_window(Sensor(rtc.seen), ALPHA_SMALL), open_loop(rtc.own), None)
         assert np.all(np.abs(found.alpha.vector - ALPHA_SMALL.vector) < 0.01)
+
+
+def told_upright():
+    return replace(small_instrument(), slopes=SlopeRecipe(orientation=Orientation()))
+
+
+def seen_mirrored():
+    """The small matrix, as it is and as an RTC with y counted downwards lists it, by mode."""
+    mask, mirrored = rtc_valid_subapertures(small_instrument()), Orientation(flip_y=True)
+    matrix = matrix_at(Misregistration())
+    upright = to_rtc(matrix, SlopeRecipe(orientation=Orientation()), mask)
+    return upright.T, to_rtc(matrix, SlopeRecipe(orientation=mirrored), mask).T
+
+
+def parities(upright, other):
+    """How each mode correlates with itself, y counted the other way."""
+    size = np.linalg.norm(upright, axis=1) * np.linalg.norm(other, axis=1)
+    return np.sum(upright * other, axis=1) / size
+
+
+def test_one_mode_of_the_other_sign_is_not_taken_for_other_axes():
+    """Three modes look the same with y counted downwards, the fourth is turned over by it."""
+    upright, other = seen_mirrored()
+    alike = parities(upright, other)
+    modes = [*np.argsort(alike)[-3:], np.argmin(alike)]
+    expected = upright[modes].astype(complex)
+    slopes = expected * np.array([1.0, 1.0, 1.0, -1.0])[:, None]
+    noise = np.random.default_rng(3).normal(size=(3, expected.shape[1]))
+    slopes[:3] += 0.75 * noise * np.sqrt(np.mean(np.abs(expected[:3]) ** 2, axis=1))[:, None]
+    assert of_answer(slopes, expected, np.zeros(4), told_upright()).wrong == ""
+
+
+def test_axes_that_turn_half_of_the_modes_over_are_named():
+    upright, other = seen_mirrored()
+    alike = parities(upright, other)
+    modes = [*np.argsort(alike)[-2:], *np.argsort(alike)[:2]]
+    expected = upright[modes].astype(complex)
+    found = of_answer(other[modes].astype(complex), expected, np.zeros(4), told_upright())
+    assert "orientation.flip_y = true" in found.wrong

@@ -83,7 +83,7 @@ def _go_on(context: StepContext, event: Event) -> None:
     if context.state.measuring is not None:
         return
     fetch_in_use(context)
-    if context.state.stopped_because:
+    if context.operator.stopped_because:
         resume.keep_stopped(context)
         return
     acquisition.acquire(context, event)

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any, get_args
 
 from service.api import create_app
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS
 from service.tracking.operations.running import OPERATION_OF, CurrentOperation, ServiceState
 from service.tracking.products import MatrixState, MeasureState, ProbationState
 from service.tracking.registration import Validity
-from service.tracking.state import AcquisitionStage, Mode
+from service.tracking.state import Mode
 from studies import dispatch, reference
 from studies.contract_tables import described, table, with_tables
 

@@ -37,7 +37,14 @@ from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
 from service.tracking.resume import restored
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import (
+    LoopState,
+    MatrixStates,
+    Mode,
+    Operations,
+    OperatorState,
+    TrackerState,
+)
 from service.web.keys import KeyFile
 
 M_ARENA_MAX = -8
@@ -203,11 +210,10 @@ def _supervisor(
     policy = policy_of(settings)
     state = TrackerState(
         system=system,
-        mode=Mode(settings.service.mode),
-        reconstructors=restored(archive.reconstructors.records()),
-        measurements=archive.measurements()[-MEASUREMENTS_KEPT:],
-        basis_id=instrument.basis_id,
-        config_id=instrument.config_id,
+        operator=OperatorState(mode=Mode(settings.service.mode)),
+        matrices=MatrixStates(reconstructors=restored(archive.reconstructors.records())),
+        operations=Operations(measurements=archive.measurements()[-MEASUREMENTS_KEPT:]),
+        loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
     )
     return Supervisor(
         state=taken_up(archive, state, policy, clock.now_ns()),

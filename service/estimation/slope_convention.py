@@ -48,8 +48,8 @@ ADVANTAGE = 2.0
 """Those told must do worse by this factor."""
 
 _ONE_MODE = 2
-"""Of more lines than this one alone that contradicts is a mode that answers otherwise: other axes
-would turn about half of them. The next modes that are dithered tell if it was the axes after all."""
+"""Of more lines than this one that contradicts alone is a mode that answers otherwise: other axes
+turn about half of them. The next modes that are dithered tell if it was the axes after all."""
 
 LAGS = np.arange(-3.0, 3.1, 0.5)
 """Frames by which slopes may lag the commands of their row and still be recognised."""

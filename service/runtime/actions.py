@@ -127,13 +127,13 @@ class Actions:
         PyrcalError
             If its numbers are not to be had.
         """
-        record = state.reconstructor(state.in_use or "")
-        if record is None or state.rtc is None:
+        record = state.reconstructor(state.matrices.in_use or "")
+        if record is None or state.loop.rtc is None:
             return
         matrix = self.matrix(record.id)
         layout = wire.layout_of(matrix, self._publishing.chunk_bytes)
         system = self._publishing.system
-        self._bridge.offer(record.manifest(layout, state.rtc, system), matrix)
+        self._bridge.offer(record.manifest(layout, state.loop.rtc, system), matrix)
         self._bridge.set_current(record.id)
 
     async def keep_measured(self, received: MeasuredMatrix) -> Event:
@@ -165,7 +165,7 @@ class Actions:
         conditions = self._conditions(state, gains)
         made = await self._workers.call(OpticsWorker.make, conditions, effect.fewer)
         accepted = made.gate.accepted
-        parent = state.in_use or UNKNOWN_PARENT
+        parent = state.matrices.in_use or UNKNOWN_PARENT
         record = self._record(len(made.matrix), effect.why, registration, parent)
         record = replace(
             record,
@@ -181,7 +181,7 @@ class Actions:
         )
 
     async def _republish(self, effect: ev.RepublishMatrix, state: TrackerState) -> Event:
-        rtc, registration = _there(state), state.registration
+        rtc, registration = _there(state), state.alpha.registration
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
         gate, judged, why = None, None, effect.why
@@ -266,9 +266,9 @@ class Actions:
 
     async def _ask_judged(self, request: wire.LoopRequest, state: TrackerState) -> Event | None:
         """Ask for gains only if the gate lets the matrix in use run with them."""
-        if state.in_use is None or request.gains is None:
+        if state.matrices.in_use is None or request.gains is None:
             raise CommandError("the reconstructor in use is not known: its gains cannot be judged")
-        matrix = await asyncio.to_thread(self.matrix, state.in_use)
+        matrix = await asyncio.to_thread(self.matrix, state.matrices.in_use)
         verdict = await self._verdict(matrix, request.gains[: len(matrix)], state)
         if not verdict.accepted:
             refused = wire.Reply(
@@ -413,20 +413,24 @@ def judged_now(state: TrackerState, gains: tuple[float, ...]) -> Judged:
 
 def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None:
     """Return how many modes the loop holds with, if these are its gains; None: it does not."""
-    rtc = state.rtc
-    if rtc is None or rtc.loop == "open" or blocking_alarm(state, Interlock.MEASURE) is not None:
+    rtc = state.loop.rtc
+    if (
+        rtc is None
+        or rtc.loop == "open"
+        or blocking_alarm(state.alarms.active, Interlock.MEASURE) is not None
+    ):
         return None
     n_modes = rtc.n_controlled
     return n_modes if same_gains(gains[:n_modes], rtc.gains[:n_modes]) else None
 
 
 def _there(state: TrackerState) -> wire.Status:
-    if state.rtc is None:
+    if state.loop.rtc is None:
         raise LinkError("no RTC is there")
-    return state.rtc
+    return state.loop.rtc
 
 
 def _registered(state: TrackerState) -> Registration:
-    if state.registration is None:
+    if state.alpha.registration is None:
         raise CommandError("α is not known")
-    return state.registration
+    return state.alpha.registration

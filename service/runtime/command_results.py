@@ -57,22 +57,24 @@ class CarriedOut:
         """
         match self.command:
             case cmd.SetMode():
-                return CommandResult(f"mode is {now.mode}")
+                return CommandResult(f"mode is {now.operator.mode}")
             case cmd.StopEverything():
                 return _stopped(now)
             case cmd.Resume():
                 off = "; no dither is started until one is asked for"
                 return CommandResult(
-                    f"released: mode is {now.mode}{off if now.dither_stopped else ''}"
+                    f"released: mode is {now.operator.mode}{off if now.dithers.stopped else ''}"
                 )
             case cmd.SetPointing():
                 return _pointing(now)
             case cmd.SetValue(name=name, value=value, for_s=for_s):
                 return CommandResult(f"{name} is {as_text(value)} for {for_s:g} s")
             case cmd.Acquire():
-                return CommandResult(f"an acquisition is under way: {now.acquisition.text}")
+                return CommandResult(
+                    f"an acquisition is under way: {now.operations.acquisition.text}"
+                )
             case cmd.AbortAcquisition():
-                return CommandResult(f"the acquisition has {now.acquisition.text}")
+                return CommandResult(f"the acquisition has {now.operations.acquisition.text}")
             case cmd.StartDither():
                 return self._dither(now)
             case cmd.StopDither():
@@ -95,7 +97,9 @@ class CarriedOut:
     def _of_matrices(self, now: TrackerState) -> CommandResult:
         match self.command:
             case cmd.Refit():
-                return CommandResult(f"a reconstructor is being computed; mode is {now.mode}")
+                return CommandResult(
+                    f"a reconstructor is being computed; mode is {now.operator.mode}"
+                )
             case cmd.Approve(id=name):
                 return self._sent(now, name)
             case cmd.Reject(id=name):
@@ -107,18 +111,18 @@ class CarriedOut:
 
     def _republished(self, now: TrackerState, source: str) -> CommandResult:
         """Tell of a reconstructor that goes out again, under an id of its own."""
-        known = {record.id for record in self.before.reconstructors}
-        made = [r for r in now.reconstructors if r.parent == source and r.id not in known]
+        known = {record.id for record in self.before.matrices.reconstructors}
+        made = [r for r in now.matrices.reconstructors if r.parent == source and r.id not in known]
         if made:
             if made[-1].state is MatrixState.REFUSED and isinstance(self.command, cmd.Rollback):
                 text = f"{_why_not(made[-1])}; ordered with anyway, it goes out all the same"
                 raise CommandError(text)
             answer = self._sent(now, made[-1].id)
             return CommandResult(
-                f"{answer.text}; it is {source} again; mode is {now.mode}", answer.final
+                f"{answer.text}; it is {source} again; mode is {now.operator.mode}", answer.final
             )
         failed = [line for line in new_lines(self.then, now) if line.name == "job.failed"]
-        if now.making_since_ns_utc is None and failed:
+        if now.matrices.making_since_ns_utc is None and failed:
             raise CommandError(failed[-1].text)
         return CommandResult(f"{source} is being judged before it is sent again", final=False)
 
@@ -143,21 +147,21 @@ class CarriedOut:
         return CommandResult(f"{name} sent, applied at frame {record.applied_frame_seq}")
 
     def _dither(self, now: TrackerState) -> CommandResult:
-        asked = self.then.dither
+        asked = self.then.dithers.dither
         name = "" if asked is None else asked.id
-        dither = now.dither
+        dither = now.dithers.dither
         if dither is None or dither.id != name:
             told = now.alarm(NO_DITHER)
             gone = f"{name} is not followed any more: see the events"
             raise CommandError(gone if told is None else told.text)
         cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
-        cost = f"{cost}, budget {1e9 * now.dither_policy.budget_m:.3g} nm"
+        cost = f"{cost}, budget {1e9 * now.dithers.policy.budget_m:.3g} nm"
         if dither.start_seq is None:
             return CommandResult(f"{name} {SILENT}: {cost}", final=False)
         return CommandResult(f"{name} plays from frame {dither.start_seq}: {cost}")
 
     def _loop(self, now: TrackerState) -> CommandResult:
-        asked, found = self.then.loop_command, now.loop_command
+        asked, found = self.then.loop.command, now.loop.command
         if asked is None or found is None or asked.id != found.id:
             return CommandResult(f"{SILENT}: another change of the loop came after it")
         match found.state:
@@ -172,7 +176,7 @@ class CarriedOut:
 
 
 def _pointing(now: TrackerState) -> CommandResult:
-    where = now.pointing
+    where = now.alpha.pointing
     if where is None:
         return CommandResult("the pointing is not known")
     return CommandResult(
@@ -182,8 +186,8 @@ def _pointing(now: TrackerState) -> CommandResult:
 
 
 def _stopped(now: TrackerState) -> CommandResult:
-    playing = None if now.rtc is None else now.rtc.dither_id
-    text = f"{now.stopped_because}; nothing is dithered, made or sent until it is released"
+    playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
+    text = f"{now.operator.stopped_because}; nothing is dithered, made or sent until it is released"
     if playing is None:
         return CommandResult(text)
     return CommandResult(
@@ -192,7 +196,7 @@ def _stopped(now: TrackerState) -> CommandResult:
 
 
 def _no_dither(now: TrackerState) -> CommandResult:
-    playing = None if now.rtc is None else now.rtc.dither_id
+    playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
     off = "no dither is started until one is asked for"
     if playing is None:
         return CommandResult(f"no dither plays; {off}")
@@ -204,7 +208,7 @@ def _no_dither(now: TrackerState) -> CommandResult:
 def _alarm(now: TrackerState, name: str) -> CommandResult:
     """Tell what is kept of an alarm that was acknowledged or muted."""
     record = next(
-        (record for record in now.alarm_records if record.name == name), AlarmRecord(name=name)
+        (record for record in now.alarms.records if record.name == name), AlarmRecord(name=name)
     )
     said = []
     if record.acknowledged is not None:

@@ -128,8 +128,8 @@ class Engine:
         self._follow()
         for effect in effects:
             self._driver.perform(effect)
-        if self.state.in_use != before.in_use:
-            self._driver.swapped(self.state.in_use)
+        if self.state.matrices.in_use != before.matrices.in_use:
+            self._driver.swapped(self.state.matrices.in_use)
         return effects
 
     def receive(self, event: Event) -> None:
@@ -182,7 +182,7 @@ class Engine:
         Longer while α is followed and nothing else happens: no alarm, no matrix made or tried.
         """
         state, now_ns = self.state, self._driver.now_ns()
-        if state.registration is None or state.alarms or state.on_probation:
+        if state.alpha.registration is None or state.alarms.active or state.on_probation:
             return 0.0
         dithers = (OperationKind.OWN_DITHER, OperationKind.OTHER_DITHER)
         steady = all(running.kind in dithers for running in under_way(state, now_ns))
@@ -195,7 +195,7 @@ class Engine:
         """
         if self.bank is None:
             return "no passive estimate: the optical model is being prepared"
-        registration, now_ns = self.state.registration, self._driver.now_ns()
+        registration, now_ns = self.state.alpha.registration, self._driver.now_ns()
         told = (
             registration is not None
             and not registration.doubt
@@ -236,10 +236,10 @@ def follow_state(
 
     Returns the streams, and what to tell the tracker when the dither cannot be read.
     """
-    if blocking_alarm(state, Interlock.ASK) is not None:
+    if blocking_alarm(state.alarms.active, Interlock.ASK) is not None:
         return with_rtc(bank, None), None
-    bank = with_rtc(bank, state.rtc)
-    dither = state.dither
+    bank = with_rtc(bank, state.loop.rtc)
+    dither = state.dithers.dither
     try:
         return with_dither(bank, dither, policy.window_s), None
     except ModelError as error:
@@ -262,14 +262,14 @@ def detect_changes(was_silent_s: float, bank: EstimatorBank, state: TrackerState
         found += _detect_other_dither(dither.id, bank.dither_measurement, state)
         found += _answered(bank, state)
     lines = () if bank.vibrations is None else bank.vibrations.lines_hz
-    if bank.vibrations is not None and lines != state.vibrations_hz:
+    if bank.vibrations is not None and lines != state.loop.vibrations_hz:
         found.append(ev.Vibrations(lines_hz=lines))
     for name, trouble, over in detect_conditions(bank):
         found += ev.ConditionChanged.detect(state, name, trouble, over, bank.received_ns_utc)
     holds = bank.rejection.holds
-    if holds is not None and holds is not state.loop_holds:
+    if holds is not None and holds is not state.loop.holds:
         found.append(ev.LoopHeld(holds=holds))
-    judged, trial = bank.comparison.found, state.probation
+    judged, trial = bank.comparison.found, state.operations.probation
     if judged is not None and trial is not None and trial.awaits(judged.before, judged.after):
         found.append(ev.Compared(finding=judged))
     return found
@@ -279,7 +279,7 @@ def _detect_other_dither(
     dither_id: str, measurement: DitherMeasurement, state: TrackerState
 ) -> list[Event]:
     """Return what the frames hold of the dither, where it is told for the first time or is over."""
-    told = state.dither_policy
+    told = state.dithers.policy
     raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
     louder = measurement.found_m > LOUDER * told.amiss_m
     news = told.amiss_id != dither_id or louder if measurement.text else raised
@@ -302,7 +302,7 @@ def _answered(bank: EstimatorBank, state: TrackerState) -> list[Event]:
     """
     found = None if bank.dither_measurement is None else bank.dither_measurement.unanswered
     raised = state.alarm(alarms.MIRROR_SILENT) is not None
-    closed = len(bank.in_loop) > 0 and not state.acquisition.under_way
+    closed = len(bank.in_loop) > 0 and not state.operations.acquisition.under_way
     if found is None or not closed or not (found or raised):
         return []
     text = found or "the slopes answer the dither again"
@@ -314,9 +314,9 @@ def _answered(bank: EstimatorBank, state: TrackerState) -> list[Event]:
 
 def detect_shape_change(bank: EstimatorBank, state: TrackerState) -> list[ev.ConditionChanged]:
     """Return whether it has changed that the RTC's telemetry fits the instrument file."""
-    if state.rtc is None:
+    if state.loop.rtc is None:
         return []
-    wrong = shape_mismatch(bank.description, state.rtc)
+    wrong = shape_mismatch(bank.description, state.loop.rtc)
     over = "the RTC's telemetry fits the instrument file again"
     return ev.ConditionChanged.detect(state, alarms.OTHER_INSTRUMENT, wrong, over)
 

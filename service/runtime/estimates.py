@@ -108,9 +108,9 @@ async def fitted(
     if isinstance(outcome, WindowRefused):
         return ev.WindowLost(refused=outcome)
     began_ns = 0
-    if state.rtc is not None:
+    if state.loop.rtc is not None:
         n_frames = window.n_windows * window.plan.n_frames
-        began_ns = window.t_end_ns_utc - round(n_frames * 1e9 / state.rtc.frame_rate_hz)
+        began_ns = window.t_end_ns_utc - round(n_frames * 1e9 / state.loop.rtc.frame_rate_hz)
     if isinstance(outcome, WideCaptureEstimate):
         return ev.WideCaptureFitted(found=outcome, began_ns_utc=began_ns)
     return ev.WindowFitted(estimate=outcome, began_ns_utc=began_ns)
@@ -119,13 +119,15 @@ async def fitted(
 async def _outcome(
     window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> LockInEstimate | RandomEstimate | WideCaptureEstimate | WindowRefused:
-    rtc, registration = state.rtc, state.registration
+    rtc, registration = state.loop.rtc, state.alpha.registration
     start = None if registration is None else registration.alpha
     if isinstance(window, Correlated):
         return await workers.call(OpticsWorker.fit_random, window, start)
-    if state.acquisition.uses_wide_capture:
+    if state.operations.acquisition.uses_wide_capture:
         flux = None if rtc is None else rtc.flux
-        return await workers.call(OpticsWorker.find, window, state.acquisition.alpha, flux)
+        return await workers.call(
+            OpticsWorker.find, window, state.operations.acquisition.alpha, flux
+        )
     if rtc is None:
         return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
     loop = ClosedLoop(
@@ -146,8 +148,8 @@ def _reconstructor(
     The fit takes the dither alone for its instrument then, which costs precision and no truth.
     """
     try:
-        if spectra.cm_id is not None or state.in_use is not None:
-            return matrix_of(spectra.cm_id or state.in_use or "")
+        if spectra.cm_id is not None or state.matrices.in_use is not None:
+            return matrix_of(spectra.cm_id or state.matrices.in_use or "")
     except UnknownIdError:
         pass
     return np.zeros((0, spectra.slopes.shape[-1]), np.float32)
@@ -164,7 +166,9 @@ async def fit_passive(
         return None
     if isinstance(sums, str):
         return (
-            None if sums == state.passive_unavailable_reason else ev.PassiveUnavailable(text=sums)
+            None
+            if sums == state.alpha.passive_unavailable_reason
+            else ev.PassiveUnavailable(text=sums)
         )
     last = sums.tail
     if last is None:
@@ -180,7 +184,7 @@ async def fit_passive(
         estimate=estimate,
         t_ns_utc=end_ns,
         began_ns_utc=sums.since_ns_utc,
-        loop=loop_numbers(state.rtc),
+        loop=loop_numbers(state.loop.rtc),
     )
 
 
@@ -197,7 +201,7 @@ async def read_own_matrix(
     """
     if record.judged is not None and workers.first is not None:
         return []
-    registration = state.registration
+    registration = state.alpha.registration
     near = None if registration is None else registration.alpha
     try:
         dialect = await workers.call(OpticsWorker.read_slope_convention, matrix, near)
@@ -254,12 +258,12 @@ class NoisySums:
 
     def take(self, window: Correlated, state: TrackerState) -> None:
         """Add a window, if it is of the matrix under way and its telemetry can be believed."""
-        record, dither = state.noisy_measurement, state.dither
+        record, dither = state.noisy_measurement, state.dithers.dither
         if record is None or (dither is not None and dither.id != record.id):
             return
         if (
             window.plan.modes != record.modes
-            or blocking_alarm(state, Interlock.MEASURE) is not None
+            or blocking_alarm(state.alarms.active, Interlock.MEASURE) is not None
         ):
             return
         total = self._total if self._id == record.id else None
@@ -279,7 +283,7 @@ class NoisySums:
         PyrcalError
             If it cannot be fitted or archived.
         """
-        total, registration = self._total, state.registration
+        total, registration = self._total, state.alpha.registration
         if self._id != record.id or total is None:
             raise CommandError("no window of its dither was whole: see the log for the reasons")
         self._id = self._total = None

@@ -14,12 +14,13 @@ from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, Link
 from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_no_return, why_unread
-from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import PROPOSAL_STANDS_S, outdated
 from service.wire import TEXT_LIMIT, StateMessage
 
@@ -198,7 +199,7 @@ def detect_link_changes(
     """
     made, found = complaints(link), []
     made |= {name: text for name, text in also.items() if text}
-    raised = {alarm.name: alarm for alarm in state.alarms if alarm.name in COMPLAINTS}
+    raised = {alarm.name: alarm for alarm in state.alarms.active if alarm.name in COMPLAINTS}
     for name, text in made.items():
         before = raised.get(name)
         same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)
@@ -248,14 +249,14 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(
             name=alarms.WORKER_LOST, responsible=Responsible.WORKER, text=text, blocks=True
         )
-    if inputs.state.making_since_ns_utc is not None:
+    if inputs.state.matrices.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
         yield Prerequisite(name="matrix", responsible=Responsible.WORKER, text=text)
 
 
 def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield what of the RTC's telemetry does not come."""
-    link, where, rtc = inputs.link, f"ao/v1/{inputs.state.system}", inputs.state.rtc
+    link, where, rtc = inputs.link, f"ao/v1/{inputs.state.system}", inputs.state.loop.rtc
     if rtc is not None and rtc.trouble and link.rtc_alive:
         yield Prerequisite(
             name="rtc-trouble", responsible=Responsible.RTC, text=rtc.trouble, blocks=True
@@ -298,7 +299,7 @@ def _for_frames(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield what must be known of the reconstructor in use, or sent."""
-    state, rtc = inputs.state, inputs.state.rtc
+    state, rtc = inputs.state, inputs.state.loop.rtc
     if rtc is not None and rtc.cm_id is None:
         text = (
             "its status names no reconstructor (cm_id is nil): the loop is not judged until it "
@@ -311,11 +312,13 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
     no_return = why_no_return(state)
-    for record in state.reconstructors:
+    for record in state.matrices.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} was sent: acknowledge that it is applied"
             yield Prerequisite(name="acknowledgement", responsible=Responsible.RTC, text=text)
-        elif record.state is MatrixState.PROPOSED and (state.mode is not Mode.AUTO or no_return):
+        elif record.state is MatrixState.PROPOSED and (
+            state.operator.mode is not Mode.AUTO or no_return
+        ):
             text = f"reconstructor {record.id} is proposed: approve or reject it"
             more = [no_return or "", _replaced(state, record)]
             yield Prerequisite(
@@ -327,7 +330,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
     """Return that a proposal will be replaced, and when; empty: it fits α."""
-    if state.mode is Mode.HOLD or not outdated(state, record):
+    if state.operator.mode is Mode.HOLD or not outdated(state, record):
         return ""
     until_s = record.created_ns_utc / SECOND_NS + PROPOSAL_STANDS_S
     then = datetime.fromtimestamp(until_s, UTC)
@@ -335,12 +338,12 @@ def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
 
 
 def _describe_rtc(state: TrackerState) -> str:
-    return f" (last: {state.read_back_error})" if state.read_back_error else ""
+    return f" (last: {state.matrices.read_back_error})" if state.matrices.read_back_error else ""
 
 
 def _for_alarms(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     """Yield the alarms that keep the service from its job: their texts say what to do."""
-    for alarm in inputs.state.alarms:
+    for alarm in inputs.state.alarms.active:
         acts = [
             interlock
             for interlock in (Interlock.ASK, Interlock.DECIDE, Interlock.MEASURE)
@@ -354,23 +357,26 @@ def _for_alarms(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 
 def _for_the_operator(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
-    state, rtc = inputs.state, inputs.state.rtc
+    state, rtc = inputs.state, inputs.state.loop.rtc
     orders = {
-        "mode": (state.mode is Mode.HOLD, "mode is hold, nothing is made: set another when it may"),
+        "mode": (
+            state.operator.mode is Mode.HOLD,
+            "mode is hold, nothing is made: set another when it may",
+        ),
         "dither-stopped": (
-            state.dither_stopped,
+            state.dithers.stopped,
             "the dither was stopped by an operator: start it when it may",
         ),
         "interrupted": (
-            state.acquisition.stage is AcquisitionStage.INTERRUPTED,
-            f"the acquisition was interrupted: {state.acquisition.text}",
+            state.operations.acquisition.stage is AcquisitionStage.INTERRUPTED,
+            f"the acquisition was interrupted: {state.operations.acquisition.text}",
         ),
     }
     for name, (is_so, text) in orders.items():
         if is_so:
             yield Prerequisite(name=name, responsible=Responsible.OPERATOR, text=text)
-    if rtc is not None and state.dither is not None and state.registration is None:
-        text = f"{state.dither.id}: the first window of telemetry that holds it"
+    if rtc is not None and state.dithers.dither is not None and state.alpha.registration is None:
+        text = f"{state.dithers.dither.id}: the first window of telemetry that holds it"
         yield Prerequisite(name="window", responsible=Responsible.RTC, text=text)
 
 
@@ -385,8 +391,8 @@ def _for_measurements(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             f"give it up"
         )
         yield Prerequisite(name="noisy-matrix", responsible=Responsible.RTC, text=text)
-    if state.acquisition.under_way:
-        text = f"an acquisition is under way: {state.acquisition.text}"
+    if state.operations.acquisition.under_way:
+        text = f"an acquisition is under way: {state.operations.acquisition.text}"
         yield Prerequisite(name="acquiring", responsible=Responsible.RTC, text=text)
 
 
@@ -461,15 +467,15 @@ def state_message(
     state: TrackerState, now_ns: int, waiting: tuple[Prerequisite, ...] = ()
 ) -> StateMessage:
     """Return the short account of the state for whoever listens on the network."""
-    registration = state.registration
+    registration = state.alpha.registration
     hindered = "; ".join(wait.text for wait in waiting if wait.blocks)
     return StateMessage(
         system=state.system,
         t_ns=now_ns,
-        mode=state.mode.value,
+        mode=state.operator.mode.value,
         alpha=None if registration is None else registration.alpha.to_boundary(),
         sigma=None if registration is None else at_boundary(registration.sigma),
-        in_use=state.in_use,
+        in_use=state.matrices.in_use,
         validity=None if registration is None else registration.validity.level.value,
         waiting_for=tuple(f"{w.responsible}: {w.text}"[:TEXT_LIMIT] for w in waiting),
         operation=operating(state, hindered, now_ns).words,

@@ -145,16 +145,16 @@ class Recorder:
 
     def changed(self, before: TrackerState, after: TrackerState, lines: Iterable[LogEntry]) -> None:
         """Take what a step has changed, to be written soon."""
-        if after.reconstructors is not before.reconstructors:
-            old = {record.id: record for record in before.reconstructors}
-            new = {r.id: r for r in after.reconstructors if old.get(r.id) is not r}
+        if after.matrices.reconstructors is not before.matrices.reconstructors:
+            old = {record.id: record for record in before.matrices.reconstructors}
+            new = {r.id: r for r in after.matrices.reconstructors if old.get(r.id) is not r}
             with self._guard:
                 self._records |= new
             if new:
                 self._lines.set()
-        if after.history is not before.history:
-            last = before.history[-1:]
-            new_ones = takewhile(lambda entry: entry not in last, reversed(after.history))
+        if after.alpha.history is not before.alpha.history:
+            last = before.alpha.history[-1:]
+            new_ones = takewhile(lambda entry: entry not in last, reversed(after.alpha.history))
             with self._guard:
                 room = MAX_WAITING - len(self._estimates)
                 found = list(new_ones)[::-1]
@@ -379,10 +379,12 @@ class Recorder:
 
 def ids_of(text: str, state: TrackerState) -> dict[str, object]:
     """Return what a line of the log is to be found by: frame, matrix in use, matrices it names."""
-    known = [r.id for r in state.reconstructors] + [m.id for m in state.measurements]
+    known = [r.id for r in state.matrices.reconstructors] + [
+        m.id for m in state.operations.measurements
+    ]
     ids = {
-        "frame": None if state.rtc is None else state.rtc.seq,
-        "in_use": state.in_use,
+        "frame": None if state.loop.rtc is None else state.loop.rtc.seq,
+        "in_use": state.matrices.in_use,
         "matrices": [name for name in known if name in text],
     }
     return {name: found for name, found in ids.items() if found}
@@ -446,7 +448,7 @@ def is_unsaved(before: TrackerState, after: TrackerState) -> bool:
     """Return whether something has been measured, or begun, that is not saved yet."""
     if is_urgent(before, after):
         return True
-    old, new = before.registration, after.registration
+    old, new = before.alpha.registration, after.alpha.registration
     if old is None or new is None:
         return new is not None
     return (old.t_ns_utc, old.doubt) != (new.t_ns_utc, new.doubt)
@@ -458,13 +460,13 @@ def is_urgent(before: TrackerState, after: TrackerState) -> bool:
     A service killed a second later would leave its own loop open to one that cannot know, or one
     that undoes what an operator has ordered; or would not know where the mirror's image was moved.
     """
-    if before.offload is not after.offload:
+    if before.alpha.offload is not after.alpha.offload:
         return True
     return orders_of(before) != orders_of(after) or _course(before) != _course(after)
 
 
 def _course(state: TrackerState) -> tuple[object, ...]:
-    acquisition, rtc = state.acquisition, state.rtc
+    acquisition, rtc = state.operations.acquisition, state.loop.rtc
     if not acquisition.under_way:
         return (acquisition.stage,)
     session = None if rtc is None else rtc.session
@@ -473,5 +475,10 @@ def _course(state: TrackerState) -> tuple[object, ...]:
 
 def needed(state: TrackerState) -> frozenset[str]:
     """Return the ids of matrices that somebody may ask for at any moment."""
-    ids = (state.in_use, state.previous, state.acquisition.matrix, state.acquisition.applied)
+    ids = (
+        state.matrices.in_use,
+        state.previous,
+        state.operations.acquisition.matrix,
+        state.operations.acquisition.applied,
+    )
     return frozenset(one for one in ids if one is not None)

@@ -113,7 +113,7 @@ class Snapshot:
     @property
     def alarms(self) -> tuple[AlarmStatus, ...]:
         """Those that last, in the order in which they were raised."""
-        raised = self.tracker.alarms
+        raised = self.tracker.alarms.active
         return tuple(
             AlarmStatus(record=record_of(self.tracker, a), definition=a.definition) for a in raised
         )
@@ -136,7 +136,7 @@ class Snapshot:
     @property
     def alpha(self) -> Alpha | None:
         """Null until the first accepted window."""
-        registration = self.tracker.registration
+        registration = self.tracker.alpha.registration
         return None if registration is None else Alpha(registration=registration, snapshot=self)
 
     @property
@@ -147,7 +147,7 @@ class Snapshot:
     @property
     def rtc(self) -> Rtc | None:
         """Null: no RTC has been heard, or it has vanished."""
-        known = self.tracker.rtc
+        known = self.tracker.loop.rtc
         return None if known is None else Rtc(status=known)
 
 

@@ -358,10 +358,10 @@ class Supervisor:
             for event in detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting_for(link)
-            for text in told.due_lines(waiting, self._engine.state.alarms, now_ns):
+            for text in told.due_lines(waiting, self._engine.state.alarms.active, now_ns):
                 self._note("waiting", text, Level.INFO)
             self._bridge.publish_state(state_message(self._engine.state, now_ns, waiting))
-            raised = frozenset((a.name, a.text) for a in self._engine.state.alarms)
+            raised = frozenset((a.name, a.text) for a in self._engine.state.alarms.active)
             for name, text in raised ^ alarms:
                 self._bridge.publish_alarm(
                     AlarmMessage(
@@ -453,7 +453,7 @@ class Supervisor:
         if record is None:
             return
         for event in await read_own_matrix(record, matrix, self._engine.state, self._workers):
-            if self._engine.state.in_use == in_use:
+            if self._engine.state.matrices.in_use == in_use:
                 self._post(event)
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:

@@ -63,7 +63,13 @@ class TrendSampler:
         end_ns = None if frames is None else frames.t0_ns_utc + frames.n_frames * frames.dt_ns
         is_new, self._seen_ns = end_ns != self._seen_ns, end_ns
         residual_m = None
-        if frames is not None and is_new and frames.cm_id and state.rtc and state.rtc.in_loop:
+        if (
+            frames is not None
+            and is_new
+            and frames.cm_id
+            and state.loop.rtc
+            and state.loop.rtc.in_loop
+        ):
             try:
                 residual_m = residual_of(frames, self._matrix(frames.cm_id))
             except PyrcalError:  # nobody has its numbers
@@ -76,10 +82,10 @@ def sample_of(
 ) -> TrendSample:
     """Return what is known at this moment of what goes into a chart."""
     registration, rtc, margin, pointing = (
-        state.registration,
-        state.rtc,
-        state.margin,
-        state.pointing,
+        state.alpha.registration,
+        state.loop.rtc,
+        state.matrices.margin,
+        state.alpha.pointing,
     )
     gains = () if registration is None else registration.optical_gains
     flux = None if rtc is None else rtc.flux_images
@@ -110,8 +116,8 @@ def residual_of(frames: FrameBlock, matrix: NDArray[np.float32]) -> float | None
 
 
 def _wavefront_m(state: TrackerState) -> float | None:
-    found = state.assessment
-    if found is None or found.id != state.in_use:
+    found = state.matrices.assessment
+    if found is None or found.id != state.matrices.in_use:
         return None
     return _finite(found.expected.wavefront_m + found.expected.loss_m)
 

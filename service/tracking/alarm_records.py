@@ -43,10 +43,10 @@ def follow(context: StepContext, *, timely: bool, ordered: bool) -> None:
     ``timely``: the time has gone on. ``ordered``: an operator has given a command, and what it ends
     has been seen.
     """
-    if context.state.alarms is context.before.alarms and not timely:
+    if context.alarms.active is context.before.alarms.active and not timely:
         return
-    notes = {record.name: record for record in context.state.alarm_records}
-    raised = {alarm.name: alarm for alarm in context.state.alarms}
+    notes = {record.name: record for record in context.alarms.records}
+    raised = {alarm.name: alarm for alarm in context.alarms.active}
     for alarm in raised.values():
         notes[alarm.name] = _raised(notes.get(alarm.name, AlarmRecord(name=alarm.name)), alarm)
     for name, record in notes.items():
@@ -58,7 +58,7 @@ def follow(context: StepContext, *, timely: bool, ordered: bool) -> None:
 def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
     """Return what is kept of an alarm that lasts."""
     known = next(
-        (record for record in state.alarm_records if record.name == alarm.name),
+        (record for record in state.alarms.records if record.name == alarm.name),
         AlarmRecord(name=alarm.name),
     )
     return replace(_raised(known, alarm), text=alarm.text)
@@ -66,18 +66,20 @@ def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
 
 def stale(state: TrackerState) -> tuple[AlarmRecord, ...]:
     """Return the alarms that have gone and nobody has seen."""
-    return tuple(record for record in state.alarm_records if record.alarm_state is AlarmState.STALE)
+    return tuple(
+        record for record in state.alarms.records if record.alarm_state is AlarmState.STALE
+    )
 
 
 def muted(state: TrackerState) -> tuple[AlarmRecord, ...]:
     """Return the alarms that are muted, whether they last or not."""
-    return tuple(record for record in state.alarm_records if record.muted is not None)
+    return tuple(record for record in state.alarms.records if record.muted is not None)
 
 
 def worst(state: TrackerState) -> Severity | None:
     """Return the most severe of what lasts, or went unseen; None: there is nothing."""
     found: Severity | None = None
-    for record in state.alarm_records:
+    for record in state.alarms.records:
         if record.worst is not None and record.worst.above(found):
             found = record.worst
     return found
@@ -139,9 +141,9 @@ def unmute(context: StepContext, command: cmd.UnmuteAlarm) -> None:
 def take_over(context: StepContext, orders: Orders) -> None:
     """Know what was known before a restart; what lasted then has yet to be raised again."""
     over_ns = context.now_ns
-    context.state = replace(
-        context.state,
-        alarm_records=tuple(
+    context.alarms = replace(
+        context.alarms,
+        records=tuple(
             replace(record, over_ns_utc=record.over_ns_utc or over_ns) if record.worst else record
             for record in orders.seen
         ),
@@ -170,7 +172,9 @@ def _not_raised(context: StepContext, record: AlarmRecord, *, ordered: bool) -> 
     if record.over_ns_utc is None:
         if ordered or record.acknowledged is not None:
             return _done_with(record)
-        last = next((a.text for a in context.before.alarms if a.name == record.name), record.text)
+        last = next(
+            (a.text for a in context.before.alarms.active if a.name == record.name), record.text
+        )
         return replace(record, over_ns_utc=context.now_ns, text=last)
     waited_ns = context.now_ns - record.over_ns_utc
     if record.acknowledged is not None and waited_ns > RAISED_AGAIN_S * SECOND_NS:
@@ -190,7 +194,7 @@ def _unmuted(record: AlarmRecord, now_ns: int) -> AlarmRecord:
 
 def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord], AlarmRecord]:
     """Return all notes by name, and one of them, or a new one."""
-    notes = {record.name: record for record in context.state.alarm_records}
+    notes = {record.name: record for record in context.alarms.records}
     own = {f"{PREFIX}{rule.name}" for rule in context.policy.rules}
     if name not in notes and name not in ALARMS and name not in own:
         raise UnknownIdError(f"unknown alarm {name}")
@@ -200,8 +204,8 @@ def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord
 def _keep(context: StepContext, notes: dict[str, AlarmRecord]) -> None:
     """Keep what says something, where it is not what is kept already."""
     kept = tuple(record for record in notes.values() if record != AlarmRecord(name=record.name))
-    if kept != context.state.alarm_records:
-        context.state = replace(context.state, alarm_records=kept)
+    if kept != context.alarms.records:
+        context.alarms = replace(context.alarms, records=kept)
 
 
 def _operator_note(context: StepContext, command: cmd.Instruction) -> OperatorNote:
@@ -222,15 +226,17 @@ _COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
 }
 
 FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
-    "state.mode": lambda state: state.mode.value,
-    "state.loop": lambda state: None if state.rtc is None else state.rtc.loop.value,
-    "state.n_controlled": lambda state: None if state.rtc is None else state.rtc.n_controlled,
-    "state.magnitude": lambda state: None if state.rtc is None else state.rtc.magnitude,
+    "state.mode": lambda state: state.operator.mode.value,
+    "state.loop": lambda state: None if state.loop.rtc is None else state.loop.rtc.loop.value,
+    "state.n_controlled": lambda state: (
+        None if state.loop.rtc is None else state.loop.rtc.n_controlled
+    ),
+    "state.magnitude": lambda state: None if state.loop.rtc is None else state.loop.rtc.magnitude,
     "state.elevation_deg": lambda state: (
-        None if state.pointing is None else state.pointing.elevation_deg
+        None if state.alpha.pointing is None else state.alpha.pointing.elevation_deg
     ),
     "state.azimuth_deg": lambda state: (
-        None if state.pointing is None else state.pointing.azimuth_deg
+        None if state.alpha.pointing is None else state.alpha.pointing.azimuth_deg
     ),
 }
 """What a condition may ask of the state; nothing where it is not known."""
@@ -238,7 +244,7 @@ FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
 
 def judge_rules(context: StepContext) -> None:
     """Raise the alarms of the rules that hold, and end those of the others."""
-    raised = {alarm.name: alarm.text for alarm in context.state.alarms}
+    raised = {alarm.name: alarm.text for alarm in context.alarms.active}
     for rule in context.policy.rules:
         name, found = f"{PREFIX}{rule.name}", _found(context, rule)
         holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
@@ -275,15 +281,15 @@ def set_value(context: StepContext, command: cmd.SetValue) -> None:
     told = ObservatoryValue(
         name=command.name, value=command.value, until_ns_utc=until_ns, by=command.by
     )
-    others = tuple(each for each in context.state.observatory_values if each.name != command.name)
-    context.state = replace(context.state, observatory_values=(*others, told))
+    others = tuple(each for each in context.alarms.observatory_values if each.name != command.name)
+    context.alarms = replace(context.alarms, observatory_values=(*others, told))
 
 
 def changes_value(state: TrackerState, command: cmd.SetValue, now_ns: int) -> bool:
     """Return whether a value is told that differs from what is known."""
     return not any(
         each.name == command.name and each.until_ns_utc > now_ns and each.value == command.value
-        for each in state.observatory_values
+        for each in state.alarms.observatory_values
     )
 
 
@@ -302,7 +308,7 @@ def as_text(value: cmd.Value) -> str:
 def _found(context: StepContext, rule: Rule) -> cmd.Value | None:
     if rule.about in FIELDS:
         return FIELDS[rule.about](context.state)
-    told = (each for each in context.state.observatory_values if each.name == rule.about)
+    told = (each for each in context.alarms.observatory_values if each.name == rule.about)
     return next((each.value for each in told if each.until_ns_utc > context.now_ns), None)
 
 

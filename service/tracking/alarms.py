@@ -7,10 +7,11 @@ is as LSST's ts_watcher has it (doc/displaying_alarms.rst there).
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum, auto
 from importlib.resources import files
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
@@ -237,17 +238,9 @@ ALARMS: Final = _read()
 """By name, as alarms.toml tells."""
 
 
-class Alarmed(Protocol):
-    """Whatever has alarms that last."""
-
-    @property
-    def alarms(self) -> tuple[Alarm, ...]:
-        """Those."""
-
-
-def blocking_alarm(state: Alarmed, interlock: Interlock) -> Alarm | None:
+def blocking_alarm(alarms: Iterable[Alarm], interlock: Interlock) -> Alarm | None:
     """Return an alarm that forbids this now, or None."""
-    return next((alarm for alarm in state.alarms if alarm_blocks(alarm, interlock)), None)
+    return next((alarm for alarm in alarms if alarm_blocks(alarm, interlock)), None)
 
 
 def alarm_blocks(alarm: Alarm, interlock: Interlock) -> bool:

@@ -123,7 +123,7 @@ def make_way(context: StepContext) -> None:
 
 def allow(context: StepContext, *, allowed: bool = True) -> None:
     """Let the service dither by itself, or not any more."""
-    context.state = replace(context.state, dither_stopped=not allowed)
+    context.dithers = replace(context.dithers, stopped=not allowed)
 
 
 def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
@@ -188,7 +188,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
         context.clear_alarm(alarms.DITHER_LOST)
         context.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
         return
-    if context.state.dither_losses:
+    if context.dithers.losses:
         context.put_off(dither_s=_patience_s(context.state))
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
     _lose(context, dither, text)
@@ -212,14 +212,14 @@ def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
 
 def found_again(context: StepContext) -> None:
     """Miss it no more: a window held the dither, or none is wanted any more."""
-    context.state = replace(context.state, dither_lost=None, dither_losses=0)
+    context.dithers = replace(context.dithers, lost=None, losses=0)
     context.clear_alarm(alarms.DITHER_LOST)
 
 
 def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
     """Take over from an accepted window what it says of the precision of windows."""
     rtc, known = context.rtc, context.dither_policy.precision
-    accepted = context.state.windows_accepted > context.before.windows_accepted
+    accepted = context.windows.accepted > context.before.windows.accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return
     if len(estimate.modes) > N_LINES:
@@ -307,7 +307,7 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     if loud_ns and context.now_ns < loud_ns + round(CALM_S * SECOND_NS):
         _show(context, DitherPhase.OFF, "the RTC has played the last one too strong")
         return
-    if context.now_ns < context.state.no_dither_before_ns_utc:
+    if context.now_ns < context.dithers.no_dither_before_ns_utc:
         return
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: its window of another length, or to stop
@@ -337,7 +337,7 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     context.dither_policy = replace(
         context.dither_policy,
         lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
-        results_due=context.state.windows_accepted + wanted.parameters.n_windows,
+        results_due=context.windows.accepted + wanted.parameters.n_windows,
         ended_ns_utc=None,
         next_ns_utc=None,
     )
@@ -372,7 +372,7 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
 
 def _adopt(context: StepContext, rtc: Status) -> bool:
     """Take over a dither that runs, if it can be read; return whether there is one."""
-    if rtc.dither is None or rtc.dither_id == context.state.dither_lost:
+    if rtc.dither is None or rtc.dither_id == context.dithers.lost:
         return False
     running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, context.dither_policy
     over = own_sine(running) and total_m(running) > dither_plan.ROUNDING * dithering.budget_m
@@ -452,12 +452,12 @@ def _lose(context: StepContext, dither: Dither, text: str) -> None:
     context.raise_alarm(alarms.DITHER_LOST, text)
     context.warn("dither.lost", text)
     context.dither = None
-    losses = context.state.dither_losses + 1
-    context.state = replace(context.state, dither_lost=dither.id, dither_losses=losses)
+    losses = context.dithers.losses + 1
+    context.dithers = replace(context.dithers, lost=dither.id, losses=losses)
 
 
 def _patience_s(state: TrackerState) -> float:
-    return min(PATIENCE_S * 2.0**state.dither_losses, LONGEST_PATIENCE_S)
+    return min(PATIENCE_S * 2.0**state.dithers.losses, LONGEST_PATIENCE_S)
 
 
 def _note_stop(context: StepContext, dither_id: str) -> None:
@@ -493,7 +493,7 @@ def _forgive(context: StepContext, rtc: Status) -> None:
     own = context.dither
     by_frames = bool(context.dither_policy.loud_text)
     fine = not by_frames and own is not None and rtc.dither_id == own.id
-    given_up = context.state.dither_stopped or not context.policy.dither_enabled
+    given_up = context.dithers.stopped or not context.policy.dither_enabled
     if given_up:
         context.clear_alarm(alarms.NOT_AS_ASKED)
     if fine or given_up:

@@ -111,7 +111,7 @@ def wanted(context: StepContext, rtc: Status) -> tuple[WantedDither, DitherPlan]
     found = schedule(kappa, requirement)
     plan = _plan(state, found, requirement, window_s, phase)
     shown: tuple[int, ...] = ()
-    early = state.dither_due_since_ns_utc is None and mode_proof.unknown_loop(state, rtc)
+    early = state.alpha.dither_due_since_ns_utc is None and mode_proof.unknown_loop(state, rtc)
     if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE} or early:
         shown = mode_proof.modes_to_show(context, rtc, window_s)
     if shown:
@@ -154,7 +154,7 @@ def _parameters(
         total_m=total_m,
         window_s=window_s,
         n_windows=max(int(lasting_s / window_s + 1e-6), 1),
-        avoid_hz=(*context.policy.dither_avoid_hz, *context.state.vibrations_hz),
+        avoid_hz=(*context.policy.dither_avoid_hz, *context.loop.vibrations_hz),
         last_hz=context.dither_policy.lines_hz,
         shunned=mode_proof.shunned_modes(context.state),
     )
@@ -186,7 +186,7 @@ def _plan(
 
 def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
     """Return κ ``(4,)`` of ``σ = κ / (A sqrt(T))`` as far as it has been learnt."""
-    table, known = tabulated(rtc.magnitude), state.dither_policy.precision
+    table, known = tabulated(rtc.magnitude), state.dithers.policy.precision
     return table if known is None else table * known.ratio
 
 
@@ -273,8 +273,8 @@ def _paced(context: StepContext, requirement: DitherRequirement) -> tuple[Dither
     )
     if registration is None:
         return DitherPhase.ACQUIRE, "α is not known", now_ns
-    if state.dither_due_since_ns_utc is not None:
-        return DitherPhase.ACQUIRE, state.dither_due_reason or "α is in doubt", now_ns
+    if state.alpha.dither_due_since_ns_utc is not None:
+        return DitherPhase.ACQUIRE, state.alpha.dither_due_reason or "α is in doubt", now_ns
     if registration.n_windows < MIN_WINDOWS:
         text = f"{registration.n_windows} of {MIN_WINDOWS} windows agree"
         return DitherPhase.ACQUIRE, text, now_ns
@@ -282,7 +282,7 @@ def _paced(context: StepContext, requirement: DitherRequirement) -> tuple[Dither
         return DitherPhase.FOLLOW, "the settings allow no pause", now_ns
     window_ns = registration.window_ns_utc or registration.arrived_ns_utc
     longest_ns = window_ns + round(policy.longest_pause_s * SECOND_NS)
-    passive_ns = state.dither_policy.passive_ns_utc
+    passive_ns = state.dithers.policy.passive_ns_utc
     if passive_ns is not None and now_ns - passive_ns < PASSIVE_WITHIN_S * SECOND_NS:
         return _pace_with_passive(registration, requirement, longest_ns, now_ns)
     return _pace_without_passive(registration, requirement, longest_ns)
@@ -320,8 +320,8 @@ def _pace_without_passive(
 
 def _steady(state: TrackerState, found: Schedule, requirement: DitherRequirement) -> float:
     """Return the amplitude, left as it is while the best one is near."""
-    before = state.dither_policy.plan
-    settled = state.dither_policy.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
+    before = state.dithers.policy.plan
+    settled = state.dithers.policy.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
     if before is None or not settled or before.total_m > requirement.budget_m:
         return found.total_m
     ratio = found.total_m / before.total_m
@@ -331,16 +331,21 @@ def _steady(state: TrackerState, found: Schedule, requirement: DitherRequirement
 def why_none(context: StepContext, rtc: Status) -> str | None:
     """Return why the service asks for no dither of its own, or None."""
     state = context.state
-    still = state.dither_policy.unwanted_id
+    still = state.dithers.policy.unwanted_id
     left = "" if still is None else f"; the RTC still plays {still}"
-    if state.dither_stopped:
+    if state.dithers.stopped:
         return f"stopped by the operator{left}"
-    if not context.policy.dither_enabled and state.dither is None:
+    if not context.policy.dither_enabled and state.dithers.dither is None:
         return f"the settings forbid it{left}"
     if not rtc.in_loop:
         return why_open(rtc)
-    unnamed = rtc.cm_id is None or state.read_back_error
-    if state.in_use is None and not unnamed and state.dither is None and rtc.dither is None:
+    unnamed = rtc.cm_id is None or state.matrices.read_back_error
+    if (
+        state.matrices.in_use is None
+        and not unnamed
+        and state.dithers.dither is None
+        and rtc.dither is None
+    ):
         return "the reconstructor in use is not known yet"
     alarm = context.blocking_alarm(Interlock.MEASURE)
     return None if alarm is None else f"nothing would be measured under {alarm.name}"
@@ -354,7 +359,7 @@ def awaits_a_result(context: StepContext, wanted_dither: WantedDither) -> bool:
     if wanted_dither.phase is not DitherPhase.SPARSE or dithering.ended_ns_utc is None:
         return False
     late = context.now_ns - dithering.ended_ns_utc > RESULT_WITHIN_S * SECOND_NS
-    return not late and context.state.windows_accepted < dithering.results_due
+    return not late and context.windows.accepted < dithering.results_due
 
 
 def too_strong(context: StepContext, rtc: Status) -> str | None:
@@ -382,12 +387,12 @@ def why_unwanted(context: StepContext, rtc: Status) -> str | None:
     state, running = context.state, rtc.dither_id
     if running is None or not running.startswith(OUR_DITHERS):
         return None
-    if state.stopped_because:
+    if state.operator.stopped_because:
         return "everything is stopped"
-    followed = state.dither is not None and state.dither.id == running
-    if state.dither_stopped and not followed:
+    followed = state.dithers.dither is not None and state.dithers.dither.id == running
+    if state.dithers.stopped and not followed:
         return "the operator wants no dither"
     forbidden = not context.policy.dither_enabled
-    if forbidden and state.dither is None and running.startswith(OWN_DITHER):
+    if forbidden and state.dithers.dither is None and running.startswith(OWN_DITHER):
         return "the settings forbid a dither"
     return None

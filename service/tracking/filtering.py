@@ -160,7 +160,7 @@ def brought_forward(context: StepContext, registration: Registration, t_ns_utc: 
         elapsed_ns = context.now_ns - registration.arrived_ns_utc
     policy = context.policy
     drift = Drift(alpha_rate=policy.drift_rate, bias_memory_s=policy.bias_memory_s)
-    bent = validity.flexure(registration.pointing, context.state.pointing, policy)
+    bent = validity.flexure(registration.pointing, context.alpha.pointing, policy)
     return predicted(joint_of(registration), drift, elapsed_ns / SECOND_NS, bent)
 
 
@@ -198,9 +198,9 @@ def bias_of(
 
 def remember(context: StepContext, entry: HistoryEntry) -> None:
     """Keep one more line of history."""
-    entry = replace(entry, in_use=context.state.in_use)
-    history = (*context.state.history, entry)[-HISTORY_LENGTH:]
-    context.state = replace(context.state, history=history)
+    entry = replace(entry, in_use=context.matrices.in_use)
+    history = (*context.alpha.history, entry)[-HISTORY_LENGTH:]
+    context.alpha = replace(context.alpha, history=history)
 
 
 def counted(context: StepContext, registration: Registration, prior: Joint) -> int:
@@ -246,13 +246,11 @@ def accept(
         pointing=measured.pointing,
         window_pointing=validity.pointing_at(context.state, when.began_ns_utc),
         restored_ns_utc=previous.restored_ns_utc if previous is not None else None,
-        basis_id=context.state.basis_id,
-        config_id=context.state.config_id,
+        basis_id=context.loop.basis_id,
+        config_id=context.loop.config_id,
     )
     validity.store_registration(context, registration)
-    context.state = replace(
-        context.state, windows_accepted=context.state.windows_accepted + n_accepted
-    )
+    context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
     if not doubted:
         validity.have_window(context)
         context.clear_alarm(SUSPECTED)
@@ -267,7 +265,7 @@ def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpa
     One that confirms where the mirror has jumped to need not have begun since, for it tells no
     other place than the window before it.
     """
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is None or not registration.doubt:
         return False
     if update.jumped:
@@ -378,7 +376,7 @@ def why_no_window(
 
 def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:
     """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
-    alarm = blocking_alarm(state, Interlock.MEASURE)
+    alarm = blocking_alarm(state.alarms.active, Interlock.MEASURE)
     if alarm is None:
         return validity.why_telemetry_invalid(state, when)
     return f"{alarm.definition.because}: its telemetry is no measurement"

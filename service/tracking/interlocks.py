@@ -14,6 +14,7 @@ from typing import Final, get_args
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarm_records import PREFIX
 from service.tracking.alarms import ALARMS
 from service.tracking.commands import Command
@@ -24,7 +25,7 @@ from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import known_record
 from service.tracking.sending import beyond_judging, why_refused
-from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import left_behind
 
 
@@ -159,7 +160,7 @@ def _named(order: Order) -> str:
 
 
 def _needs_rtc(moment: Moment, _: str = "") -> str | None:
-    return NO_RTC if moment.state.rtc is None else None
+    return NO_RTC if moment.state.loop.rtc is None else None
 
 
 def _start_dither(moment: Moment, _: str) -> str | None:
@@ -171,12 +172,12 @@ def _measure_noisy(moment: Moment, _: str) -> str | None:
 
 
 def _is_closed(moment: Moment) -> bool:
-    rtc = moment.state.rtc
+    rtc = moment.state.loop.rtc
     return rtc is not None and rtc.loop != "open"
 
 
 def _ramp(moment: Moment, _: str) -> str | None:
-    rtc = moment.state.rtc
+    rtc = moment.state.loop.rtc
     if rtc is None:
         return NO_RTC
     opened = "found the loop open; expected it closed, to see its residual"
@@ -188,23 +189,23 @@ def _acquire(moment: Moment, _: str) -> str | None:
 
 
 def _abort(moment: Moment, _: str) -> str | None:
-    acquisition = moment.state.acquisition
+    acquisition = moment.state.operations.acquisition
     interrupted = acquisition.stage is AcquisitionStage.INTERRUPTED
     return None if acquisition.under_way or interrupted else "no acquisition is under way"
 
 
 def _resume(moment: Moment, _: str) -> str | None:
-    if moment.state.stopped_because:
+    if moment.state.operator.stopped_because:
         return None
-    held = "; mode is hold: set another to go on" if moment.state.mode is Mode.HOLD else ""
+    held = "; mode is hold: set another to go on" if moment.state.operator.mode is Mode.HOLD else ""
     return f"nothing is stopped{held}"
 
 
 def _refit(moment: Moment, _: str) -> str | None:
-    if moment.state.rtc is None:
+    if moment.state.loop.rtc is None:
         return NO_RTC
     unknown = "α is not known yet; start a dither and wait for a window"
-    return unknown if moment.state.registration is None else None
+    return unknown if moment.state.alpha.registration is None else None
 
 
 def _approve(moment: Moment, matrix_id: str) -> str | None:
@@ -212,7 +213,7 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
     record = _meant(state, matrix_id)
     if record is None or record.state is not MatrixState.PROPOSED:
         return _not_proposed(record)
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is not None and not registration.usable:
         return f"{record.id} cannot be judged: α is invalid ({registration.validity.reason})"
     if left_behind(state, record, moment.policy):
@@ -235,7 +236,7 @@ def _meant(state: TrackerState, matrix_id: str) -> ReconstructorRecord | None:
     """Return the reconstructor of this id; of none, the one that is proposed, if one is."""
     if matrix_id:
         return known_record(state, matrix_id)
-    records = reversed(state.reconstructors)
+    records = reversed(state.matrices.reconstructors)
     return next((one for one in records if one.state is MatrixState.PROPOSED), None)
 
 
@@ -249,7 +250,7 @@ def _publish(moment: Moment, matrix_id: str) -> str | None:
     state = moment.state
     if matrix_id:
         record = known_record(state, matrix_id)
-        if not record.was_used and state.registration is None:
+        if not record.was_used and state.alpha.registration is None:
             unknown = "α is not known yet; start a dither, wait for a window"
             return f"{record.id} cannot be judged: {unknown}"
     return _needs_rtc(moment)
@@ -274,7 +275,7 @@ def _give_up(moment: Moment, measurement_id: str) -> str | None:
 
 
 def _acknowledge(moment: Moment, alarm: str) -> str | None:
-    notes = moment.state.alarm_records
+    notes = moment.state.alarms.records
     if not alarm:
         unseen = any(record.worst is not None and record.acknowledged is None for record in notes)
         return None if unseen else "every alarm is acknowledged"
@@ -288,7 +289,9 @@ def _acknowledge(moment: Moment, alarm: str) -> str | None:
 
 
 def _unmute(moment: Moment, alarm: str) -> str | None:
-    muted = any(record.muted for record in moment.state.alarm_records if alarm in {"", record.name})
+    muted = any(
+        record.muted for record in moment.state.alarms.records if alarm in {"", record.name}
+    )
     if muted or not _is_known(alarm):
         return None
     return f"{alarm} is not muted" if alarm else "no alarm is muted"

@@ -74,8 +74,8 @@ def proven_modes(state: TrackerState) -> frozenset[int]:
     Those of the matrix in use are, whatever a dither says of one: the RTC's own tells them, of the
     service's only proven ones are controlled, and the loop runs with them.
     """
-    proof = state.mode_proof
-    in_use = None if state.in_use is None else state.reconstructor(state.in_use)
+    proof = state.matrices.mode_proof
+    in_use = None if state.matrices.in_use is None else state.reconstructor(state.matrices.in_use)
     controlled = frozenset(range(0 if in_use is None else in_use.n_modes))
     if in_use is not None and in_use.parent is None:
         controlled -= proof.strange
@@ -84,7 +84,7 @@ def proven_modes(state: TrackerState) -> frozenset[int]:
 
 def shunned_modes(state: TrackerState) -> frozenset[int]:
     """Return the modes that have answered otherwise and are not in the loop: none tells of α."""
-    return state.mode_proof.contrary - proven_modes(state)
+    return state.matrices.mode_proof.contrary - proven_modes(state)
 
 
 def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str | None:
@@ -94,7 +94,7 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
     """
     if context.policy.dither_modes or context.policy.mode_information is None:
         return None  # there is no choice of others
-    proof = context.state.mode_proof
+    proof = context.matrices.mode_proof
     odd = (proof.contrary | proof.suspected).intersection(estimate.modes)
     odd -= proven_modes(context.state)
     if not odd:
@@ -110,13 +110,13 @@ def n_proven_modes(state: TrackerState, n_modes: int) -> int:
 
 def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None:
     """Return why a matrix would control modes that nobody has seen to answer, or None."""
-    if state.acquisition.under_way:
+    if state.operations.acquisition.under_way:
         return None  # it closes the loop on smooth modes first, and watches it
     proven = proven_modes(state)
     missing = [mode for mode in range(record.n_modes) if mode not in proven]
     if not missing:
         return None
-    contrary = [mode for mode in missing if mode in state.mode_proof.contrary]
+    contrary = [mode for mode in missing if mode in state.matrices.mode_proof.contrary]
     if contrary:
         return f"{_named(contrary)} not answered as the instrument file says"
     return (
@@ -127,7 +127,7 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
 
 def awaits_proof(context: StepContext, rtc: Status) -> bool:
     """Return whether modes that are wanted are still to be shown by a dither."""
-    allowed = context.policy.dither_enabled and not context.state.dither_stopped
+    allowed = context.policy.dither_enabled and not context.dithers.stopped
     return allowed and not context.policy.dither_modes and bool(_missing(context, rtc))
 
 
@@ -137,16 +137,16 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     Where few are missing, modes that tell of α are added: a window must still measure it.
     """
     state, registration = context.state, context.registration
-    busy = state.on_probation or state.making_since_ns_utc is not None
-    on_way = any(record.on_its_way for record in state.reconstructors)
-    if registration is None or busy or on_way or state.mode is Mode.HOLD:
+    busy = state.on_probation or state.matrices.making_since_ns_utc is not None
+    on_way = any(record.on_its_way for record in state.matrices.reconstructors)
+    if registration is None or busy or on_way or state.operator.mode is Mode.HOLD:
         return ()
     if not awaits_proof(context, rtc):
         return ()
     missing = _missing(context, rtc)
     if not (settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
         return ()
-    at_once = max(MAX_AT_ONCE // FEWER**state.mode_proof.n_tries, N_LINES)
+    at_once = max(MAX_AT_ONCE // FEWER**state.matrices.mode_proof.n_tries, N_LINES)
     most = min(len(lines_clear(context, rtc, window_s)), at_once, rtc.max_dither_modes)
     shown = missing[:most]
     telling = chosen_modes(rtc, context.policy, shunned_modes(state))
@@ -174,7 +174,7 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
     high = min(PROVING_RANGE[1] * rtc.frame_rate_hz, rtc.frame_rate_hz / 2 - edge_hz)
     # whole hertz apart: what is played is looked at second by second, and lines must not mix there
     spacing = np.ceil(max(CLOSEST_STEPS * step, (high - low) / MAX_AT_ONCE))
-    avoid = (*context.policy.dither_avoid_hz, *context.state.vibrations_hz)
+    avoid = (*context.policy.dither_avoid_hz, *context.loop.vibrations_hz)
     lines = np.arange(np.ceil(low), high, spacing)
     return tuple(
         float(line) for line in lines if all(abs(line - v) >= CLEARANCES_HZ[-1] for v in avoid)
@@ -183,26 +183,26 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
 
 def begin(context: StepContext, modes: tuple[int, ...]) -> None:
     """Note that a dither has been asked for to see these modes."""
-    proof = context.state.mode_proof
+    proof = context.matrices.mode_proof
     if (
         context.state.alarm(alarms.WORKER_BEHIND) is None
     ):  # which gives windows up: no fault of theirs
         proof = _missed(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
-    context.state = replace(context.state, mode_proof=shown)
+    context.matrices = replace(context.matrices, mode_proof=shown)
     context.log("modes.shown", f"modes {_listed(modes)} are dithered before they are controlled")
 
 
 def awaits_result(context: StepContext, window_s: float) -> bool:
     """Return whether what the last such dither has shown may still be on its way."""
-    proof = context.state.mode_proof
+    proof = context.matrices.mode_proof
     waited_s = (context.now_ns - proof.shown_ns_utc) / SECOND_NS
     return bool(proof.shown) and waited_s < window_s + TOLD_WITHIN_S
 
 
 def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
     """Take over which modes of a window answer as they should, whatever it says of α."""
-    rtc, proof = context.rtc, context.state.mode_proof
+    rtc, proof = context.rtc, context.matrices.mode_proof
     if rtc is None or estimate.session != rtc.session or estimate.gain_sigma is None:
         return
     modes, gains = np.array(estimate.modes), np.real(estimate.optical_gain)
@@ -228,7 +228,7 @@ def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> No
         proof = replace(proof, shown=frozenset())
     if proof == before:
         return
-    context.state = replace(context.state, mode_proof=proof)
+    context.matrices = replace(context.matrices, mode_proof=proof)
     _report_answers(context, rtc, bad)
     _tell_uneven(context, before)
 
@@ -252,14 +252,16 @@ def _answers(
 def recognise(context: StepContext, event: ev.ModesRecognised) -> None:
     """Take over which modes of the matrix in use the model has recognised."""
     proof = replace(
-        context.state.mode_proof,
+        context.matrices.mode_proof,
         strange=frozenset(event.strange),
         own_response_ratio=event.response,
     )
-    context.state = replace(context.state, mode_proof=proof)
+    context.matrices = replace(context.matrices, mode_proof=proof)
     context.log("modes.recognised", f"{event.id}: {event.text}")
-    before = context.state.mode_proof
-    context.state = replace(context.state, mode_proof=replace(before, own_uneven=event.uneven))
+    before = context.matrices.mode_proof
+    context.matrices = replace(
+        context.matrices, mode_proof=replace(before, own_uneven=event.uneven)
+    )
     _tell_uneven(context, before)
 
 
@@ -294,7 +296,7 @@ def _uneven(
 
 def _report_answers(context: StepContext, rtc: Status, bad: frozenset[int]) -> None:
     """Say which modes answer otherwise, and control none of them for a while."""
-    proof = context.state.mode_proof
+    proof = context.matrices.mode_proof
     contrary = shunned_modes(context.state)
     in_the_way = sorted(mode for mode in contrary if mode < _target(context, rtc))
     if not in_the_way:
@@ -328,7 +330,7 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
 
 def _tell_uneven(context: StepContext, before: ModeProof) -> None:
     """Say which modes answer more or less strongly than their neighbours."""
-    proof = context.state.mode_proof
+    proof = context.matrices.mode_proof
     if (proof.uneven, proof.own_uneven) == (before.uneven, before.own_uneven):
         return
     found = [f"{proof.own_uneven}: matrices allow for it"] if proof.own_uneven else []
@@ -352,12 +354,12 @@ def _missed(proof: ModeProof) -> ModeProof:
 
 def give_up(context: StepContext, rtc: Status) -> None:
     """Leave modes alone for a while that several dithers have not shown."""
-    proof = context.state.mode_proof
+    proof = context.matrices.mode_proof
     if proof.n_tries < TRIES:
         return
     suspected = proof.suspected - proof.shown
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
-    context.state = replace(context.state, mode_proof=given_up)
+    context.matrices = replace(context.matrices, mode_proof=given_up)
     text = (
         f"{_named(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows are "
         "refused, or give the dither more budget"
@@ -372,13 +374,15 @@ def _missing(context: StepContext, rtc: Status) -> list[int]:
     or it is none.
     """
     proven, wanted = proven_modes(context.state), _wanted(context, rtc)
-    accused = (mode for mode in context.state.mode_proof.suspected if wanted <= mode < rtc.n_modes)
+    accused = (
+        mode for mode in context.matrices.mode_proof.suspected if wanted <= mode < rtc.n_modes
+    )
     return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
 
 
 def _wanted(context: StepContext, rtc: Status) -> int:
     """Return up to which mode all should be proven now."""
-    limit, n_modes = context.state.mode_limit, _target(context, rtc)
+    limit, n_modes = context.matrices.mode_limit, _target(context, rtc)
     if limit is not None and context.now_ns < limit.until_ns_utc:
         n_modes = min(n_modes, limit.n_modes)
     return n_modes
@@ -386,7 +390,9 @@ def _wanted(context: StepContext, rtc: Status) -> int:
 
 def _target(context: StepContext, rtc: Status) -> int:
     """Return how many modes are controlled, are to be, or await an operator's word."""
-    proposed = (r.n_modes for r in context.state.reconstructors if r.state is MatrixState.PROPOSED)
+    proposed = (
+        r.n_modes for r in context.matrices.reconstructors if r.state is MatrixState.PROPOSED
+    )
     return max(rtc.n_controlled, min(context.policy.n_modes_target, rtc.n_modes), *proposed, 0)
 
 

@@ -56,7 +56,7 @@ def demand(context: StepContext) -> None:
     step = wanted(context.state, registration, context.policy.start.vector, limits)
     if not step.any():
         return
-    last = context.state.offload
+    last = context.alpha.offload
     offload = Offload(
         id=f"offload-{context.now_ns}",
         step=step,
@@ -65,7 +65,7 @@ def demand(context: StepContext) -> None:
         n_moves=0 if last is None else last.n_moves,
         still_ns_utc=_clock_ns(context, limits.settle_s),
     )
-    context.state = replace(context.state, offload=offload)
+    context.alpha = replace(context.alpha, offload=offload)
     named = dict(zip(PARAMETERS, (step * BOUNDARY_SCALE).tolist(), strict=True))
     context.ask(ev.Ask(request=OffloadRequest(id=offload.id, **named)))
     context.log("offload.asked", f"{offload.id}: α is to change by {step_text(step)}")
@@ -82,9 +82,9 @@ def wanted(
     alpha = registration.alpha.vector
     off = _apart(alpha, start)
     step = np.clip(-limits.share * off, -limits.max_step, limits.max_step)
-    done = np.zeros(4) if state.offload is None else state.offload.total
+    done = np.zeros(4) if state.alpha.offload is None else state.alpha.offload.total
     step = np.clip(done + step, -limits.travel, limits.travel) - done
-    used = state.reconstructor(state.in_use) if state.in_use else None
+    used = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
     made_for = start if used is None or used.alpha is None else used.alpha.vector
     before, after = (np.abs(_apart(at, made_for)) for at in (alpha, alpha + step))
     allowed = np.maximum(before, BEHIND * limits.max_step)
@@ -94,7 +94,7 @@ def wanted(
 
 def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> None:
     """Expect α where the device has moved it, or note that it has not."""
-    offload, limits, rtc = context.state.offload, context.policy.offloading, context.rtc
+    offload, limits, rtc = context.alpha.offload, context.policy.offloading, context.rtc
     if offload is None or limits is None or offload.id != request.id:
         return
     if not reply.accepted:
@@ -115,7 +115,7 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
 
 def on_failure(context: StepContext, name: str, text: str) -> None:
     """Know no more whether the image has moved: no reply came."""
-    offload, limits = context.state.offload, context.policy.offloading
+    offload, limits = context.alpha.offload, context.policy.offloading
     if offload is None or limits is None or offload.id != name:
         return
     still_ns = max(offload.still_ns_utc, _clock_ns(context, limits.settle_s))
@@ -132,7 +132,7 @@ def go_on(context: StepContext, offload: Offload) -> None:
     """
     if context.policy.offloading is None:
         return
-    context.state = replace(context.state, offload=offload)
+    context.alpha = replace(context.alpha, offload=offload)
     if offload.state is OffloadState.ASKED:
         on_failure(context, offload.id, "the service ended before the reply came")
 
@@ -141,8 +141,8 @@ def _may_move(
     context: StepContext, registration: Registration, rtc: Status, limits: Offloading
 ) -> bool:
     """Return whether α is beyond doubt, nothing else is under way, and nobody forbids it."""
-    state, last = context.state, context.state.offload
-    if state.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
+    state, last = context.state, context.alpha.offload
+    if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
     if any(
         context.blocking_alarm(interlock)
@@ -156,7 +156,9 @@ def _may_move(
     )
     if not sure or np.any(np.sqrt(np.diag(registration.covariance)) > limits.near):
         return False
-    if state.making_since_ns_utc is not None or any(r.on_its_way for r in state.reconstructors):
+    if state.matrices.making_since_ns_utc is not None or any(
+        r.on_its_way for r in state.matrices.reconstructors
+    ):
         return False
     if state.noisy_measurement is not None or ramping(state, context.now_ns) is not None:
         return False
@@ -176,7 +178,7 @@ def _clock_ns(context: StepContext, after_s: float) -> int:
 
 
 def _end(context: StepContext, offload: Offload, state: OffloadState, text: str) -> None:
-    context.state = replace(context.state, offload=replace(offload, state=state, text=text))
+    context.alpha = replace(context.alpha, offload=replace(offload, state=state, text=text))
 
 
 def _cross_talk(step: Array, limits: Offloading) -> Array:

@@ -36,7 +36,7 @@ from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 def set_mode(context: StepContext, command: cmd.SetMode) -> None:
     """Go on in the mode an operator orders; that of the settings is remembered."""
     mode = command.mode
-    of_settings = context.state.settings_mode or context.state.mode
+    of_settings = context.operator.settings_mode or context.operator.mode
     change_mode(context, mode, None if mode is of_settings else of_settings)
     context.clear_alarm(PROBATION)
     context.log("mode", f"mode is {mode}")
@@ -150,14 +150,14 @@ def set_pointing(context: StepContext, command: cmd.SetPointing) -> None:
 
 def enter_hold(context: StepContext, why: str) -> None:
     """Do nothing unasked until an operator sets another mode."""
-    of_settings = context.state.settings_mode or context.state.mode
+    of_settings = context.operator.settings_mode or context.operator.mode
     change_mode(context, Mode.HOLD, None if of_settings is Mode.HOLD else of_settings)
     context.log("mode", f"hold: {why}")
 
 
 def change_mode(context: StepContext, mode: Mode, of_settings: Mode | None) -> None:
     """Go on in a mode; ``of_settings`` is that of the settings, None: the same."""
-    context.state = replace(context.state, mode=mode, settings_mode=of_settings)
+    context.operator = replace(context.operator, mode=mode, settings_mode=of_settings)
 
 
 RAMP_GROUPS = ((0, 1), (2, 99), (100, None))
@@ -188,7 +188,7 @@ def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
         raise CommandError(f"found {n_controlled} modes; expected 1 to {rtc.n_modes}")
     gains = _gains_of(command, context, rtc, n_controlled or rtc.n_controlled)
     if command.loop is not None:
-        context.state = replace(context.state, close_since_ns_utc=None)
+        context.loop = replace(context.loop, close_since_ns_utc=None)
     _ask_loop(
         context,
         LoopRequest(
@@ -226,11 +226,11 @@ def ramp(context: StepContext, command: cmd.Ramp) -> None:
 
 def on_loop_answer(context: StepContext, command: str, outcome: CommandState, reason: str) -> None:
     """Note what became of a command; one that a later one has replaced is only logged."""
-    asked, text = context.state.loop_command, command
+    asked, text = context.loop.command, command
     if asked is not None and asked.id == command:
         until_ns = context.now_ns + round(asked.lasts_s * SECOND_NS)
         ended = replace(asked, state=outcome, reason=reason, until_ns_utc=until_ns)
-        context.state = replace(context.state, loop_command=ended)
+        context.loop = replace(context.loop, command=ended)
         text = asked.text
     level = Level.INFO if outcome is CommandState.ACCEPTED else Level.WARNING
     context.log(f"loop.{outcome}", f"{text}: {reason}" if reason else text, level)
@@ -238,28 +238,28 @@ def on_loop_answer(context: StepContext, command: str, outcome: CommandState, re
 
 def end_ramp(context: StepContext) -> None:
     """Note that no ramp can be under way: the RTC has begun a new session."""
-    asked = context.state.loop_command
-    context.state = replace(context.state, loop_command=asked and replace(asked, lasts_s=0.0))
+    asked = context.loop.command
+    context.loop = replace(context.loop, command=asked and replace(asked, lasts_s=0.0))
 
 
 def begin_closing(context: StepContext) -> None:
     """Close the loop again that a measurement has opened which was given up."""
-    context.state = replace(context.state, close_since_ns_utc=context.now_ns)
+    context.loop = replace(context.loop, close_since_ns_utc=context.now_ns)
     close_again(context)
 
 
 def close_again(context: StepContext) -> None:
     """Close the loop that a measurement opened which was then given up, as often as it takes."""
-    since_ns, rtc = context.state.close_since_ns_utc, context.rtc
-    if since_ns is None or rtc is None or context.state.stopped_because:
+    since_ns, rtc = context.loop.close_since_ns_utc, context.rtc
+    if since_ns is None or rtc is None or context.operator.stopped_because:
         return
     waited_s = (context.now_ns - since_ns) / SECOND_NS
     # a measurement only just asked for may open it yet
     closed = rtc.loop != "open"
     if waited_s > (CLOSE_AGAIN_EVERY_S if closed else CLOSE_AGAIN_FOR_S):
-        context.state = replace(context.state, close_since_ns_utc=None)
+        context.loop = replace(context.loop, close_since_ns_utc=None)
         return
-    last = context.state.loop_command
+    last = context.loop.command
     recent = (
         last is not None and context.now_ns - last.asked_ns_utc < CLOSE_AGAIN_EVERY_S * SECOND_NS
     )
@@ -356,6 +356,6 @@ def _ask_loop(
         asked_ns_utc=context.now_ns,
         lasts_s=lasts_s,
     )
-    context.state = replace(context.state, loop_command=asked)
+    context.loop = replace(context.loop, command=asked)
     context.log("loop.asked", text)
     context.ask(ev.Ask(request=request, judged=judged))

@@ -50,15 +50,15 @@ def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
 
 def keep(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep one more reconstructor; what is needed least gives way."""
-    records = [*(r for r in context.state.reconstructors if r.id != record.id), record]
-    kept = prune(records, context.state.in_use)
-    context.state = replace(context.state, reconstructors=kept)
+    records = [*(r for r in context.matrices.reconstructors if r.id != record.id), record]
+    kept = prune(records, context.matrices.in_use)
+    context.matrices = replace(context.matrices, reconstructors=kept)
 
 
 def change(context: StepContext, record: ReconstructorRecord) -> None:
     """Replace the record of the same id."""
-    records = tuple(record if r.id == record.id else r for r in context.state.reconstructors)
-    context.state = replace(context.state, reconstructors=records)
+    records = tuple(record if r.id == record.id else r for r in context.matrices.reconstructors)
+    context.matrices = replace(context.matrices, reconstructors=records)
 
 
 def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:
@@ -69,33 +69,35 @@ def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: 
 def use(context: StepContext, matrix_id: str) -> None:
     """Mark one reconstructor as applied; whichever was, has been superseded."""
     record = known_record(context.state, matrix_id)
-    if context.state.in_use == matrix_id and record.state is MatrixState.APPLIED:
+    if context.matrices.in_use == matrix_id and record.state is MatrixState.APPLIED:
         return
-    for other in context.state.reconstructors:
+    for other in context.matrices.reconstructors:
         if other.id != matrix_id and other.state is MatrixState.APPLIED:
             change_state(context, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
     change(context, replace(record, state=MatrixState.APPLIED))
     forget_verdict(context)
-    context.state = replace(context.state, in_use=matrix_id, assessment=None, judged_ns_utc=None)
+    context.matrices = replace(
+        context.matrices, in_use=matrix_id, assessment=None, judged_ns_utc=None
+    )
 
 
 def forget_verdict(context: StepContext) -> None:
     """Forget the margin of the matrix in use: what it was judged at is not so any more."""
-    context.state = replace(context.state, margin=None)
+    context.matrices = replace(context.matrices, margin=None)
 
 
 def judge_again(context: StepContext) -> None:
     """Have the matrix in use judged again, whenever that was done last."""
-    context.state = replace(context.state, judged_ns_utc=None)
+    context.matrices = replace(context.matrices, judged_ns_utc=None)
 
 
 def forget_session(context: StepContext) -> None:
     """Note that the RTC has begun a new session: nobody knows what it multiplies with."""
-    for record in context.state.reconstructors:
+    for record in context.matrices.reconstructors:
         if record.on_its_way:
             change_state(context, record.id, MatrixState.FAILED, "the RTC restarted")
-    context.state = replace(
-        context.state,
+    context.matrices = replace(
+        context.matrices,
         in_use=None,
         verified_ids=frozenset(),
         mismatched_id=None,
@@ -109,29 +111,29 @@ def forget_session(context: StepContext) -> None:
 
 def fetch(context: StepContext, rtc: Status) -> None:
     """Ask the RTC for the matrix it uses."""
-    context.state = replace(context.state, applied_asked_ns_utc=context.now_ns)
+    context.matrices = replace(context.matrices, applied_asked_ns_utc=context.now_ns)
     context.ask(ev.FetchMatrix(id=rtc.cm_id))
 
 
 def not_fetched(context: StepContext, why: str) -> None:
     """Note why the matrix in use is not to be had."""
-    context.state = replace(context.state, read_back_error=why)
+    context.matrices = replace(context.matrices, read_back_error=why)
 
 
 def make(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMatrix) -> None:
     """Have a reconstructor computed, or copied."""
-    context.state = replace(context.state, making_since_ns_utc=context.now_ns)
+    context.matrices = replace(context.matrices, making_since_ns_utc=context.now_ns)
     context.ask(effect)
 
 
 def made_none(context: StepContext) -> None:
     """Note that no reconstructor is being computed."""
-    context.state = replace(context.state, making_since_ns_utc=None)
+    context.matrices = replace(context.matrices, making_since_ns_utc=None)
 
 
 def judge(context: StepContext, matrix_id: str) -> None:
     """Have the matrix in use judged."""
-    context.state = replace(context.state, judged_ns_utc=context.now_ns)
+    context.matrices = replace(context.matrices, judged_ns_utc=context.now_ns)
     context.ask(ev.JudgeMatrix(id=matrix_id))
 
 
@@ -155,7 +157,7 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
         return
     held = why_unsendable(context.state, record) or beyond_judging(context.state, record)
     no_return = (
-        None if wanted or context.state.mode is not Mode.AUTO else why_no_return(context.state)
+        None if wanted or context.operator.mode is not Mode.AUTO else why_no_return(context.state)
     )
     if not held and no_return is not None:
         context.log("reconstructor.kept-back", f"{record.id} is proposed and not sent: {no_return}")
@@ -168,7 +170,7 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
 def propose(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep a new reconstructor in place of any proposal."""
     made_none(context)
-    for older in context.state.reconstructors:
+    for older in context.matrices.reconstructors:
         if older.state is MatrixState.PROPOSED:
             change_state(context, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
     keep(context, record)
@@ -293,8 +295,8 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
         context.clear_alarm(SHORT_MARGIN)
         gains = () if context.rtc is None else commanded_gains(context.rtc, record.n_modes)
         of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
-        context.state = replace(
-            context.state,
+        context.matrices = replace(
+            context.matrices,
             margin=None if of_other else record.gate,
             judged_ns_utc=None if of_other else context.now_ns,
         )
@@ -318,7 +320,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
         _distrust(context, known, MatrixState.APPLIED, record.sha256)
         return
     _trust(context, record.id)
-    if context.state.in_use == record.id:
+    if context.matrices.in_use == record.id:
         return
     if known is None:
         keep(context, record)
@@ -348,7 +350,7 @@ def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
     record, verdict, judged = context.state.reconstructor(event.id), event.verdict, event.judged
     if record is None:
         return
-    used = event.id == context.state.in_use
+    used = event.id == context.matrices.in_use
     gains = () if context.rtc is None else context.rtc.gains[: record.n_modes]
     if (
         judged is not None
@@ -365,7 +367,7 @@ def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
         assessment = Assessment(
             id=event.id, alpha=event.alpha, expected=event.expected, t_ns_utc=context.now_ns
         )
-    context.state = replace(context.state, margin=verdict, assessment=assessment)
+    context.matrices = replace(context.matrices, margin=verdict, assessment=assessment)
     if verdict.accepted:
         context.clear_alarm(SHORT_MARGIN)
     else:
@@ -403,10 +405,10 @@ def _distrust(
     )
     change_state(context, record.id, MatrixState.FAILED, text)
     if state is MatrixState.APPLIED:
-        context.state = replace(context.state, in_use=None, margin=None, assessment=None)
-    context.state = replace(
-        context.state,
-        verified_ids=context.state.verified_ids - {record.id},
+        context.matrices = replace(context.matrices, in_use=None, margin=None, assessment=None)
+    context.matrices = replace(
+        context.matrices,
+        verified_ids=context.matrices.verified_ids - {record.id},
         mismatched_id=record.id,
         applied_asked_ns_utc=context.now_ns,
     )
@@ -415,17 +417,17 @@ def _distrust(
 
 def _trust(context: StepContext, matrix_id: str) -> None:
     """Note that the RTC holds the numbers that it should."""
-    kept = {record.id for record in context.state.reconstructors} & context.state.verified_ids
-    context.state = replace(context.state, verified_ids=frozenset({*kept, matrix_id}))
-    if context.state.mismatched_id is not None:
-        context.state = replace(context.state, mismatched_id=None)
+    kept = {record.id for record in context.matrices.reconstructors} & context.matrices.verified_ids
+    context.matrices = replace(context.matrices, verified_ids=frozenset({*kept, matrix_id}))
+    if context.matrices.mismatched_id is not None:
+        context.matrices = replace(context.matrices, mismatched_id=None)
         context.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
         context.clear_alarm(OTHER_SUM)
 
 
 def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether a jump has been named since it was asked for, beyond the gate's verdict."""
-    registration, began_ns = state.registration, state.making_since_ns_utc
+    registration, began_ns = state.alpha.registration, state.matrices.making_since_ns_utc
     if registration is None or registration.jumped_ns_utc is None or began_ns is None:
         return False
     return registration.jumped_ns_utc >= began_ns and update_policy.outdated(state, record)
@@ -441,12 +443,12 @@ def _meant(state: TrackerState, event: Acknowledgement) -> ReconstructorRecord |
     """Return which reconstructor is acknowledged: a commit nobody could read was the last one."""
     if event.id is not None:
         return state.reconstructor(event.id)
-    return next((r for r in reversed(state.reconstructors) if r.on_its_way), None)
+    return next((r for r in reversed(state.matrices.reconstructors) if r.on_its_way), None)
 
 
 def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledgement) -> bool:
     """Return whether an acknowledgement tells of something that has been overtaken."""
-    if state.rtc is not None and event.session != state.rtc.session:
+    if state.loop.rtc is not None and event.session != state.loop.rtc.session:
         return True
     if event.state is AckState.STAGED:
         return record.state is not MatrixState.PUBLISHED

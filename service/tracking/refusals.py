@@ -24,7 +24,7 @@ AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 
 def count(context: StepContext) -> None:
     """Count a window that was refused."""
-    context.state = replace(context.state, windows_refused=context.state.windows_refused + 1)
+    context.windows = replace(context.windows, refused=context.windows.refused + 1)
 
 
 def refuse(context: StepContext, reason: str, kind: RefusalKind) -> None:
@@ -32,8 +32,8 @@ def refuse(context: StepContext, reason: str, kind: RefusalKind) -> None:
     count(context)
     if kind in AS_EXPECTED:
         return
-    run = min(context.state.window_run, 0) - 1
-    context.state = replace(context.state, window_run=run)
+    run = min(context.windows.run, 0) - 1
+    context.windows = replace(context.windows, run=run)
     if run > -IN_A_ROW or _excused(context):
         return
     text = f"windows are refused one after the other: {reason}; α is not measured meanwhile"
@@ -45,8 +45,8 @@ def refuse(context: StepContext, reason: str, kind: RefusalKind) -> None:
 
 def use(context: StepContext) -> None:
     """Note that a window could be used; as many in a row as raise the alarm end it."""
-    run = max(context.state.window_run, 0) + 1
-    context.state = replace(context.state, window_run=run)
+    run = max(context.windows.run, 0) + 1
+    context.windows = replace(context.windows, run=run)
     if run >= IN_A_ROW:
         context.clear_alarm(alarms.WINDOWS_REFUSED)
 
@@ -57,8 +57,8 @@ def follow(context: StepContext) -> None:
     One that is expected and does not come is as good as refused.
     """
     if _excused(context):
-        if context.state.window_run < 0 or context.state.alarm(alarms.WINDOWS_REFUSED):
-            context.state = replace(context.state, window_run=0)
+        if context.windows.run < 0 or context.state.alarm(alarms.WINDOWS_REFUSED):
+            context.windows = replace(context.windows, run=0)
             context.clear_alarm(alarms.WINDOWS_REFUSED)
         return
     registration, dither = context.registration, context.dither
@@ -75,7 +75,7 @@ def follow(context: StepContext) -> None:
 def _excused(context: StepContext) -> bool:
     """Return whether windows are refused for what is known already, or none is wanted."""
     state, rtc = context.state, context.rtc
-    if rtc is None or not rtc.in_loop or state.dither_stopped or state.stopped_because:
+    if rtc is None or not rtc.in_loop or state.dithers.stopped or state.operator.stopped_because:
         return True
     if context.acquisition.under_way or state.measuring is not None:
         return True

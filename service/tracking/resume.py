@@ -37,7 +37,7 @@ def stop(context: StepContext, command: cmd.StopEverything) -> None:
     closed again when all is released: the RTC is busy until then. A gain ramp is the RTC's, and
     ends by itself; only opening the loop would end it sooner.
     """
-    if not context.state.stopped_because:
+    if not context.operator.stopped_because:
         ramp = ramping(context.state, context.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
         _stay(context, f"everything was stopped {command.signed}{left}")
@@ -54,7 +54,7 @@ def stop(context: StepContext, command: cmd.StopEverything) -> None:
 
 def release(context: StepContext, command: cmd.Resume) -> None:
     """Go on in the mode and with the dither that were ordered before, or meanwhile."""
-    context.state = replace(context.state, stopped_because="")
+    context.operator = replace(context.operator, stopped_because="")
     context.clear_alarm(STOPPED)
     context.log("resumed", command.signed)
 
@@ -66,7 +66,7 @@ def keep_stopped(context: StepContext) -> None:
 
 
 def _stay(context: StepContext, text: str) -> None:
-    context.state = replace(context.state, stopped_because=text)
+    context.operator = replace(context.operator, stopped_because=text)
     context.raise_alarm(
         STOPPED, f"{text}: nothing is dithered, made or sent until the stop is released"
     )
@@ -75,11 +75,11 @@ def _stay(context: StepContext, text: str) -> None:
 def orders_of(state: TrackerState) -> Orders:
     """Return what the next service has to obey; the default is nothing."""
     return Orders(
-        mode=None if state.settings_mode is None else state.mode,
-        settings_mode=state.settings_mode,
-        dither_stopped=state.dither_stopped,
-        stopped=state.stopped_because,
-        seen=state.alarm_records,
+        mode=None if state.operator.settings_mode is None else state.operator.mode,
+        settings_mode=state.operator.settings_mode,
+        dither_stopped=state.dithers.stopped,
+        stopped=state.operator.stopped_because,
+        seen=state.alarms.records,
     )
 
 
@@ -93,7 +93,7 @@ def obey(context: StepContext, orders: Orders) -> None:
         dither.allow(context, allowed=False)
         text = "by an operator before the restart; start the dither to let it dither again"
         context.warn("dither.stopped", text)
-    of_settings, ordered = context.state.mode, orders.mode
+    of_settings, ordered = context.operator.mode, orders.mode
     if ordered is None or ordered is of_settings:
         return
     if of_settings is not orders.settings_mode:
@@ -127,22 +127,26 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return what is worth keeping of a state; None: nothing is known yet, nor ordered."""
-    registration, acquisition, orders = state.registration, left_behind(state), orders_of(state)
+    registration, acquisition, orders = (
+        state.alpha.registration,
+        left_behind(state),
+        orders_of(state),
+    )
     if registration is not None:
         bias = registration.bias and replace(registration.bias, previous_estimate=None)
         registration = replace(registration, bias=bias, suspected_jump=None, previous_estimate=None)
-    elif acquisition is None and state.offload is None and orders == Orders():
+    elif acquisition is None and state.alpha.offload is None and orders == Orders():
         return None
     return Saved(
         system=state.system,
         saved_ns_utc=now_ns,
-        session=state.rtc.session if state.rtc is not None else None,
-        in_use=state.in_use,
-        pointing=state.pointing,
+        session=state.loop.rtc.session if state.loop.rtc is not None else None,
+        in_use=state.matrices.in_use,
+        pointing=state.alpha.pointing,
         registration=registration,
         acquisition=acquisition,
         orders=None if orders == Orders() else orders,
-        offload=state.offload,
+        offload=state.alpha.offload,
     )
 
 
@@ -201,8 +205,8 @@ def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:
     if registration is None:
         return None
     for name, found, expected in (
-        ("basis", registration.basis_id, state.basis_id),
-        ("configuration", registration.config_id, state.config_id),
+        ("basis", registration.basis_id, state.loop.basis_id),
+        ("configuration", registration.config_id, state.loop.config_id),
     ):
         if expected is not None and found != expected:
             return f"it is of {name} {found}, the instrument file has {expected}"

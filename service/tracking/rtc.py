@@ -6,12 +6,12 @@ from dataclasses import replace
 
 from service.tracking import alarms, dither, reconstructors, validity
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import Effect
 from service.tracking.loop import loop_numbers, same_loop, same_numbers, why_open
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
-from service.tracking.state import AcquisitionStage
 from service.tracking.step_context import StepContext, tell_bursts
 from service.wire import DitherRequest, DitherStop, Status
 
@@ -31,7 +31,7 @@ COMPUTE_WITHIN_S = 60.0
 
 def on_tick(context: StepContext) -> None:
     """Give up what has been waited for too long."""
-    for record in context.state.reconstructors:
+    for record in context.matrices.reconstructors:
         sent_ns = record.published_ns_utc or context.now_ns
         if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
             text = (
@@ -40,11 +40,11 @@ def on_tick(context: StepContext) -> None:
             )
             reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
             context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
-    for alarm in context.state.alarms:
+    for alarm in context.alarms.active:
         silent_ns = context.now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
             validity.end_alarm(context, alarm.name)
-    since_ns = context.state.making_since_ns_utc
+    since_ns = context.matrices.making_since_ns_utc
     if since_ns is not None and context.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
         reconstructors.made_none(context)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
@@ -63,11 +63,11 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if bias is not None and bias.looked_ns_utc and not same_numbers(bias.loop, loop_numbers(rtc)):
         # it was learnt in another loop, in whichever session
         validity.forget_bias(context)
-    context.state = replace(
-        context.state,
+    context.loop = replace(
+        context.loop,
         rtc=rtc,
-        basis_id=context.state.basis_id or rtc.basis_id,
-        config_id=context.state.config_id or rtc.config_id,
+        basis_id=context.loop.basis_id or rtc.basis_id,
+        config_id=context.loop.config_id or rtc.config_id,
     )
     validity.point(context, rtc.pointing)
     _drop_other_basis(context)
@@ -87,8 +87,8 @@ def on_status(context: StepContext, rtc: Status) -> None:
 
 def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
     """Note where the slopes vibrate; the next dither keeps clear of it."""
-    before, lines = context.state.vibrations_hz, event.lines_hz
-    context.state = replace(context.state, vibrations_hz=lines)
+    before, lines = context.loop.vibrations_hz, event.lines_hz
+    context.loop = replace(context.loop, vibrations_hz=lines)
     # a line between two bins of the spectrum shows now in one, now in the other
     if not all(any(abs(line - known) < _SAME_LINE_HZ for known in before) for line in lines):
         context.log("vibrations", f"vibrations at {', '.join(f'{f:.0f}' for f in lines)} Hz")
@@ -96,7 +96,7 @@ def on_vibrations(context: StepContext, event: ev.Vibrations) -> None:
 
 def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     """Note whether the loop holds well."""
-    context.state = replace(context.state, loop_holds=event.holds)
+    context.loop = replace(context.loop, holds=event.holds)
 
 
 def _tell_of_gains(context: StepContext, before: Status | None, rtc: Status) -> None:
@@ -113,11 +113,14 @@ def _drop_other_basis(context: StepContext) -> None:
     registration, state = context.registration, context.state
     if registration is None or registration.basis_id is None or registration.config_id is None:
         return
-    if (registration.basis_id, registration.config_id) != (state.basis_id, state.config_id):
+    if (registration.basis_id, registration.config_id) != (
+        state.loop.basis_id,
+        state.loop.config_id,
+    ):
         validity.forget(context)
         text = (
             f"α was measured with {registration.basis_id}, {registration.config_id}; the RTC has "
-            f"{state.basis_id}, {state.config_id}"
+            f"{state.loop.basis_id}, {state.loop.config_id}"
         )
         context.log("registration.void", text)
 
@@ -130,7 +133,7 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     end_ramp(context)
     validity.require_confirmation(context)
     context.retry_all()
-    context.state = replace(context.state, rtc=None, loop_holds=False)
+    context.loop = replace(context.loop, rtc=None, holds=False)
     dither.found_again(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)
@@ -141,7 +144,7 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
 def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
     """Forget what belonged to the RTC, and nothing else."""
     dither.drop(context)
-    context.state = replace(context.state, rtc=None)
+    context.loop = replace(context.loop, rtc=None)
     dither.found_again(context)
     dither.forget_unwanted(context)
     text = (

@@ -24,9 +24,9 @@ def why_unsendable(
     ``swapped_ns_utc``: it was in use until then. What telemetry has complained of since is what the
     swap has done, and no reason against going back.
     """
-    if state.rtc is None:
+    if state.loop.rtc is None:
         return NO_RTC
-    known, registration = _was_in_use(state, record), state.registration
+    known, registration = _was_in_use(state, record), state.alpha.registration
     if registration is not None and not known:  # one must be able to go back
         if registration.suspected_jump is not None:
             return "a jump is suspected: the next window of telemetry decides"
@@ -34,11 +34,11 @@ def why_unsendable(
             now = "invalid" if registration.doubt_voids else "in question"
             return f"α is {now} ({registration.doubt})"
     interlock = Interlock.SEND_KNOWN if known else Interlock.SEND_NEW
-    before = state.alarms if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
+    before = state.alarms.active if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
     alarm = next((alarm for alarm in before if alarm_blocks(alarm, interlock)), None)
     if alarm is not None:
         return alarm.text
-    unread = why_unread(state, state.rtc.cm_id)
+    unread = why_unread(state, state.loop.rtc.cm_id)
     return unread if unread or known else why_unproven(state, record)
 
 
@@ -53,11 +53,15 @@ def why_refused(
 
 def why_no_return(state: TrackerState) -> str | None:
     """Return why the matrix in use could not be sent back after another one, or None."""
-    rtc = state.rtc
-    if rtc is None or (rtc.cm_id or state.in_use) in state.verified_ids:
+    rtc = state.loop.rtc
+    if rtc is None or (rtc.cm_id or state.matrices.in_use) in state.matrices.verified_ids:
         return None
     name = "its matrix" if rtc.cm_id is None else rtc.cm_id
-    why = state.read_back_error or why_unread(state, rtc.cm_id) or "its status does not name it"
+    why = (
+        state.matrices.read_back_error
+        or why_unread(state, rtc.cm_id)
+        or "its status does not name it"
+    )
     return (
         f"there would be no way back: the RTC has not shown {name} on rtc/cm/applied ({why}); "
         "have it offered there, or approve what is proposed and watch the loop"
@@ -68,39 +72,42 @@ def _not_of_swap(state: TrackerState, swapped_ns_utc: int) -> tuple[Alarm, ...]:
     """Return the alarms that a matrix applied then cannot have caused."""
     return tuple(
         alarm
-        for alarm in state.alarms
+        for alarm in state.alarms.active
         if alarm.name not in _OF_A_SWAP or alarm.since_ns_utc < swapped_ns_utc
     )
 
 
 def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
     """Return why nobody knows the numbers of this matrix of the RTC's, or None."""
-    if matrix_id is None or matrix_id in state.verified_ids:
+    if matrix_id is None or matrix_id in state.matrices.verified_ids:
         return None
-    if matrix_id == state.mismatched_id:
+    if matrix_id == state.matrices.mismatched_id:
         return f"the RTC holds other numbers as {matrix_id}"
-    if state.read_back_error:
+    if state.matrices.read_back_error:
         return None  # an RTC need not offer its matrix; its id is believed then
     return f"the RTC's matrix {matrix_id} is being read back: wait some seconds"
 
 
 def may_follow(state: TrackerState) -> bool:
     """Return whether a reconstructor that nobody asked for may be sent."""
-    rtc, registration = state.rtc, state.registration
-    if state.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
+    rtc, registration = state.loop.rtc, state.alpha.registration
+    if state.operator.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
         return False
-    if blocking_alarm(state, Interlock.DECIDE) is not None or why_no_return(state) is not None:
+    if (
+        blocking_alarm(state.alarms.active, Interlock.DECIDE) is not None
+        or why_no_return(state) is not None
+    ):
         return False
     return registration is not None and update_policy.settled(registration)
 
 
 def beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether nobody knows the gains it was judged with, nor those it would run with."""
-    opened = state.rtc is not None and state.rtc.loop == "open"
+    opened = state.loop.rtc is not None and state.loop.rtc.loop == "open"
     return opened and record.gate is not None and record.judged is None
 
 
 def _was_in_use(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether the very numbers of this reconstructor have been in use before."""
-    same = (r for r in state.reconstructors if r.sha256 == record.sha256)
+    same = (r for r in state.matrices.reconstructors if r.sha256 == record.sha256)
     return bool(record.sha256) and any(r.was_used for r in same)

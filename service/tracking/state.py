@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
 from service.control.gate import GateVerdict
-from service.model.misregistration import Misregistration
+from service.tracking.acquisition_state import Acquisition
 from service.tracking.alarms import Alarm, AlarmRecord
 from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.loop import LoopCommand
@@ -88,162 +85,22 @@ class Mode(StrEnum):
     """Estimate only: nothing is computed or published unless asked for."""
 
 
-class AcquisitionStage(StrEnum):
-    """How far an acquisition has come."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OperatorState:
+    """What operators have ordered; written where orders are taken."""
 
-    IDLE = "idle"
-    """None has been asked for, or needed."""
+    mode: Mode = Mode.PROPOSE
 
-    OPENING = "opening"
-    """The RTC has been asked to open the loop."""
+    settings_mode: Mode | None = None
+    """What the settings say while an operator has ordered another; None: ``mode`` is theirs."""
 
-    COARSE = "coarse"
-    """Smooth modes are dithered with the loop open, to find α from afar."""
-
-    CONFIRMING = "confirming"
-    """Other modes are dithered, which must say the same."""
-
-    PARTIAL = "partial"
-    """A reconstructor for a part of the modes is made, judged and sent; then the loop closes."""
-
-    WIDENING = "widening"
-    """The loop is closed: α sharpens, and more modes are controlled."""
-
-    TRACKING = "tracking"
-    """Done: α is known and the loop closed on it."""
-
-    FAILED = "failed"
-    """Given up; the text says why, and what to do."""
-
-    ABORTED = "aborted"
-    """An operator ended it."""
-
-    INTERRUPTED = "interrupted"
-    """The service ended, or the RTC vanished, in the middle of it; the text says what is done."""
-
-
-UNDER_WAY = frozenset(
-    {
-        AcquisitionStage.OPENING,
-        AcquisitionStage.COARSE,
-        AcquisitionStage.CONFIRMING,
-        AcquisitionStage.PARTIAL,
-        AcquisitionStage.WIDENING,
-    }
-)
-"""Stages in which the loop is the acquisition's."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LoopFound:
-    """The loop before anything was done to it."""
-
-    closed: bool
-    gains: tuple[float, ...]
-    """One per mode of the basis, as it will be closed again."""
-
-    n_controlled: int
-    """Modes to come back to."""
-
-    leak: float
-    """Per frame."""
-
-    held: bool
-    """Whether it was closed and no alarm said that it did not hold."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interruption:
-    """What an acquisition was at when it was cut off: the service ended, or the RTC vanished."""
-
-    doing: str
-    """Stage, and the text of it."""
-
-    session: str | None
-    """The RTC's; None: none was there. An open loop in the same session is the one it left."""
-
-    cause: str = "the service ended"
+    stopped_because: str = ""
+    """Who has stopped everything, and why; empty: nobody, or it was released."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Acquisition:
-    """One acquisition, under way or over."""
-
-    stage: AcquisitionStage = AcquisitionStage.IDLE
-    text: str = "none was needed"
-    """What it does, or how it ended and what to do."""
-
-    started_ns_utc: int = 0
-    since_ns_utc: int = 0
-    """Since when it is in this stage."""
-
-    commanded: bool = False
-    """An operator asked for it: that allows its publications in every mode."""
-
-    attempt: int = 0
-    """How often the loop has been opened for it."""
-
-    misses: int = 0
-    """Windows in a row, of this stage or before a start, that led nowhere."""
-
-    found: LoopFound | None = None
-    """None: idle."""
-
-    alpha: Misregistration | None = None
-    """Found with the loop open; None: not yet."""
-
-    covariance: NDArray[np.float64] | None = None
-    """``(4, 4)`` of it, the open loop's model error included, numeric units."""
-
-    n_modes: int = 0
-    """Modes of the reconstructor that is made, sent or in use."""
-
-    max_modes: int | None = None
-    """More than so many were refused by the gate, or have slipped; None: not yet."""
-
-    command: str | None = None
-    """Id of the change of the loop that was asked for in this stage; None: none was."""
-
-    matrix: str | None = None
-    """Id of the reconstructor sent for it last; None: none was in this attempt."""
-
-    applied: str | None = None
-    """Id of the last one that was applied with the loop closed."""
-
-    sent: bool = False
-    """Whether anything was sent: the RTC's own matrix is then no longer in use."""
-
-    windows: int = 0
-    """Windows that had been accepted when the reconstructor in use was applied, or it was over."""
-
-    held_off: bool = False
-    """An operator ended it: none begins by itself until windows agree in a closed loop, an operator
-    sets the mode, or asks for one."""
-
-    interruption: Interruption | None = None
-    """How it was left by the service before this one, or at a gap in the link; None: it was not."""
-
-    @property
-    def uses_wide_capture(self) -> bool:
-        """Whether windows are of the open loop, from which α is found."""
-        return self.stage in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}
-
-    @property
-    def under_way(self) -> bool:
-        """Whether it is neither over nor idle."""
-        return self.stage in UNDER_WAY
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)  # without slots: see Turn
-class TrackerState:
-    """Everything the service knows; ``service.tracker.step`` makes the next one."""
-
-    system: str
-    """The ``{system}`` of the wire."""
-
-    mode: Mode = Mode.PROPOSE
-    settings_mode: Mode | None = None
-    """What the settings say while an operator has ordered another; None: ``mode`` is theirs."""
+class AlphaState:
+    """What is known of α, and of the telemetry that tells of it."""
 
     registration: Registration | None = None
     """None until the first accepted window."""
@@ -251,11 +108,54 @@ class TrackerState:
     history: tuple[HistoryEntry, ...] = ()
     """Oldest first, bounded."""
 
+    passive: PassiveState | None = None
+
+    passive_unavailable_reason: str = ""
+    """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
+
+    void_before_ns_utc: int = 0
+    """Telemetry that began before this time of the RTC's clock measures nothing."""
+
+    void_because: str = ""
+    """What was the matter with it."""
+
+    dither_due_since_ns_utc: int | None = None
+    """Since when a dithered window is wanted before anything else is believed; None: it is not."""
+
+    dither_due_reason: str = ""
+    """Why: what makes α doubtful."""
+
+    pointing: Pointing | None = None
+    """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
+
+    pointings: tuple[tuple[int, Pointing], ...] = ()
+    """Where it looked, and from when on by the RTC's clock: oldest first, bounded."""
+
+    offload: Offload | None = None
+    """The last one asked for; None: none was, or α is corrected by the matrix alone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WindowCounts:
+    """How many windows there were, and what became of them."""
+
+    accepted: int = 0
+
+    refused: int = 0
+
+    run: int = 0
+    """How many of the last windows could be used one after the other; below 0: were refused."""
+
+    outlying: int = 0
+    """Believable in themselves, but so far from all others that they were not believed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatrixStates:
+    """Reconstructors, and what is known of the one the RTC multiplies with."""
+
     reconstructors: tuple[ReconstructorRecord, ...] = ()
     """Oldest first, bounded; the one in use is always among them once known."""
-
-    measurements: tuple[MeasurementRecord, ...] = ()
-    """Of interaction matrices, oldest first, bounded."""
 
     in_use: str | None = None
     """Id of the matrix the RTC multiplies with; None: unknown."""
@@ -278,14 +178,62 @@ class TrackerState:
     assessment: Assessment | None = None
     """What the matrix in use loses against a new one; None: not known yet."""
 
-    probation: Probation | None = None
-    """Of the matrix applied last; None: none has been, in this run of the service."""
+    making_since_ns_utc: int | None = None
+    """When the reconstructor now being computed was asked for; None: none is."""
+
+    judged_ns_utc: int | None = None
+    """When ``margin`` was last asked for."""
+
+    no_making_before_ns_utc: int = 0
+    """Before when no reconstructor is computed again."""
 
     mode_proof: ModeProof = field(default_factory=ModeProof)
     """Which modes have shown how they answer."""
 
     mode_limit: ModeLimit | None = None
     """How many modes the gate lets be controlled; None: as many as are wanted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Operations:
+    """What may have the loop or the mirror for itself: each under way, or the last one."""
+
+    acquisition: Acquisition = field(default_factory=Acquisition)
+    """Finding α from nothing: under way, or how the last one ended."""
+
+    probation: Probation | None = None
+    """Of the matrix applied last; None: none has been, in this run of the service."""
+
+    measurements: tuple[MeasurementRecord, ...] = ()
+    """Of interaction matrices, oldest first, bounded."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherState:
+    """The dither, and what it has taught."""
+
+    dither: Dither | None = None
+    """Requested or running; None: none, and a new one may be asked for."""
+
+    stopped: bool = False
+    """An operator stopped it: the service does not start another by itself."""
+
+    lost: str | None = None
+    """The last dither that did not reach the mirror: not adopted though a status shows it."""
+
+    losses: int = 0
+    """Dithers lost since the last window was accepted."""
+
+    policy: DitherPolicyState = field(default_factory=DitherPolicyState)
+    """What the dither policy has learnt, and its account of why it dithers or does not."""
+
+    no_dither_before_ns_utc: int = 0
+    """Before when none is asked for again: what cannot be had holds up nothing else."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopState:
+    """The RTC and its loop."""
 
     rtc: Status | None = None
     """None until the first status, and again when the RTC has vanished."""
@@ -296,127 +244,90 @@ class TrackerState:
     config_id: str | None = None
     """Pinned or adopted; frames of another configuration are refused."""
 
-    dither: Dither | None = None
-    """Requested or running; None: none, and a new one may be asked for."""
-
-    dither_stopped: bool = False
-    """An operator stopped it: the service does not start another by itself."""
-
-    dither_lost: str | None = None
-    """The last dither that did not reach the mirror: not adopted though a status shows it."""
-
-    dither_losses: int = 0
-    """Dithers lost since the last window was accepted."""
-
-    dither_policy: DitherPolicyState = field(default_factory=DitherPolicyState)
-    """What the dither policy has learnt, and its account of why it dithers or does not."""
-
     vibrations_hz: tuple[float, ...] = ()
     """Vibration lines in the slopes, lowest first."""
 
-    loop_holds: bool = False
+    holds: bool = False
     """Whether telemetry says that the loop leaves little of what it follows."""
 
-    acquisition: Acquisition = field(default_factory=Acquisition)
-    """Finding α from nothing: under way, or how the last one ended."""
-
-    loop_command: LoopCommand | None = None
+    command: LoopCommand | None = None
     """The last change of the loop that was asked of the RTC; None: none was."""
 
     close_since_ns_utc: int | None = None
     """Since when the loop should close again after a measurement that was given up; None: no."""
 
-    making_since_ns_utc: int | None = None
-    """When the reconstructor now being computed was asked for; None: none is."""
 
-    judged_ns_utc: int | None = None
-    """When ``margin`` was last asked for."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AlarmStates:
+    """Alarms that last, and what is kept of those before."""
 
-    no_dither_before_ns_utc: int = 0
-    """Before when none is asked for again: what cannot be had holds up nothing else."""
+    active: tuple[Alarm, ...] = ()
+    """Those that last."""
 
-    no_making_before_ns_utc: int = 0
-    """Before when no reconstructor is computed again."""
-
-    dither_due_since_ns_utc: int | None = None
-    """Since when a dithered window is wanted before anything else is believed; None: it is not."""
-
-    dither_due_reason: str = ""
-    """Why: what makes α doubtful."""
-
-    pointing: Pointing | None = None
-    """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
-
-    pointings: tuple[tuple[int, Pointing], ...] = ()
-    """Where it looked, and from when on by the RTC's clock: oldest first, bounded."""
-
-    void_before_ns_utc: int = 0
-    """Telemetry that began before this time of the RTC's clock measures nothing."""
-
-    void_because: str = ""
-    """What was the matter with it."""
-
-    offload: Offload | None = None
-    """The last one asked for; None: none was, or α is corrected by the matrix alone."""
-
-    passive: PassiveState | None = None
-    passive_unavailable_reason: str = ""
-    """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
-
-    stopped_because: str = ""
-    """Who has stopped everything, and why; empty: nobody, or it was released."""
+    records: tuple[AlarmRecord, ...] = ()
+    """What is kept of alarms that last, went unseen or are muted."""
 
     observatory_values: tuple[ObservatoryValue, ...] = ()
     """Values that operators' own rules ask for, as they were told last."""
 
-    alarms: tuple[Alarm, ...] = ()
-    """Those that last."""
 
-    alarm_records: tuple[AlarmRecord, ...] = ()
-    """What is kept of alarms that last, went unseen or are muted."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackerState:
+    """Everything the service knows; ``service.tracker.step`` makes the next one."""
+
+    system: str
+    """The ``{system}`` of the wire."""
+
+    operator: OperatorState = field(default_factory=OperatorState)
+    alpha: AlphaState = field(default_factory=AlphaState)
+    windows: WindowCounts = field(default_factory=WindowCounts)
+    matrices: MatrixStates = field(default_factory=MatrixStates)
+    operations: Operations = field(default_factory=Operations)
+    dithers: DitherState = field(default_factory=DitherState)
+    loop: LoopState = field(default_factory=LoopState)
+    alarms: AlarmStates = field(default_factory=AlarmStates)
 
     log: tuple[LogEntry, ...] = ()
     """Oldest first, bounded."""
 
-    windows_accepted: int = 0
-    windows_refused: int = 0
-    window_run: int = 0
-    """How many of the last windows could be used one after the other; below 0: were refused."""
-    windows_outlying: int = 0
-    """Believable in themselves, but so far from all others that they were not believed."""
-
     def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
-        return next((r for r in reversed(self.reconstructors) if r.id == matrix_id), None)
+        return next((r for r in reversed(self.matrices.reconstructors) if r.id == matrix_id), None)
 
     def alarm(self, name: str) -> Alarm | None:
         """Return the alarm of this name that lasts, or None."""
-        return next((alarm for alarm in self.alarms if alarm.name == name), None)
+        return next((alarm for alarm in self.alarms.active if alarm.name == name), None)
 
     @property
     def on_probation(self) -> bool:
         """Whether nothing is sent unasked: a matrix is on probation, or being rolled back."""
-        return self.probation is not None and self.probation.under_way
+        return self.operations.probation is not None and self.operations.probation.under_way
 
     @property
     def previous(self) -> str | None:
         """Id of the reconstructor that was in use before: what a rollback goes back to."""
-        used = (r.id for r in reversed(self.reconstructors) if r.state is MatrixState.SUPERSEDED)
+        used = (
+            r.id
+            for r in reversed(self.matrices.reconstructors)
+            if r.state is MatrixState.SUPERSEDED
+        )
         return next(used, None)
 
     def measurement(self, measurement_id: str) -> MeasurementRecord | None:
         """Return the record of this measured matrix, or None."""
-        return next((r for r in reversed(self.measurements) if r.id == measurement_id), None)
+        return next(
+            (r for r in reversed(self.operations.measurements) if r.id == measurement_id), None
+        )
 
     @property
     def by_rtc(self) -> tuple[MeasurementRecord, ...]:
         """Interaction matrices the RTC has measured or measures, oldest first."""
-        return tuple(r for r in self.measurements if r.pattern is not None)
+        return tuple(r for r in self.operations.measurements if r.pattern is not None)
 
     @property
     def noisy(self) -> tuple[MeasurementRecord, ...]:
         """Noisy interaction matrices, by random signs on sky, oldest first."""
-        return tuple(r for r in self.measurements if r.pattern is None)
+        return tuple(r for r in self.operations.measurements if r.pattern is None)
 
     @property
     def measuring(self) -> MeasurementRecord | None:
@@ -429,7 +340,7 @@ class TrackerState:
         return self._under_way(noisy=True)
 
     def _under_way(self, *, noisy: bool) -> MeasurementRecord | None:
-        going_on = (r for r in reversed(self.measurements) if r.under_way)
+        going_on = (r for r in reversed(self.operations.measurements) if r.under_way)
         return next((r for r in going_on if (r.pattern is None) is noisy), None)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
+from service.tracking.acquisition_state import Acquisition
 from service.tracking.alarms import (
     ALARMS,
     Alarm,
@@ -19,7 +20,19 @@ from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.events import Effect
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
-from service.tracking.state import Acquisition, Level, LogEntry, TrackerState
+from service.tracking.state import (
+    AlarmStates,
+    AlphaState,
+    DitherState,
+    Level,
+    LogEntry,
+    LoopState,
+    MatrixStates,
+    Operations,
+    OperatorState,
+    TrackerState,
+    WindowCounts,
+)
 from service.wire import Status
 
 T = TypeVar("T")
@@ -56,20 +69,22 @@ _VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w
 
 
 class _Part(Generic[T]):
-    """A part of the state; to replace one alone this way takes a twentieth of ``replace``."""
+    """A record of the state, or a part of one: assigning puts another in its place."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, record: str, part: str = "") -> None:
+        self._record, self._part = record, part
 
     def __get__(self, context: StepContext, _: type[StepContext]) -> T:
-        part: T = getattr(context.state, self._name)
-        return part
+        record = getattr(context.state, self._record)
+        found: T = getattr(record, self._part) if self._part else record
+        return found
 
-    def __set__(self, context: StepContext, part: T) -> None:
-        changed = object.__new__(TrackerState)
-        vars(changed).update(vars(context.state))
-        vars(changed)[self._name] = part
-        context.state = changed
+    def __set__(self, context: StepContext, other: T) -> None:
+        record: Any = other
+        if self._part:
+            record = replace(getattr(context.state, self._record), **{self._part: other})
+        changed: dict[str, Any] = {self._record: record}
+        context.state = replace(context.state, **changed)
 
 
 class StepContext:
@@ -81,16 +96,25 @@ class StepContext:
 
     __slots__ = ("before", "effects", "now_ns", "policy", "state")
 
-    registration = _Part[Registration | None]("registration")
+    operator = _Part[OperatorState]("operator")
+    alpha = _Part[AlphaState]("alpha")
+    windows = _Part[WindowCounts]("windows")
+    matrices = _Part[MatrixStates]("matrices")
+    operations = _Part[Operations]("operations")
+    dithers = _Part[DitherState]("dithers")
+    loop = _Part[LoopState]("loop")
+    alarms = _Part[AlarmStates]("alarms")
+
+    registration = _Part[Registration | None]("alpha", "registration")
     """What is known of α; None: nothing."""
 
-    dither = _Part[Dither | None]("dither")
+    dither = _Part[Dither | None]("dithers", "dither")
     """The dither that was asked for or runs; None: none."""
 
-    dither_policy = _Part[DitherPolicyState]("dither_policy")
+    dither_policy = _Part[DitherPolicyState]("dithers", "policy")
     """What the dither policy remembers."""
 
-    acquisition = _Part[Acquisition]("acquisition")
+    acquisition = _Part[Acquisition]("operations", "acquisition")
     """How far finding α from nothing has come."""
 
     def __init__(self, state: TrackerState, policy: Policy, now_ns: int) -> None:
@@ -105,7 +129,7 @@ class StepContext:
     @property
     def rtc(self) -> Status | None:
         """The RTC by its last status; None: none is there."""
-        return self.state.rtc
+        return self.state.loop.rtc
 
     def ask(self, effect: Effect) -> None:
         """Have something done."""
@@ -113,7 +137,7 @@ class StepContext:
 
     def blocking_alarm(self, interlock: Interlock) -> Alarm | None:
         """Return an alarm that forbids this now, or None."""
-        return blocking_alarm(self.state, interlock)
+        return blocking_alarm(self.state.alarms.active, interlock)
 
     def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
         """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
@@ -121,15 +145,17 @@ class StepContext:
             self.now_ns + round(put_off_s * SECOND_NS) if put_off_s else 0
             for put_off_s in (dither_s, make_s)
         )
-        self.state = replace(
-            self.state,
-            no_dither_before_ns_utc=max(self.state.no_dither_before_ns_utc, dither_ns),
-            no_making_before_ns_utc=max(self.state.no_making_before_ns_utc, make_ns),
-        )
+        dither_ns = max(self.dithers.no_dither_before_ns_utc, dither_ns)
+        make_ns = max(self.matrices.no_making_before_ns_utc, make_ns)
+        self._put_off_until(dither_ns, make_ns)
 
     def retry_all(self) -> None:
         """Put nothing off any more."""
-        self.state = replace(self.state, no_dither_before_ns_utc=0, no_making_before_ns_utc=0)
+        self._put_off_until(0, 0)
+
+    def _put_off_until(self, dither_ns: int, make_ns: int) -> None:
+        self.dithers = replace(self.dithers, no_dither_before_ns_utc=dither_ns)
+        self.matrices = replace(self.matrices, no_making_before_ns_utc=make_ns)
 
     def log(self, name: str, text: str, level: Level = Level.INFO) -> None:
         """Add a line to the log; one that repeats is counted instead."""
@@ -152,17 +178,17 @@ class StepContext:
         before = self.state.alarm(name)
         t_ns = 0 if self.rtc is None else self.rtc.t_ns
         first = before or Alarm(name=name, since_ns_utc=self.now_ns, text=text, t_ns_utc=t_ns)
-        others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
+        others = tuple(alarm for alarm in self.state.alarms.active if alarm.name != name)
         raised = replace(first, text=text, seen_ns_utc=self.now_ns, own=own)
-        self.state = replace(self.state, alarms=(*others, raised))
+        self.alarms = replace(self.alarms, active=(*others, raised))
         if before is None:
             self.log(name, text, Level.ALARM)
 
     def clear_alarm(self, name: str) -> None:
         """End an alarm, if it is raised."""
-        others = tuple(alarm for alarm in self.state.alarms if alarm.name != name)
-        if len(others) < len(self.state.alarms):
-            self.state = replace(self.state, alarms=others)
+        others = tuple(alarm for alarm in self.state.alarms.active if alarm.name != name)
+        if len(others) < len(self.state.alarms.active):
+            self.alarms = replace(self.alarms, active=others)
             self.log(name, f"{name}: over")
 
 

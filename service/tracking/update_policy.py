@@ -56,7 +56,7 @@ def verdict_invalid_reason(
     It was taken over α ± 3σ as they were then, which must hold all of α ± 3σ as they are now, but
     for a small ``REACH``: σ grows between two windows, and another verdict takes as long.
     """
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is None or judged is None:
         return None if registration is None else why_of_another_loop(state, judged, gains)
     moved = np.abs(registration.alpha.vector - judged.alpha.vector)
@@ -72,7 +72,7 @@ def verdict_doubtful_reason(
 
     A reconstructor that somebody wants back is sent all the same.
     """
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is not None and registration.doubt:
         return registration.doubt
     return verdict_invalid_reason(state, judged, gains)
@@ -85,7 +85,7 @@ def why_of_another_loop(
 
     An open loop does not tell the gains it will close with.
     """
-    rtc = state.rtc
+    rtc = state.loop.rtc
     if rtc is None:
         return None
     if judged is None:
@@ -104,19 +104,19 @@ def update_reason(
     state: TrackerState, in_use: ReconstructorRecord, policy: Policy, now_ns: int
 ) -> str | None:
     """Return why the reconstructor in use should be replaced now, or None."""
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is None:
         return None
     if in_use.alpha is None:
         return f"{in_use.id} was not made for a known registration"
-    if state.margin is not None and not state.margin.accepted:
-        return f"{in_use.id}: {state.margin.reason}"
+    if state.matrices.margin is not None and not state.matrices.margin.accepted:
+        return f"{in_use.id}: {state.matrices.margin.reason}"
     if moved(state, in_use, policy):
         step = registration.alpha.vector - in_use.alpha.vector
         return f"moved by {step_text(step)} since {in_use.id}"
     if _jumped(state, in_use, registration):
         return f"{in_use.id} was made before the mirror jumped"
-    last = state.assessment
+    last = state.matrices.assessment
     if last is None or last.id != in_use.id:
         return None
     return _gain_reason(last, in_use, registration, policy, now_ns)
@@ -129,8 +129,8 @@ def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
     counts only where α is known to be elsewhere than where the one in use was made for: there every
     move counts.
     """
-    registration, last = state.registration, state.assessment
-    gains = () if state.rtc is None else state.rtc.gains[: in_use.n_modes]
+    registration, last = state.alpha.registration, state.matrices.assessment
+    gains = () if state.loop.rtc is None else state.loop.rtc.gains[: in_use.n_modes]
     if verdict_invalid_reason(state, in_use.judged, gains) is not None:
         return True
     if (
@@ -221,7 +221,7 @@ def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Regi
 
 def left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
     """Return whether α has gone so far from this reconstructor that nobody may want it now."""
-    registration = state.registration
+    registration = state.alpha.registration
     return registration is not None and (
         moved(state, record, policy) or _jumped(state, record, registration)
     )
@@ -235,7 +235,7 @@ def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
 def _apart(
     state: TrackerState, record: ReconstructorRecord, threshold: NDArray[np.float64]
 ) -> bool:
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is None:
         return False
     if record.alpha is None or record.sigma is None:
@@ -288,7 +288,7 @@ def more_to_try(state: TrackerState, rtc: Status, policy: Policy, now_ns: int) -
     if not rtc.gains[rtc.n_controlled - 1]:
         return ()
     target = min(policy.n_modes_target, rtc.n_modes)
-    limit = state.mode_limit
+    limit = state.matrices.mode_limit
     if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):
         target = min(target, limit.n_modes)
     rungs = {target, *fewer_than(target)}
@@ -296,7 +296,7 @@ def more_to_try(state: TrackerState, rtc: Status, policy: Policy, now_ns: int) -
 
 
 def _comfortable(state: TrackerState) -> bool:
-    margin = state.margin
+    margin = state.matrices.margin
     if margin is None or not margin.accepted:
         return False
     return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
@@ -320,10 +320,12 @@ def note_limit(
         return
     if record.n_modes > n_now:
         context.log("modes.raised", text)
-    limit = context.state.mode_limit
+    limit = context.matrices.mode_limit
     if limit is not None and record.n_modes > limit.n_modes:
         # kept: a limit found again soon must be waited out longer
-        context.state = replace(context.state, mode_limit=replace(limit, n_modes=record.n_modes))
+        context.matrices = replace(
+            context.matrices, mode_limit=replace(limit, n_modes=record.n_modes)
+        )
 
 
 def note_declined(context: StepContext, *, rejected: bool) -> None:
@@ -333,13 +335,13 @@ def note_declined(context: StepContext, *, rejected: bool) -> None:
     while, longer each time. An acquisition counts its own failures. ``rejected``: an operator has
     done so now.
     """
-    before, records = context.before, context.state.reconstructors
-    if records is before.reconstructors or context.acquisition.under_way:
+    before, records = context.before, context.matrices.reconstructors
+    if records is before.matrices.reconstructors or context.acquisition.under_way:
         return
-    rtc = context.rtc or before.rtc
+    rtc = context.rtc or before.loop.rtc
     if rtc is None or rtc.n_controlled == 0:
         return
-    earlier = {record.id: record.state for record in before.reconstructors}
+    earlier = {record.id: record.state for record in before.matrices.reconstructors}
     for record in records:
         wait_s = _wait_after(record, earlier.get(record.id), rejected=rejected)
         if wait_s is not None and record.n_modes > rtc.n_controlled:
@@ -364,7 +366,7 @@ def limit_modes(
     context: StepContext, n_modes: int, reason: str, first_wait_s: float = FIRST_WAIT_S
 ) -> None:
     """Try no more than these for a while, longer each time that it is found again."""
-    before, wait_s, now_ns = context.state.mode_limit, first_wait_s, context.now_ns
+    before, wait_s, now_ns = context.matrices.mode_limit, first_wait_s, context.now_ns
     if before is not None and now_ns - before.since_ns_utc < FORGIVEN_AFTER_S * SECOND_NS:
         left_s = (before.until_ns_utc - now_ns) / SECOND_NS
         wait_s = max(first_wait_s, min(2.0 * before.wait_s, LONGEST_WAIT_S), left_s)
@@ -375,5 +377,5 @@ def limit_modes(
         wait_s=wait_s,
         reason=reason,
     )
-    context.state = replace(context.state, mode_limit=limit)
+    context.matrices = replace(context.matrices, mode_limit=limit)
     context.log("modes.limited", f"no more than {n_modes} modes for {wait_s:.0f} s: {reason}")

@@ -47,11 +47,15 @@ def fetch_in_use(context: StepContext) -> None:
     rtc, state = context.rtc, context.state
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
-    if rtc.cm_id in state.verified_ids:
+    if rtc.cm_id in state.matrices.verified_ids:
         return
-    anew = rtc.cm_id is not None and not state.read_back_error and state.mismatched_id is None
+    anew = (
+        rtc.cm_id is not None
+        and not state.matrices.read_back_error
+        and state.matrices.mismatched_id is None
+    )
     every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
-    if context.now_ns - state.applied_asked_ns_utc >= every_s * SECOND_NS:
+    if context.now_ns - state.matrices.applied_asked_ns_utc >= every_s * SECOND_NS:
         fetch(context, rtc)
 
 
@@ -82,22 +86,24 @@ def _unjudged_in_use(context: StepContext) -> str | None:
     there and then.
     """
     state, registration = context.state, context.registration
-    if registration is None or state.in_use is None or not settled(registration):
+    if registration is None or state.matrices.in_use is None or not settled(registration):
         return None
-    making = state.making_since_ns_utc is not None
+    making = state.matrices.making_since_ns_utc is not None
     return (
-        None if making or not _judgement_due(state, state.in_use, context.now_ns) else state.in_use
+        None
+        if making or not _judgement_due(state, state.matrices.in_use, context.now_ns)
+        else state.matrices.in_use
     )
 
 
 def _judgement_due(state: TrackerState, in_use: str, now_ns: int) -> bool:
-    if state.judged_ns_utc is None:
+    if state.matrices.judged_ns_utc is None:
         return True
-    waited_s = (now_ns - state.judged_ns_utc) / SECOND_NS
+    waited_s = (now_ns - state.matrices.judged_ns_utc) / SECOND_NS
     record = state.reconstructor(in_use)
-    if state.margin is None or record is None or record.judged is None:
+    if state.matrices.margin is None or record is None or record.judged is None:
         return waited_s > JUDGE_REFUSED_S
-    every_s = JUDGE_INTERVAL_S if state.margin.accepted else JUDGE_REFUSED_S
+    every_s = JUDGE_INTERVAL_S if state.matrices.margin.accepted else JUDGE_REFUSED_S
     return waited_s > every_s or (waited_s > JUDGE_AGAIN_S and assessment_is_old(state, record))
 
 
@@ -105,18 +111,20 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
     """Compute a reconstructor when it is worthwhile, or could command more modes."""
     state, registration, now_ns = context.state, context.registration, context.now_ns
     if (
-        state.mode is Mode.HOLD
+        state.operator.mode is Mode.HOLD
         or state.on_probation
         or registration is None
         or not settled(registration)
     ):
         return
-    if not rtc.in_loop or state.making_since_ns_utc is not None:
+    if not rtc.in_loop or state.matrices.making_since_ns_utc is not None:
         return
     if context.blocking_alarm(Interlock.SEND_NEW) is not None:
         return
-    first_ns = max(_next_attempt_ns(state, rtc, context.policy), state.no_making_before_ns_utc)
-    in_use = state.reconstructor(state.in_use) if state.in_use else None
+    first_ns = max(
+        _next_attempt_ns(state, rtc, context.policy), state.matrices.no_making_before_ns_utc
+    )
+    in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
     if _busy(context) or now_ns < first_ns or in_use is None:
         return
     why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
@@ -139,10 +147,10 @@ def _busy(context: StepContext) -> bool:
     where there would be no way back.
     """
     state = context.state
-    awaited = state.mode is not Mode.AUTO or why_no_return(state) is not None
+    awaited = state.operator.mode is not Mode.AUTO or why_no_return(state) is not None
     return any(
         r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and _stands(context, r))
-        for r in state.reconstructors
+        for r in state.matrices.reconstructors
     )
 
 
@@ -163,7 +171,11 @@ def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
 
     One refused for another α, or for more modes than are controlled, holds back no other.
     """
-    own = [r for r in state.reconstructors if r.parent is not None and not _overtaken(state, r)]
+    own = [
+        r
+        for r in state.matrices.reconstructors
+        if r.parent is not None and not _overtaken(state, r)
+    ]
     if not own:
         return 0
     last = own[-1]

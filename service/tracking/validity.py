@@ -72,7 +72,10 @@ def telemetry_span(began_ns_utc: int, ended_ns_utc: int) -> TelemetrySpan:
 
 def precedes(state: TrackerState, when: TelemetrySpan, since_ns_utc: int) -> bool:
     """Return whether telemetry began before a time, and so cannot tell of what is since then."""
-    if state.rtc is not None and since_ns_utc - state.rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS:
+    if (
+        state.loop.rtc is not None
+        and since_ns_utc - state.loop.rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS
+    ):
         return False
     return when.began_ns_utc < since_ns_utc - _ROUNDING_NS
 
@@ -82,9 +85,9 @@ def why_telemetry_invalid(state: TrackerState, when: TelemetrySpan) -> str | Non
 
     What is the matter now is asked of the alarms.
     """
-    voids = [(state.void_before_ns_utc, state.void_because)]
-    if state.offload is not None:
-        voids.append((state.offload.still_ns_utc, MOVING))
+    voids = [(state.alpha.void_before_ns_utc, state.alpha.void_because)]
+    if state.alpha.offload is not None:
+        voids.append((state.alpha.offload.still_ns_utc, MOVING))
     because = next((why for before_ns, why in voids if precedes(state, when, before_ns)), None)
     if because is None:
         return None
@@ -97,7 +100,7 @@ def invalidate_telemetry(context: StepContext, because: str, t_ns_utc: int = 0) 
     ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
     """
     before_ns = max(t_ns_utc, 0 if context.rtc is None else context.rtc.t_ns)
-    context.state = replace(context.state, void_before_ns_utc=before_ns, void_because=because)
+    context.alpha = replace(context.alpha, void_before_ns_utc=before_ns, void_because=because)
 
 
 def end_alarm(context: StepContext, name: str, t_ns_utc: int = 0) -> None:
@@ -118,18 +121,18 @@ def point(context: StepContext, pointing: Pointing | None) -> None:
     """Note where the telescope looks, and remember its way; None: nobody tells."""
     if pointing is None:
         return
-    way, t_ns = context.state.pointings, 0 if context.rtc is None else context.rtc.t_ns
+    way, t_ns = context.alpha.pointings, 0 if context.rtc is None else context.rtc.t_ns
     if not way or separation_deg(way[-1][1], pointing) >= _TURNED_DEG:
         way = (*way, (t_ns, pointing))[-_POINTINGS_KEPT:]
-    context.state = replace(context.state, pointing=pointing, pointings=way)
+    context.alpha = replace(context.alpha, pointing=pointing, pointings=way)
 
 
 def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
     """Return where the telescope looked at a time of the RTC's clock, as far as it is known."""
-    later = [place for place in state.pointings if place[0] > t_ns_utc]
+    later = [place for place in state.alpha.pointings if place[0] > t_ns_utc]
     if not later:
-        return state.pointing
-    earlier = state.pointings[: len(state.pointings) - len(later)]
+        return state.alpha.pointing
+    earlier = state.alpha.pointings[: len(state.alpha.pointings) - len(later)]
     return earlier[-1][1] if earlier else later[0][1]
 
 
@@ -198,7 +201,7 @@ def age(context: StepContext) -> None:
         walked = context.policy.drift_rate**2 * elapsed_s(
             context.state, registration, context.now_ns
         )
-        bent = flexure(registration.pointing, context.state.pointing, context.policy)
+        bent = flexure(registration.pointing, context.alpha.pointing, context.policy)
         registration = replace(registration, grown=walked + bent**2)
         standing = _validity_of(context, registration)
         if standing.level in _WORTHLESS:
@@ -215,9 +218,14 @@ def age(context: StepContext) -> None:
 
 def want_window(context: StepContext, reason: str) -> None:
     """Want a dithered window; a wish that stands keeps its beginning."""
-    if context.state.dither_due_since_ns_utc is None:
+    if context.alpha.dither_due_since_ns_utc is None:
         due = replace(
-            context.state, dither_due_since_ns_utc=context.now_ns, dither_due_reason=reason
+            context.state,
+            alpha=replace(
+                context.alpha,
+                dither_due_since_ns_utc=context.now_ns,
+                dither_due_reason=reason,
+            ),
         )
         context.state = due
         context.log("dither.due", reason)
@@ -225,7 +233,7 @@ def want_window(context: StepContext, reason: str) -> None:
 
 def have_window(context: StepContext) -> None:
     """Note that the wish has been fulfilled."""
-    context.state = replace(context.state, dither_due_since_ns_utc=None, dither_due_reason="")
+    context.alpha = replace(context.alpha, dither_due_since_ns_utc=None, dither_due_reason="")
 
 
 def flexure(pointing_then: Pointing | None, now: Pointing | None, policy: Policy) -> Array:
@@ -237,9 +245,9 @@ def flexure(pointing_then: Pointing | None, now: Pointing | None, policy: Policy
 
 def slewed_deg(state: TrackerState, registration: Registration) -> float:
     """Return how far the telescope has moved since the last dithered window, degrees."""
-    if state.pointing is None or registration.window_pointing is None:
+    if state.alpha.pointing is None or registration.window_pointing is None:
         return 0.0
-    return separation_deg(state.pointing, registration.window_pointing)
+    return separation_deg(state.alpha.pointing, registration.window_pointing)
 
 
 def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> float:
@@ -247,8 +255,8 @@ def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> f
 
     A simulated RTC may be slower than its timestamps, and the mirror drifts by its time.
     """
-    if state.rtc is not None and state.rtc.t_ns >= registration.t_ns_utc:
-        return (state.rtc.t_ns - registration.t_ns_utc) / SECOND_NS
+    if state.loop.rtc is not None and state.loop.rtc.t_ns >= registration.t_ns_utc:
+        return (state.loop.rtc.t_ns - registration.t_ns_utc) / SECOND_NS
     return max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
 
 
@@ -256,7 +264,7 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     policy, reason = context.policy, _why_invalid(context.state, registration, context.policy)
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
-    sigma, limit, before = registration.sigma, policy.stale_sigma, context.before.registration
+    sigma, limit, before = registration.sigma, policy.stale_sigma, context.before.alpha.registration
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
     was_stale = before is not None and before.validity.level is Validity.STALE
@@ -302,11 +310,11 @@ def _without_old_suspicion(registration: Registration, now_ns: int) -> Registrat
 
 def _stale_reason(state: TrackerState, now_ns: int) -> str | None:
     """Return why α is worth too little for a closed loop, in the words of its validity, or None."""
-    registration = state.registration
+    registration = state.alpha.registration
     if (
         registration is None
-        or state.rtc is None
-        or not state.rtc.in_loop
+        or state.loop.rtc is None
+        or not state.loop.rtc.in_loop
         or registration.n_windows == 0
     ):
         return None
@@ -326,7 +334,7 @@ def _sharpens(registration: Registration, now_ns: int) -> bool:
 
 def _too_wide_for_the_gate(state: TrackerState, registration: Registration) -> bool:
     """Return whether the margin is short only because σ has grown since the last window."""
-    margin = state.margin
+    margin = state.matrices.margin
     # an edge that would slip is refused whatever σ is
     if margin is None or margin.worst_pole_radius <= margin.bound:
         return False

@@ -135,8 +135,8 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             f"confirmed: the one after "
             f"it lies {_away(measured, registration)} away"
         )
-        n_outlying = context.state.windows_outlying + 1
-        context.state = replace(context.state, windows_outlying=n_outlying)
+        n_outlying = context.windows.outlying + 1
+        context.windows = replace(context.windows, outlying=n_outlying)
         context.warn("window.outlier", text)
         registration = replace(
             registration, scatter=kalman.learnt(registration.scatter, kalman.JUMP_THRESHOLD)
@@ -300,20 +300,20 @@ def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -
 
 
 def _note_unavailable(context: StepContext, why: str) -> None:
-    context.state = replace(context.state, passive_unavailable_reason=why)
+    context.alpha = replace(context.alpha, passive_unavailable_reason=why)
 
 
 def fit_begins_at(state: TrackerState) -> Misregistration | None:
     """Return about what a look is to be fitted: α, or the last look; None: the nominal rotation."""
-    if state.registration is not None:
-        return state.registration.alpha
-    last = state.passive
+    if state.alpha.registration is not None:
+        return state.alpha.registration.alpha
+    last = state.alpha.passive
     return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
 
 
 def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str | None:
     """Return why a look says nothing of the telescope as it is, or None."""
-    of_loop = loop_numbers(state.rtc)
+    of_loop = loop_numbers(state.loop.rtc)
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
     return filtering.why_no_measurement(
@@ -323,7 +323,7 @@ def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str |
 
 def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
     """Return which later telemetry has told more than a look that was long under way, or None."""
-    registration = state.registration
+    registration = state.alpha.registration
     if registration is None or not registration.window_began_ns_utc:
         return None
     since = validity.telemetry_span(
@@ -364,8 +364,8 @@ def _expecting(registration: Registration, excess: Array) -> Registration:
 
 def _loop(state: TrackerState, registration: Registration) -> tuple[float, ...]:
     """Return the loop that is looked at; while no RTC is there, the one of the last look."""
-    if state.rtc is not None:
-        return loop_numbers(state.rtc)
+    if state.loop.rtc is not None:
+        return loop_numbers(state.loop.rtc)
     return () if registration.bias is None else registration.bias.loop
 
 
@@ -458,4 +458,4 @@ def _show(
         text=text,
         bias=bias,
     )
-    context.state = replace(context.state, passive=watchdog, passive_unavailable_reason="")
+    context.alpha = replace(context.alpha, passive=watchdog, passive_unavailable_reason="")

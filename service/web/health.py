@@ -77,7 +77,7 @@ async def readyz(request: Request, service: ServiceDep) -> ReadyView | Response:
 
 def find_problems(snapshot: Snapshot) -> dict[str, str]:
     """Return what is the matter with telemetry, archive and worker; empty: nothing."""
-    alarms = {alarm.name: alarm.text for alarm in snapshot.tracker.alarms}
+    alarms = {alarm.name: alarm.text for alarm in snapshot.tracker.alarms.active}
     hindering = [wait for wait in snapshot.waiting_for if wait.blocks]
     age_s = snapshot.link.frame_age_s
     stopped = []
@@ -225,15 +225,15 @@ def _of_link(link: LinkStatistics) -> Iterator[Metric]:
 def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     tracker = snapshot.tracker
     windows = {
-        "accepted": tracker.windows_accepted,
-        "refused": tracker.windows_refused,
-        "outlying": tracker.windows_outlying,
+        "accepted": tracker.windows.accepted,
+        "refused": tracker.windows.refused,
+        "outlying": tracker.windows.outlying,
     }
     yield _counter("windows", "Windows of telemetry, by verdict", windows, "verdict")
     # the last look of each kind
-    misfits = {str(entry.source): entry.misfit for entry in tracker.history}
-    if tracker.passive is not None:
-        misfits[str(Source.PASSIVE)] = tracker.passive.misfit
+    misfits = {str(entry.source): entry.misfit for entry in tracker.alpha.history}
+    if tracker.alpha.passive is not None:
+        misfits[str(Source.PASSIVE)] = tracker.alpha.passive.misfit
     explained = "Residual power over what noise explains, last of each kind: 1 is all explained"
     yield _gauge("misfit_ratio", explained, misfits, "source")
     alpha = snapshot.alpha
@@ -250,14 +250,14 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
     worth = registration.validity.level
     text = "1 for what the estimate is worth"
     yield _gauge("alpha_validity", text, _one_of(Validity, worth), "validity")
-    due = tracker.dither_due_since_ns_utc is not None
+    due = tracker.alpha.dither_due_since_ns_utc is not None
     yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
 
 
 def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
-    dithering = tracker.dither_policy
+    dithering = tracker.dithers.policy
     mean = "Quadratic mean of the dither over ten minutes, OPD"
     yield _gauge("dither_mean_meters", mean, dithering.mean_cost_m)
     yield _gauge("dither_budget_meters", "Largest RMS of all modes together", dithering.budget_m)
@@ -266,15 +266,19 @@ def _of_the_dither(tracker: TrackerState) -> Iterator[Metric]:
 
 
 def _of_reconstructors(tracker: TrackerState) -> Iterator[Metric]:
-    states = Counter(record.state for record in tracker.reconstructors)
+    states = Counter(record.state for record in tracker.matrices.reconstructors)
     by_state = {str(state): states[state] for state in MatrixState}
     yield _gauge("reconstructors", "Reconstructors remembered", by_state, "state")
-    yield _gauge("mode", "1 for the mode of the service", _one_of(Mode, tracker.mode), "mode")
-    if tracker.margin is None:
+    yield _gauge(
+        "mode", "1 for the mode of the service", _one_of(Mode, tracker.operator.mode), "mode"
+    )
+    if tracker.matrices.margin is None:
         return
-    worst = tracker.margin.worst_pole_radius
+    worst = tracker.matrices.margin.worst_pole_radius
     yield _gauge("worst_pole_radius", "Of the reconstructor in use, 1 is unstable", worst)
-    yield _gauge("pole_radius_bound", "Largest radius that is accepted", tracker.margin.bound)
+    yield _gauge(
+        "pole_radius_bound", "Largest radius that is accepted", tracker.matrices.margin.bound
+    )
     yield _gauge("stability_margin", "1 minus the worst pole radius", 1.0 - worst)
 
 

@@ -55,9 +55,9 @@ async def _named(
     if matrix_id not in _ALIASES:
         return matrix_id
     state = service.snapshot().tracker
-    proposed = [r.id for r in state.reconstructors if r.state is MatrixState.PROPOSED]
+    proposed = [r.id for r in state.matrices.reconstructors if r.state is MatrixState.PROPOSED]
     found = {
-        "in-use": state.in_use,
+        "in-use": state.matrices.in_use,
         "previous": state.previous,
         "candidate": proposed[-1] if proposed else None,
     }[matrix_id]

@@ -130,8 +130,8 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
     current = snapshot.alpha
     if current is None:
         detail = (
-            f"no estimate yet: {tracker.windows_accepted} windows accepted, "
-            f"{tracker.windows_refused} refused; {snapshot.ready_reason}"
+            f"no estimate yet: {tracker.windows.accepted} windows accepted, "
+            f"{tracker.windows.refused} refused; {snapshot.ready_reason}"
         )
         return problem(request, HTTPStatus.NOT_FOUND, "no-estimate", detail)
     return answer(current)
@@ -154,16 +154,18 @@ def _history(request: Request, service: Supervisor, asked: RangeParameters) -> R
     tracker = service.snapshot().tracker
     first_ns, last_ns = asked.between
     first_ns = first_ns if asked.after is None else max(first_ns, asked.after + 1)
-    found = tuple(entry for entry in tracker.history if first_ns <= entry.t_ns_utc <= last_ns)
+    found = tuple(entry for entry in tracker.alpha.history if first_ns <= entry.t_ns_utc <= last_ns)
     n_older = service.archive.nights.n_estimates(first_ns, last_ns)
     ends = [entry.t_ns_utc for entry in (*found[:1], *found[-1:])]
     tag = tag_of(asked, n_older, len(found), *ends)
     if (same := not_modified(request, tag)) is not None:
         return same
     if asked.points or asked.after is not None or len(found) < asked.limit:
-        last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.history)])
+        last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.alpha.history)])
         found = (*_older(service.archive, first_ns, last_ns, asked), *found)
-    told = answer(replace(tracker, history=_cut(found, asked)), views.HISTORY)
+    told = answer(
+        replace(tracker, alpha=replace(tracker.alpha, history=_cut(found, asked))), views.HISTORY
+    )
     told.headers["ETag"] = tag
     return told
 
@@ -325,11 +327,11 @@ async def gains(service: ServiceDep) -> Response:
     ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
     """
     tracker = service.snapshot().tracker
-    if tracker.rtc is None:
+    if tracker.loop.rtc is None:
         raise CommandError("gains: no RTC is there: the number of modes is not known")
-    current = tracker.registration
+    current = tracker.alpha.registration
     measured = () if current is None else current.optical_gains
-    return _gain_table(None, measured, tracker.rtc.n_modes)
+    return _gain_table(None, measured, tracker.loop.rtc.n_modes)
 
 
 @router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})

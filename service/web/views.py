@@ -32,6 +32,7 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
 from service.runtime.supervisor import Supervisor
+from service.tracking.acquisition_state import Acquisition
 from service.tracking.alarms import Alarm, AlarmRecord, OperatorNote, Prerequisite
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, DitherPlan, DitherPolicyState
@@ -41,7 +42,7 @@ from service.tracking.mode_limits import ModeLimit, ModeProof
 from service.tracking.operations.running import Operating
 from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
 from service.tracking.registration import HistoryEntry, Offload, PassiveState
-from service.tracking.state import Acquisition, LogEntry, ObservatoryValue, TrackerState
+from service.tracking.state import LogEntry, ObservatoryValue, TrackerState
 from service.wire import Pointing
 
 Record = TypeVar("Record")
@@ -248,7 +249,7 @@ ALPHA = define_view(
     "registration.pointing",
 )
 define_view("HistoryEntryView", HistoryEntry)
-HISTORY = define_view("HistoryView", TrackerState, "entries=history", "The last estimates.")
+HISTORY = define_view("HistoryView", TrackerState, "entries=alpha.history", "The last estimates.")
 define_view("PassiveView", PassiveState)
 
 define_view("GainGroupView", GainGroup)
@@ -289,7 +290,7 @@ RECONSTRUCTOR = define_view(
 RECONSTRUCTORS = define_view(
     "ReconstructorsView",
     TrackerState,
-    "in_use reconstructors",
+    "matrices.in_use matrices.reconstructors",
     "The reconstructors the service remembers.",
 )
 GAINS = define_view("GainTableView", ModeGainTable)
@@ -330,7 +331,7 @@ define_view("OperatingView", Operating)
 define_view("ObservatoryValueView", ObservatoryValue)
 define_view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
 EVENTS = define_view(
-    "EventsView", TrackerState, "alarms log", "What happened, and what is wrong now."
+    "EventsView", TrackerState, "alarms=alarms.active log", "What happened, and what is wrong now."
 )
 define_view("PrerequisiteView", Prerequisite)
 define_view("PermissionView", Permission)
@@ -345,19 +346,19 @@ define_view(
 STATE = define_view(
     "StateView",
     Snapshot,
-    "tracker.system tracker.mode tracker.stopped_because ready ready_reason now_ns uptime_s "
-    "registration=alpha tracker.in_use tracker.margin tracker.assessment tracker.mode_limit "
-    "tracker.mode_proof tracker.probation rtc tracker.pointing tracker.basis_id "
-    "tracker.config_id tracker.dither tracker.dither_policy tracker.vibrations_hz "
-    "tracker.measuring "
-    "tracker.noisy_measurement "
-    "tracker.acquisition tracker.offload tracker.loop_command tracker.dither_due_since_ns_utc "
-    "tracker.dither_due_reason tracker.passive tracker.passive_unavailable_reason waiting_for "
-    "operating permitted "
-    "no_return "
-    "tracker.observatory_values alarms stale_alarms muted_alarms worst_severity "
-    "tracker.windows_accepted "
-    "tracker.windows_refused tracker.windows_outlying window_refusal worker_load link",
+    "tracker.system tracker.operator.mode tracker.operator.stopped_because ready ready_reason "
+    "now_ns uptime_s registration=alpha tracker.matrices.in_use tracker.matrices.margin "
+    "tracker.matrices.assessment tracker.matrices.mode_limit tracker.matrices.mode_proof "
+    "tracker.operations.probation rtc tracker.alpha.pointing tracker.loop.basis_id "
+    "tracker.loop.config_id tracker.dithers.dither dither_policy=tracker.dithers.policy "
+    "tracker.loop.vibrations_hz tracker.measuring tracker.noisy_measurement "
+    "tracker.operations.acquisition tracker.alpha.offload loop_command=tracker.loop.command "
+    "tracker.alpha.dither_due_since_ns_utc tracker.alpha.dither_due_reason "
+    "tracker.alpha.passive tracker.alpha.passive_unavailable_reason waiting_for operating "
+    "permitted no_return tracker.alarms.observatory_values alarms stale_alarms muted_alarms "
+    "worst_severity windows_accepted=tracker.windows.accepted "
+    "windows_refused=tracker.windows.refused windows_outlying=tracker.windows.outlying "
+    "window_refusal worker_load link",
     "What the service knows, at one glance.",
     measuring=MEASURING,
     noisy_measurement=NOISY_MEASUREMENT,

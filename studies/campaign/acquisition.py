@@ -23,8 +23,9 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.openloop import WideCaptureEstimate
 from service.model.misregistration import BOUNDARY_SCALE
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import WideCaptureFitted
-from service.tracking.state import AcquisitionStage, Mode
+from service.tracking.state import Mode
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory
 from studies.campaign.rows import Row, RowFile, range_of, tell
@@ -94,9 +95,9 @@ def play(start: Start) -> Row:
         over_s = None
         while night.time_s < start.within_s and not _ended(night, over_s):
             night.advance(_LOOK_S)
-            stage = night.state.acquisition.stage
+            stage = night.state.operations.acquisition.stage
             over_s = (over_s or night.time_s) if stage in _OVER else None
-    acquisition, registration = night.state.acquisition, night.state.registration
+    acquisition, registration = night.state.operations.acquisition, night.state.alpha.registration
     row: Row = {
         "stage": str(acquisition.stage),
         "text": acquisition.text,
@@ -133,7 +134,7 @@ def _ended(night: Observatory, over_s: float | None) -> bool:
     """Return whether it is over: one that tracks has to hold, or it is no acquisition."""
     if over_s is None:
         return False
-    tracking = night.state.acquisition.stage is AcquisitionStage.TRACKING
+    tracking = night.state.operations.acquisition.stage is AcquisitionStage.TRACKING
     return not tracking or night.time_s >= over_s + _HOLDS_S
 
 

@@ -27,7 +27,7 @@ from service.tracking.events import Effect, Event
 from service.tracking.operations.running import under_way
 from service.tracking.policy import Policy
 from service.tracking.resume import restored, resumed, saved_of
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
 from service.tracking.step_context import new_lines
 from studies.campaign.golden_codec import Json, decoded, encoded
 
@@ -75,7 +75,9 @@ class Teller:
         """End the service and begin it anew, in the mode of its settings."""
         before, saved = self.state, saved_of(self.state, now_ns)
         fresh = TrackerState(
-            system=before.system, mode=mode, reconstructors=restored(before.reconstructors)
+            system=before.system,
+            operator=OperatorState(mode=mode),
+            matrices=MatrixStates(reconstructors=restored(before.matrices.reconstructors)),
         )
         self.state = fresh if saved is None else resumed(fresh, saved, self._policy, now_ns)
         self._note({"t": now_ns, "restart": mode.value}, fresh, now_ns, ())
@@ -98,23 +100,23 @@ class Teller:
 
 def seen_by_operator(state: TrackerState, now_ns: int) -> dict[str, Json]:
     """Return what an operator sees of a state."""
-    registration = state.registration
+    registration = state.alpha.registration
     return {
-        "mode": state.mode.value,
+        "mode": state.operator.mode.value,
         "runs": [running.kind.name for running in under_way(state, now_ns)],
-        "acquisition": state.acquisition.stage.value,
-        "alarms": {alarm.name: alarm.text for alarm in state.alarms},
+        "acquisition": state.operations.acquisition.stage.value,
+        "alarms": {alarm.name: alarm.text for alarm in state.alarms.active},
         "alpha": None if registration is None else registration.alpha.vector.tolist(),
         "sigma": None if registration is None else registration.sigma.tolist(),
         "validity": None if registration is None else registration.validity.level.value,
-        "in use": state.in_use,
-        "matrices": {record.id: record.state.value for record in state.reconstructors},
+        "in use": state.matrices.in_use,
+        "matrices": {record.id: record.state.value for record in state.matrices.reconstructors},
         "measured": {record.id: record.state.value for record in state.by_rtc},
         "noisy": {record.id: record.state.value for record in state.noisy},
-        "dither": None if state.dither is None else state.dither.id,
-        "phase": [state.dither_policy.phase.value, state.dither_policy.reason],
-        "loop": None if state.loop_command is None else state.loop_command.state.value,
-        "windows": [state.windows_accepted, state.windows_refused, state.windows_outlying],
+        "dither": None if state.dithers.dither is None else state.dithers.dither.id,
+        "phase": [state.dithers.policy.phase.value, state.dithers.policy.reason],
+        "loop": None if state.loop.command is None else state.loop.command.state.value,
+        "windows": [state.windows.accepted, state.windows.refused, state.windows.outlying],
     }
 
 
@@ -125,7 +127,10 @@ def retold(night: Sequence[Entry], instrument: Entry) -> list[Entry]:
     """
     begin, *expected = night
     policy = with_instrument(policy_of(load_settings(None, {}, begin["settings"])), instrument)
-    teller = Teller(TrackerState(system=begin["system"], mode=Mode(begin["mode"])), policy)
+    teller = Teller(
+        TrackerState(system=begin["system"], operator=OperatorState(mode=Mode(begin["mode"]))),
+        policy,
+    )
     for entry in expected:
         if "restart" in entry:
             teller.restart(Mode(entry["restart"]), entry["t"])

@@ -112,7 +112,7 @@ def reject(night: GoldenNight) -> None:
 
 def publish_first(night: GoldenNight) -> None:
     """Send the oldest reconstructor again."""
-    night.ask(cmd.Publish(id=night.state.reconstructors[0].id))
+    night.ask(cmd.Publish(id=night.state.matrices.reconstructors[0].id))
 
 
 def measured(night: GoldenNight) -> None:
@@ -127,7 +127,7 @@ def acknowledged(state: AckState, reason: str, name: str | None = LAST) -> Do:
     """Return an answer of the RTC's to the last reconstructor, or another one."""
 
     def answer(night: GoldenNight) -> None:
-        rtc, last = night.state.rtc, night.state.reconstructors[-1].id
+        rtc, last = night.state.loop.rtc, night.state.matrices.reconstructors[-1].id
         acknowledgement = Acknowledgement(
             session="" if rtc is None else rtc.session,
             id=last if name == LAST else name,

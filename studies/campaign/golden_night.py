@@ -223,7 +223,7 @@ class GoldenNight(Observatory):
 
     def proposed(self) -> str:
         """Return the id of the last proposal, or of nothing."""
-        records = self.state.reconstructors
+        records = self.state.matrices.reconstructors
         return next((r.id for r in reversed(records) if r.state is MatrixState.PROPOSED), "none")
 
     @override
@@ -272,7 +272,7 @@ class GoldenNight(Observatory):
             covariance=None,
             optical_gain=None,
             misfit=None,
-            cm_id=self.state.in_use,
+            cm_id=self.state.matrices.in_use,
             session=self.dome.computer.session,
             created_ns_utc=self.dome.now_ns,
             sha256="0" * 64,

@@ -168,7 +168,7 @@ def play(case: Case, given: argparse.Namespace) -> Row:
         texts: dict[str, tuple[float, str]] = {}
         while night.time_s < given.seconds:
             night.advance(0.5)
-            for alarm in night.state.alarms:
+            for alarm in night.state.alarms.active:
                 texts.setdefault(alarm.name, (night.time_s, alarm.text))
     naming = [(at, name) for name, (at, text) in texts.items() if _named(case, name, text)]
     at_s, by = min(naming) if naming else (None, None)

@@ -35,7 +35,7 @@ from service.tracking.events import Effect, Event
 from service.tracking.loop import commanded_gains
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode, OperatorState, TrackerState
 from service.wire import CHUNK_LIMIT, Manifest, Status, checksum
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
@@ -124,7 +124,7 @@ class Observatory:
         self.dome = dome or Dome(options)
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
-        state = TrackerState(system=system, mode=mode)
+        state = TrackerState(system=system, operator=OperatorState(mode=mode))
         self._engine = Engine(state, policy, self, step=self.step)
         self._engine.set_description(workbench.describe())
         self.glances: list[Glance] = []
@@ -188,7 +188,7 @@ class Observatory:
     def force(self, matrix: NDArray[np.float32]) -> None:
         """Have the service send a matrix that the gate has never seen as if it had accepted it."""
         state, n_modes = self.state, len(matrix)
-        registration, rtc, margin = state.registration, state.rtc, state.margin
+        registration, rtc, margin = state.alpha.registration, state.loop.rtc, state.matrices.margin
         if registration is None or rtc is None or margin is None:
             raise ValueError("force: found no α, no RTC or no verdict; expected a night under way")
         record = ReconstructorRecord(
@@ -198,7 +198,7 @@ class Observatory:
             created_ns_utc=self.dome.now_ns,
             alpha=registration.alpha,
             sigma=registration.sigma,
-            parent=state.in_use,
+            parent=state.matrices.in_use,
             sha256=checksum(matrix),
             gate=margin,
             judged=judged_now(state, commanded_gains(rtc, n_modes)),
@@ -312,13 +312,13 @@ class Observatory:
         self.swaps.append(swap)
 
     def _look(self) -> None:
-        registration = self.state.registration
+        registration = self.state.alpha.registration
         self.glances.append(
             Glance(
                 time_s=self.time_s,
                 alpha=None if registration is None else registration.alpha.vector,
                 sigma=None if registration is None else registration.sigma,
-                alarms=tuple(alarm.name for alarm in self.state.alarms),
+                alarms=tuple(alarm.name for alarm in self.state.alarms.active),
             )
         )
 

@@ -16,7 +16,7 @@ from service.runtime.recording import SAVE_INTERVAL_S, is_unsaved, is_urgent, le
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.events import Event
 from service.tracking.resume import restored
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
 from studies.campaign.observatory import Observatory
 from studies.campaign.other_truth import OtherDome, OtherLink, Truth
 
@@ -113,7 +113,7 @@ class OtherNight(Observatory):
         while self.time_s < until_s - 1e-9:
             self.advance(0.25)
             self._save()
-            for alarm in self.state.alarms:
+            for alarm in self.state.alarms.active:
                 self.said.setdefault((alarm.name, alarm.text), round(self.time_s, 2))
 
     def kill(self) -> None:
@@ -141,8 +141,8 @@ class OtherNight(Observatory):
         self._actions = self._new_actions()
         state = TrackerState(
             system=self.state.system,
-            mode=Mode.AUTO,
-            reconstructors=restored(self._archive.reconstructors.records()),
+            operator=OperatorState(mode=Mode.AUTO),
+            matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
         )
         self._engine.state = taken_up(self._archive, state, self._policy, self.dome.now_ns)
         self._engine.begin_anew()
@@ -158,9 +158,12 @@ class OtherNight(Observatory):
         """Keep what the tracker heard, and write what the service would."""
         super().stepped(before, event)
         after = self.state
-        if self._archive is not None and after.reconstructors is not before.reconstructors:
-            old = {record.id: record for record in before.reconstructors}
-            news = tuple(r for r in after.reconstructors if old.get(r.id) is not r)
+        if (
+            self._archive is not None
+            and after.matrices.reconstructors is not before.matrices.reconstructors
+        ):
+            old = {record.id: record for record in before.matrices.reconstructors}
+            news = tuple(r for r in after.matrices.reconstructors if old.get(r.id) is not r)
             self._archive.record(news, (), ())
 
     def _save(self) -> None:

@@ -92,7 +92,7 @@ def play(plant: str, sky: str, worker: str, seed: int, seconds: float) -> Row:
         "seconds": seconds,
         "named": sum(night.said[name] for name in NAMED),
         "suspected": night.said[SUSPECTED],
-        "windows": night.state.windows_accepted,
+        "windows": night.state.windows.accepted,
         "cpu_s": time.process_time() - begun,
     }
 

@@ -185,7 +185,7 @@ def _order(time_s: float, rng: np.random.Generator) -> Deed:
 
 def _approve(night: StrangeNight) -> None:
     """Approve the last proposal; without one send again whatever there is."""
-    shelf = night.state.reconstructors
+    shelf = night.state.matrices.reconstructors
     proposed = [record.id for record in shelf if record.state is MatrixState.PROPOSED]
     if proposed:
         night.ask(cmd.Approve(id=proposed[-1]))

@@ -51,9 +51,9 @@ def row_of(night: Observatory, jump_times_s: tuple[float, ...]) -> Row:
         "jumps": [jump_row(night, publications, t) for t in jump_times_s],
         "wavefront_nm": wavefront_rms_nm(steady),
         "dither_nm": float(np.sqrt(np.mean([m.dither_nm**2 for m in steady]))) if steady else None,
-        "windows": [night.state.windows_accepted, night.state.windows_refused],
+        "windows": [night.state.windows.accepted, night.state.windows.refused],
         "published": [publication_row(p) for p in publications],
-        "refused": sum(r.state is MatrixState.REFUSED for r in night.state.reconstructors),
+        "refused": sum(r.state is MatrixState.REFUSED for r in night.state.matrices.reconstructors),
         "unstable": sum(p.outcome is Outcome.DIVERGED for p in publications),
         "log": [
             (round((e.t_ns_utc - START_NS) * 1e-9, 2), e.level.value, e.name, e.text)

@@ -76,18 +76,18 @@ class Operators(RuleBasedStateMachine):
     @rule()
     def stop(self):
         assert refused(self.world, cmd.StopEverything(by="Ada")) == ""
-        assert self.world.state.stopped_because
-        assert "everything was stopped" in str(self.world.state.alarms)
+        assert self.world.state.operator.stopped_because
+        assert "everything was stopped" in str(self.world.state.alarms.active)
 
     @rule()
     def release(self):
-        was_stopped = bool(self.world.state.stopped_because)
+        was_stopped = bool(self.world.state.operator.stopped_because)
         assert (refused(self.world, cmd.Resume()) == "") is was_stopped
-        assert not self.world.state.stopped_because
+        assert not self.world.state.operator.stopped_because
 
     @invariant()
     def what_is_stopped_stays_so_and_asks_for_nothing_but_the_end_of_a_dither(self):
-        stopped, effects = bool(self.world.state.stopped_because), self.world.effects
+        stopped, effects = bool(self.world.state.operator.stopped_because), self.world.effects
         if stopped and self.quiet_from is not None:
             assert not [one for one in effects[self.quiet_from :] if not harmless(one)]
             running = under_way(self.world.state, self.world.now_ns)
@@ -98,7 +98,9 @@ class Operators(RuleBasedStateMachine):
     def nothing_was_asked_of_an_rtc_that_was_at_something_else(self):
         """One that goes on with a measurement that was given up is: nothing can end that."""
         state = self.world.state
-        given_up = [one for one in state.measurements if one.state is MeasureState.GIVEN_UP]
+        given_up = [
+            one for one in state.operations.measurements if one.state is MeasureState.GIVEN_UP
+        ]
         busy = [entry.text for entry in state.log if "busy: " in entry.text]
         assert given_up or not busy, busy
 

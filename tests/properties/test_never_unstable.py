@@ -87,12 +87,12 @@ def test_nothing_is_sent_whose_verdict_is_not_yes_or_of_another_loop(story, mode
                 assert found.gate.accepted
                 assert found.state is MatrixState.PUBLISHED
                 assert effect.n_modes == found.n_modes
-                assert night.state.registration is None or of_now(night.state, found, effect)
+                assert night.state.alpha.registration is None or of_now(night.state, found, effect)
 
 
 def of_now(state, found, effect):
     """Whether the verdict is of the loop and the α there are."""
-    gains = effect.gains or commanded_gains(state.rtc, found.n_modes)
+    gains = effect.gains or commanded_gains(state.loop.rtc, found.n_modes)
     return verdict_invalid_reason(state, found.judged, gains[: found.n_modes]) is None
 
 

@@ -16,7 +16,7 @@ from service.tracking.filtering import HISTORY_LENGTH
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
 from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
 from service.tracking.step_context import LOG_LENGTH
 from service.wire import (
     DitherRequest,
@@ -27,6 +27,7 @@ from service.wire import (
     Reply,
     Status,
 )
+from tests.states import tracker_state
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -203,7 +204,7 @@ class Night:
     """
 
     def __init__(self, mode=Mode.AUTO):
-        self.state = TrackerState(system="flao", mode=mode)
+        self.state = tracker_state(system="flao", mode=mode)
         self.now_ns = START_NS
         self.open = []
         self.n_made = 0
@@ -254,7 +255,7 @@ class Night:
 
     def judged(self, n_modes):
         """What a verdict given now would be of."""
-        registration, view = self.state.registration, self.state.rtc
+        registration, view = self.state.alpha.registration, self.state.loop.rtc
         return None if registration is None or view is None else judged(registration, view, n_modes)
 
     def of_matrices(self, effect, how):
@@ -283,7 +284,7 @@ class Night:
                 return ev.ProposalJudged(id=matrix_id, verdict=passed, judged=found)
             case ev.SendMatrix(id=matrix_id):
                 done = MatrixState.APPLIED if how == "done" else MatrixState.REJECTED
-                session = "s1" if self.state.rtc is None else self.state.rtc.session
+                session = "s1" if self.state.loop.rtc is None else self.state.loop.rtc.session
                 return acknowledged(matrix_id, state=done, reason="r", frame_seq=1, session=session)
             case _:
                 return None
@@ -294,13 +295,13 @@ def the_shelf_stays_in_order(before, event, night):
 
 
 def check_shelf(state):
-    applied = [r.id for r in state.reconstructors if r.state is MatrixState.APPLIED]
+    applied = [r.id for r in state.matrices.reconstructors if r.state is MatrixState.APPLIED]
     assert len(applied) <= 1
-    assert len({r.id for r in state.reconstructors}) == len(state.reconstructors)
-    if state.in_use is not None:
-        assert state.reconstructor(state.in_use) is not None
+    assert len({r.id for r in state.matrices.reconstructors}) == len(state.matrices.reconstructors)
+    if state.matrices.in_use is not None:
+        assert state.reconstructor(state.matrices.in_use) is not None
         if applied:
-            assert applied == [state.in_use]
+            assert applied == [state.matrices.in_use]
 
 
 def nothing_grows_for_ever(before, event, night):
@@ -309,14 +310,14 @@ def nothing_grows_for_ever(before, event, night):
 
 def check_bounds(state):
     assert len(state.log) <= LOG_LENGTH
-    assert len(state.history) <= HISTORY_LENGTH
-    assert len(state.reconstructors) <= RECONSTRUCTORS_KEPT
-    assert len(state.measurements) <= MEASUREMENTS_KEPT
-    assert len({alarm.name for alarm in state.alarms}) == len(state.alarms)
+    assert len(state.alpha.history) <= HISTORY_LENGTH
+    assert len(state.matrices.reconstructors) <= RECONSTRUCTORS_KEPT
+    assert len(state.operations.measurements) <= MEASUREMENTS_KEPT
+    assert len({alarm.name for alarm in state.alarms.active}) == len(state.alarms.active)
 
 
 def what_the_gate_refused_is_never_sent(before, event, night):
-    refused = {r.id for r in before.reconstructors if r.state is MatrixState.REFUSED}
+    refused = {r.id for r in before.matrices.reconstructors if r.state is MatrixState.REFUSED}
     for effect in of_kind(night.last, ev.SendMatrix):
         assert effect.id not in refused
         assert night.state.reconstructor(effect.id).gate.accepted
@@ -324,13 +325,13 @@ def what_the_gate_refused_is_never_sent(before, event, night):
 
 def nothing_is_sent_to_nobody_or_to_an_rtc_that_may_be_the_wrong_one(before, event, night):
     if of_kind(night.last, ev.SendMatrix):
-        assert night.state.rtc is not None
-        assert not {a.name for a in night.state.alarms} & set(TROUBLES[:3])
+        assert night.state.loop.rtc is not None
+        assert not {a.name for a in night.state.alarms.active} & set(TROUBLES[:3])
 
 
 def an_uncertainty_is_never_nothing_nor_negative(before, event, night):
-    known = night.state.registration
-    if known is not None and known is not before.registration:
+    known = night.state.alpha.registration
+    if known is not None and known is not before.alpha.registration:
         assert np.all(np.linalg.eigvalsh(known.covariance) > 0.0)
         assert np.all(known.sigma >= known.floor)
 
@@ -339,8 +340,8 @@ def while_a_matrix_is_measured_nothing_else_is_asked_of_the_rtc_or_learnt(before
     if before.measuring is None or night.state.measuring is None:
         return
     assert night.state.measuring.id == before.measuring.id
-    assert night.state.windows_accepted == before.windows_accepted
-    sent_before = {r.id for r in night.state.reconstructors if r.id.startswith("made")}
+    assert night.state.windows.accepted == before.windows.accepted
+    sent_before = {r.id for r in night.state.matrices.reconstructors if r.id.startswith("made")}
     for effect in night.last:
         assert isinstance(effect, ev.SendMatrix) or effect == stopping(night)
         if isinstance(effect, ev.SendMatrix):
@@ -351,8 +352,8 @@ OVER = {MeasureState.REFUSED, MeasureState.FAILED, MeasureState.STORED, MeasureS
 
 
 def a_measurement_that_is_over_stays_over_and_given_up_stays_given_up(before, event, night):
-    after = {r.id: r.state for r in night.state.measurements}
-    for was in before.measurements:
+    after = {r.id: r.state for r in night.state.operations.measurements}
+    for was in before.operations.measurements:
         assert was.state not in OVER or after[was.id] in OVER
         if was.state is MeasureState.GIVEN_UP:
             assert after[was.id] is MeasureState.GIVEN_UP
@@ -365,10 +366,10 @@ def no_dither_is_over_budget_unless_an_operator_means_it(before, event, night):
 
 
 def an_open_loop_is_an_alarm_unless_a_measurement_has_opened_it(before, event, night):
-    if isinstance(event, Status) and night.state.rtc.loop == "open":
+    if isinstance(event, Status) and night.state.loop.rtc.loop == "open":
         measuring = night.state.measuring
         expected = measuring is None or not measuring.opens_loop
-        assert ("loop-open" in {a.name for a in night.state.alarms}) is expected
+        assert ("loop-open" in {a.name for a in night.state.alarms.active}) is expected
 
 
 def only_one_reconstructor_is_under_way_at_a_time(before, event, night):
@@ -376,7 +377,7 @@ def only_one_reconstructor_is_under_way_at_a_time(before, event, night):
         return
     made = of_kind(night.last, ev.MakeMatrix)
     assert len(made) <= 1
-    waiting = [r.id for r in before.reconstructors if r.state in SENT]
+    waiting = [r.id for r in before.matrices.reconstructors if r.state in SENT]
     still = [name for name in waiting if night.state.reconstructor(name).state in SENT]
     assert not (made and still)
 
@@ -444,12 +445,16 @@ def test_the_registration_and_the_shelf_outlive_the_rtc(story, end):
         night.tell(event, after_s)
     before = night.state
     after, _ = step(before, end, POLICY, night.now_ns)
-    assert [r.id for r in after.reconstructors] == [r.id for r in before.reconstructors]
-    assert after.history == before.history
-    assert (after.registration is None) is (before.registration is None)
-    if before.registration is not None:
-        assert after.registration.alpha == before.registration.alpha
-        np.testing.assert_array_equal(after.registration.covariance, before.registration.covariance)
+    assert [r.id for r in after.matrices.reconstructors] == [
+        r.id for r in before.matrices.reconstructors
+    ]
+    assert after.alpha.history == before.alpha.history
+    assert (after.alpha.registration is None) is (before.alpha.registration is None)
+    if before.alpha.registration is not None:
+        assert after.alpha.registration.alpha == before.alpha.registration.alpha
+        np.testing.assert_array_equal(
+            after.alpha.registration.covariance, before.alpha.registration.covariance
+        )
 
 
 def test_a_long_night_fits_in_the_same_memory():
@@ -460,4 +465,4 @@ def test_a_long_night_fits_in_the_same_memory():
         night.tell(ev.LogEvent(name="n", text=str(number)), 1.0)
     check_bounds(night.state)
     check_shelf(night.state)
-    assert night.state.in_use == "initial"
+    assert night.state.matrices.in_use == "initial"

@@ -18,6 +18,7 @@ from service.tracking.alarm_records import record_of
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
+from tests.states import changed
 from tests.system.cable import free_port
 from tests.unit.test_api import ALPHA, LINK, SECOND, SIGMA, STATE, VERDICT, FakeService
 from tests.unit.tracking.situations import ALL_SHOWN, POLICY
@@ -38,38 +39,38 @@ class StagedService(FakeService):
     def alarm(self, name, text):
         """Raise an alarm as if it had been found just now."""
         raised = Alarm(name=name, since_ns_utc=time.time_ns() - 12 * SECOND, text=text)
-        self.change(alarms=(*self.now.tracker.alarms, raised))
+        self.change(active=(*self.now.tracker.alarms.active, raised))
         self._note()
 
     def acknowledge(self, name, remark):
         """Have somebody know of an alarm."""
-        notes = {record.name: record for record in self.now.tracker.alarm_records}
+        notes = {record.name: record for record in self.now.tracker.alarms.records}
         notes[name] = replace(notes[name], acknowledged=remark)
-        self.change(alarm_records=tuple(notes.values()))
+        self.change(records=tuple(notes.values()))
 
     def mute(self, name, remark):
         """Have somebody mute an alarm, or nobody any more."""
-        notes = {record.name: record for record in self.now.tracker.alarm_records}
+        notes = {record.name: record for record in self.now.tracker.alarms.records}
         notes[name] = replace(notes[name], muted=remark)
-        self.change(alarm_records=tuple(notes.values()))
+        self.change(records=tuple(notes.values()))
 
     def over(self, name):
         """End an alarm that nobody has acknowledged."""
         state = self.now.tracker
-        notes = {record.name: record for record in state.alarm_records}
+        notes = {record.name: record for record in state.alarms.records}
         notes[name] = replace(notes[name], over_ns_utc=time.time_ns())
-        alarms = tuple(alarm for alarm in state.alarms if alarm.name != name)
-        self.change(alarm_records=tuple(notes.values()), alarms=alarms)
+        alarms = tuple(alarm for alarm in state.alarms.active if alarm.name != name)
+        self.change(records=tuple(notes.values()), active=alarms)
 
     def calm(self):
         """End all alarms, and forget them."""
-        self.change(alarms=(), alarm_records=())
+        self.change(active=(), records=())
 
     def _note(self):
         state = self.now.tracker
-        notes = {record.name: record for record in state.alarm_records}
-        notes |= {alarm.name: record_of(state, alarm) for alarm in state.alarms}
-        self.change(alarm_records=tuple(notes.values()))
+        notes = {record.name: record for record in state.alarms.records}
+        notes |= {alarm.name: record_of(state, alarm) for alarm in state.alarms.active}
+        self.change(records=tuple(notes.values()))
 
 
 def state_of_now(registration=ALPHA):
@@ -105,19 +106,19 @@ def state_of_now(registration=ALPHA):
         )
         for k in range(4)
     ]
-    return replace(
+    return changed(
         STATE,
         registration=replace(
-            STATE.registration,
+            STATE.alpha.registration,
             alpha=registration,
             t_ns_utc=now_ns - SECOND,
             arrived_ns_utc=now_ns - SECOND,
         ),
         history=entries,
-        alarms=(),
+        active=(),
         reconstructors=tuple(made),
         in_use=made[-1].id,
-        verified_ids=frozenset({STATE.rtc.cm_id}),
+        verified_ids=frozenset({STATE.loop.rtc.cm_id}),
         mode_proof=ALL_SHOWN,
         log=tuple(
             replace(line, t_ns_utc=now_ns - (4 - k) * SECOND) for k, line in enumerate(STATE.log)

@@ -67,7 +67,7 @@ def bottom_px(page, selector):
 
 def proposed(service):
     """Have a reconstructor wait for an approval."""
-    (*others, last) = service.now.tracker.reconstructors
+    (*others, last) = service.now.tracker.matrices.reconstructors
     fresh = replace(last, id="cm-waits", state=MatrixState.PROPOSED, published_ns_utc=None)
     service.change(reconstructors=(*others, last, fresh))
 
@@ -212,7 +212,7 @@ def test_by_day_as_well_nobody_is_kept_out(page):
 )
 def test_only_a_loop_that_is_closed_and_followed_has_the_colour_of_that(page, change, words, tone):
     if "loop" in change:
-        rtc = page.service.now.tracker.rtc
+        rtc = page.service.now.tracker.loop.rtc
         change = {"rtc": replace(rtc, **change)}
     page.service.change(**change)
     page.says("#operation", words)
@@ -386,7 +386,7 @@ def test_on_a_laptop_nothing_of_the_header_is_lost_and_no_table_is_scrolled_side
     proposed(page.service)
     precise = [
         replace(r, sigma=0.02 * r.sigma, id=f"{r.id}-as-long-as-they-come"[:34])
-        for r in page.service.now.tracker.reconstructors
+        for r in page.service.now.tracker.matrices.reconstructors
     ]
     link = replace(page.service.now.link, frames_lost=27_850)
     page.service.now = replace(page.service.now, link=link)
@@ -412,7 +412,7 @@ def test_the_mirror_is_drawn_with_as_few_actuators_as_its_lines_leave_room_for(p
     page.click("[data-factor='1']")
     page.says("#mirror .summary", "33.1 % of a subaperture")
     assert "drawn" not in page.text("#mirror .summary")
-    page.service.change(registration=state_of_now(JUMPED).registration)
+    page.service.change(registration=state_of_now(JUMPED).alpha.registration)
     page.says("#mirror .summary", "85.4 % of a subaperture")
     page.click("[data-factor='10']")
     page.says("#mirror .summary", "of 663 drawn")

@@ -22,8 +22,9 @@ from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import events as ev
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
 from service.wire import DitherRequest, Manifest, decode
+from tests.states import tracker_state
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
 from tests.unit.tracking.situations import dither_answered
@@ -46,7 +47,7 @@ class Tracker:
 
     def __init__(self, instrument):
         self.bench = OpticsWorker(instrument, Compute(threads=1))
-        self.engine = Engine(TrackerState(system=instrument.name, mode=Mode.HOLD), POLICY, self)
+        self.engine = Engine(tracker_state(system=instrument.name, mode=Mode.HOLD), POLICY, self)
         self.engine.set_description(self.bench.describe())
         self.now_s = 0.0
         self.intake = Intake(Endpoint(system=instrument.name), clock=lambda: self.now_s)
@@ -77,7 +78,7 @@ class Tracker:
         self.engine.feed(self.intake.drain())
 
     def fit(self, window):
-        rtc, registration = self.engine.state.rtc, self.engine.state.registration
+        rtc, registration = self.engine.state.loop.rtc, self.engine.state.alpha.registration
         loop = FitLoop(
             reconstructor=self.matrices[window.cm_id],
             gains=np.array(rtc.gains),
@@ -150,13 +151,16 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
     assert len(first.estimates) >= 6
     assert first.estimates == second.estimates
     np.testing.assert_array_equal(
-        first.engine.state.registration.covariance, second.engine.state.registration.covariance
+        first.engine.state.alpha.registration.covariance,
+        second.engine.state.alpha.registration.covariance,
     )
-    assert first.engine.state.registration.alpha == second.engine.state.registration.alpha
-    assert first.engine.state.dither.id.startswith("dither-")
+    assert (
+        first.engine.state.alpha.registration.alpha == second.engine.state.alpha.registration.alpha
+    )
+    assert first.engine.state.dithers.dither.id.startswith("dither-")
     here = {
         entry.t_ns_utc: [entry.measured.to_boundary()[name] for name in PARAMETERS]
-        for entry in first.engine.state.history
+        for entry in first.engine.state.alpha.history
     }
     same = sorted(set(there) & set(here))
     assert len(same) >= 6

@@ -63,6 +63,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
 from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, Pattern, Pointing, Status
+from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import POLICY
 
 SECOND = 1_000_000_000
@@ -124,7 +125,7 @@ REQUEST = DitherRequest(
     frequency_hz=(210.0, 250.0),
     duration_s=60.0,
 )
-STATE = TrackerState(
+STATE = tracker_state(
     system="flao-lbt",
     mode=Mode.PROPOSE,
     registration=Registration(
@@ -177,7 +178,7 @@ STATE = TrackerState(
     ),
     basis_id="kl",
     config_id="b1",
-    dither_policy=DitherPolicyState(
+    policy=DitherPolicyState(
         phase=DitherPhase.SPARSE,
         reason="ordinary telemetry keeps σ between windows",
         budget_m=8e-9,
@@ -201,13 +202,13 @@ STATE = TrackerState(
         consistent=True,
         text="agrees",
     ),
-    alarms=(Alarm(name="rtc.silent", since_ns_utc=70 * SECOND, text="no status: look at it"),),
+    active=(Alarm(name="rtc.silent", since_ns_utc=70 * SECOND, text="no status: look at it"),),
     log=tuple(
         LogEntry(t_ns_utc=k, level=Level.INFO, name="window.accepted", text=f"window {k}")
         for k in range(4)
     ),
-    windows_accepted=4,
-    windows_refused=1,
+    accepted=4,
+    refused=1,
 )
 
 
@@ -248,7 +249,7 @@ class FakeService:
         return MATRIX
 
     def change(self, **changes):
-        self.now = replace(self.now, tracker=replace(self.now.tracker, **changes))
+        self.now = replace(self.now, tracker=changed(self.now.tracker, **changes))
 
 
 @pytest.fixture
@@ -306,12 +307,12 @@ async def test_alpha_leaves_in_the_units_of_its_names(client):
 
 
 async def test_the_age_is_judged_by_arrival(client, service):
-    service.change(registration=replace(STATE.registration, arrived_ns_utc=98 * SECOND))
+    service.change(registration=replace(STATE.alpha.registration, arrived_ns_utc=98 * SECOND))
     assert (await body_of(client, "/v1/alpha"))["age_s"] == 2.0
 
 
 async def test_before_the_first_window_alpha_is_a_problem_and_state_says_null(client, service):
-    service.change(registration=None, windows_accepted=0, windows_refused=3)
+    service.change(registration=None, accepted=0, refused=3)
     response = await client.get("/v1/alpha")
     assert_problem(response, 404, "no-estimate", "no estimate yet", "3 refused")
     assert (await body_of(client, "/v1/state"))["registration"] is None
@@ -347,25 +348,25 @@ async def test_the_state_of_a_service_that_knows_nothing_is_readable(client, ser
 
 
 async def test_the_state_says_why_ordinary_telemetry_says_nothing(client, service):
-    silent = replace(
+    silent = changed(
         STATE, passive_unavailable_reason="no passive estimate: the loop's delay is 1.5 frames"
     )
     service.now = replace(service.now, tracker=silent)
     assert (await body_of(client, "/v1/state"))[
         "passive_unavailable_reason"
-    ] == silent.passive_unavailable_reason
+    ] == silent.alpha.passive_unavailable_reason
 
 
 async def test_a_reading_that_cannot_tell_has_no_sigma(client, service):
-    lost = replace(STATE.passive, sigma=np.full(4, np.inf), text="it cannot tell")
-    service.now = replace(service.now, tracker=replace(STATE, passive=lost))
+    lost = replace(STATE.alpha.passive, sigma=np.full(4, np.inf), text="it cannot tell")
+    service.now = replace(service.now, tracker=changed(STATE, passive=lost))
     body = await body_of(client, "/v1/state")
     assert set(body["passive"]["sigma"].values()) == {None}
 
 
 async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(client, service):
     registration = replace(
-        STATE.registration,
+        STATE.alpha.registration,
         window_ns_utc=70 * SECOND,
         validity=ValidityState(level=Validity.AGEING, reason="σ grows", until_ns_utc=120 * SECOND),
         optical_gains=(ModeGain(mode=501, gain=0.6, sigma=0.01, scatter=0.03, t_ns_utc=1),),
@@ -422,10 +423,10 @@ async def test_a_suspected_jump_and_a_dither_that_is_due_are_seen(client, servic
         held_ns_utc=95 * SECOND,
     )
     service.change(
-        registration=replace(STATE.registration, suspected_jump=candidate, doubt="a jump"),
+        registration=replace(STATE.alpha.registration, suspected_jump=candidate, doubt="a jump"),
         dither_due_since_ns_utc=95 * SECOND,
         dither_due_reason="a jump",
-        windows_outlying=3,
+        outlying=3,
     )
     body = await body_of(client, "/v1/state")
     assert body["registration"]["suspected"]["shift_x_subap"] == 0.5
@@ -449,8 +450,8 @@ async def test_history_is_the_newest_entries_oldest_first(client):
 
 async def test_the_last_goodness_of_fit_of_each_kind_is_measured(client, service):
     last = replace(entry(9), misfit=1.4, source=Source.RANDOM)
-    seen = replace(STATE.passive, misfit=0.8)
-    service.change(history=(*STATE.history, last, replace(last, misfit=1.3)), passive=seen)
+    seen = replace(STATE.alpha.passive, misfit=0.8)
+    service.change(history=(*STATE.alpha.history, last, replace(last, misfit=1.3)), passive=seen)
     metrics = (await client.get("/metrics")).text
     found = {source: f'pyrcal_misfit_ratio{{source="{source}"}}' for source in Source}
     assert f"{found[Source.LOCK_IN]} 1.2" in metrics
@@ -486,7 +487,7 @@ async def test_events_are_the_log_and_the_alarms(client):
 
 async def test_numbers_that_are_not_finite_leave_as_null(client, service):
     verdict = replace(VERDICT, accepted=False, worst_pole_radius=float("inf"))
-    registration = replace(STATE.registration, covariance=np.full((4, 4), np.nan))
+    registration = replace(STATE.alpha.registration, covariance=np.full((4, 4), np.nan))
     service.change(margin=verdict, registration=registration)
     text = (await client.get("/v1/state")).text
     body = json.loads(text, parse_constant=pytest.fail)
@@ -795,7 +796,7 @@ async def test_the_loop_is_shown_by_groups_of_modes_with_what_was_last_asked_of_
     asked = LoopCommand(
         id="loop-1", text="open", state=CommandState.REFUSED, asked_ns_utc=7, reason="busy: im-1"
     )
-    service.change(rtc=replace(STATE.rtc, gains=gains), loop_command=asked)
+    service.change(rtc=replace(STATE.loop.rtc, gains=gains), command=asked)
     body = await body_of(client, "/v1/state")
     assert body["rtc"]["gains"] == [
         {"first": 0, "last": 1, "gain": 0.5},

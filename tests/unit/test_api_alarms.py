@@ -19,8 +19,8 @@ ADA = OperatorNote(by="Ada", reason="known", t_ns_utc=80 * SECOND)
 
 async def test_alarms_are_those_that_last_went_unseen_or_are_muted(client, service):  # noqa: F811
     service.change(
-        alarms=(Alarm(name="loop-open", since_ns_utc=70 * SECOND, text="open"),),
-        alarm_records=(
+        active=(Alarm(name="loop-open", since_ns_utc=70 * SECOND, text="open"),),
+        records=(
             AlarmRecord(name="loop-open", worst=Severity.WARNING, acknowledged=ADA),
             AlarmRecord(name="margin", worst=Severity.CRITICAL, text="bad", over_ns_utc=9 * SECOND),
             AlarmRecord(name="edge-slip", muted=replace(ADA, until_ns_utc=99 * SECOND)),

@@ -6,7 +6,7 @@ import pytest
 
 from service.control.gains import ModeGain
 from service.tracking.commands import SetLoop
-from service.tracking.state import TrackerState
+from tests.states import changed, tracker_state
 from tests.unit.obedient import Obedient
 from tests.unit.runtime.handmade import REGISTRATION
 from tests.unit.tracking.situations import START_NS, record, rtc
@@ -20,7 +20,7 @@ MEASURED = (
 @pytest.fixture
 def service():
     return Obedient(
-        TrackerState(
+        tracker_state(
             system="flao",
             rtc=rtc(),
             registration=replace(REGISTRATION, optical_gains=MEASURED),
@@ -53,7 +53,7 @@ async def test_where_nothing_was_measured_the_table_says_so(client):
 
 async def test_a_table_of_nothing_is_a_problem(client, service):
     assert (await client.get("/v1/reconstructors/cm-9/gains")).status_code == 404
-    service.tracker = replace(service.tracker, rtc=None)
+    service.tracker = changed(service.tracker, rtc=None)
     answer = await client.get("/v1/gains")
     assert (answer.status_code, "no RTC is there" in answer.text) == (409, True)
 

@@ -11,8 +11,8 @@ import pytest
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.tracking.commands import GiveUp, Measure
 from service.tracking.products import MeasurementRecord, MeasureState
-from service.tracking.state import TrackerState
 from service.wire import Pattern
+from tests.states import tracker_state
 from tests.unit.obedient import Obedient
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3)
@@ -61,7 +61,7 @@ class FakeMatrices:
 @pytest.fixture
 def service():
     return Obedient(
-        TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
+        tracker_state(system="flao-lbt", measurements=(STORED, RUNNING)),
         now_ns=1_763_696_400_250_000_000,
         archive=SimpleNamespace(measured=FakeMatrices()),
     )

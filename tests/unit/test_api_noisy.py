@@ -10,8 +10,8 @@ from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.tracking.commands import GiveUp, MeasureNoisy
 from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
-from service.tracking.state import TrackerState
 from service.web.views import NOISY_MEASUREMENT, to_json
+from tests.states import tracker_state
 from tests.unit.obedient import Obedient
 
 FILE, IMAGE = b"\x89HDF the product", b"\x89PNG the picture"
@@ -57,7 +57,7 @@ class FakeMatrices:
 @pytest.fixture
 def service():
     return Obedient(
-        TrackerState(system="flao-lbt", measurements=(STORED, RUNNING)),
+        tracker_state(system="flao-lbt", measurements=(STORED, RUNNING)),
         now_ns=1_763_696_400_250_000_000,
         archive=SimpleNamespace(noisy=FakeMatrices()),
     )
@@ -172,7 +172,7 @@ async def test_the_state_shows_the_one_under_way(client):
     shown = (await client.get("/v1/noisy-matrix/noisy-2")).json()
     assert shown["state"] == "running"
     state = to_json(
-        TrackerState(system="x", measurements=(RUNNING,)).noisy_measurement, NOISY_MEASUREMENT
+        tracker_state(system="x", measurements=(RUNNING,)).noisy_measurement, NOISY_MEASUREMENT
     )
     found = (state["id"], state["state"], state["duration_s"])
     assert found == ("noisy-2", MeasureState.RUNNING, 30.0)

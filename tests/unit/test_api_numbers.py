@@ -13,6 +13,7 @@ from service.archive import Archive
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import TrackerState
 from service.wire import checksum
+from tests.states import tracker_state
 from tests.unit.obedient import Obedient
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4) / 7
@@ -46,7 +47,7 @@ def service(tmp_path):
     with archive:
         for one in RECORDS:
             archive.reconstructors.store(one, MATRIX, None, {})
-        state = TrackerState(system="flao-lbt", reconstructors=RECORDS, in_use="cm-3")
+        state = tracker_state(system="flao-lbt", reconstructors=RECORDS, in_use="cm-3")
         yield FakeService(state, archive=archive)
 
 

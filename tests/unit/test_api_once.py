@@ -8,8 +8,8 @@ import pytest
 from service.errors import CommandError, StorageError
 from service.runtime.snapshot import Snapshot
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import TrackerState
 from service.web import connections
+from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import POLICY
 
 CM = ReconstructorRecord(id="cm-1", state=MatrixState.PROPOSED, n_modes=400, created_ns_utc=1)
@@ -21,7 +21,7 @@ class FakeService:
     def __init__(self):
         self.commands = []
         self.refusal = None
-        self.tracker = TrackerState(system="flao-lbt", reconstructors=(CM,))
+        self.tracker = tracker_state(system="flao-lbt", reconstructors=(CM,))
 
     def snapshot(self):
         return Snapshot(
@@ -149,8 +149,8 @@ async def test_who_decides_on_what_has_changed_since_is_told_to_look_again(
     tag = (await client.get(seen)).headers["etag"]
     assert (await client.get(seen)).headers["etag"] == tag
     assert (await client.post(order, headers={"If-Match": tag})).status_code == 202
-    changed = replace(CM, state=MatrixState.DISCARDED)
-    service.tracker = replace(service.tracker, reconstructors=(changed,))
+    discarded = replace(CM, state=MatrixState.DISCARDED)
+    service.tracker = changed(service.tracker, reconstructors=(discarded,))
     answer = await client.post(order, headers={"If-Match": tag})
     assert answer.status_code == 412
     assert answer.json()["type"] == "urn:pyrcal:problem:stale"
@@ -165,7 +165,7 @@ async def test_a_rollback_is_decided_on_the_one_before_whatever_is_judged_or_pro
     client, service
 ):
     def use(*records):
-        service.tracker = replace(service.tracker, reconstructors=records, in_use=records[-1].id)
+        service.tracker = changed(service.tracker, reconstructors=records, in_use=records[-1].id)
 
     async def back(tag):
         return (await client.post("/v1/rollback", headers={"If-Match": tag})).status_code

@@ -52,7 +52,7 @@ async def test_what_the_client_has_is_not_sent_again(client, path):
 
 async def test_what_has_changed_is_sent(client, service):
     tag = await tag_of(client, "/v1/alpha/history")
-    service.change(history=(*STATE.history[2:], entry(5)))
+    service.change(history=(*STATE.alpha.history[2:], entry(5)))
     changed = await again(client, "/v1/alpha/history", tag)
     assert changed.status_code == 200
     assert len(changed.json()["entries"]) == 4

@@ -16,8 +16,8 @@ from service.archive.nights import DAY_NS, HOUR_NS, MarkKind
 from service.errors import ArchiveError, StorageError, TooLargeError
 from service.model.misregistration import Misregistration
 from service.tracking.registration import HistoryEntry, Source
-from service.tracking.state import TrackerState
 from service.web.reading import downsample
+from tests.states import tracker_state
 
 SECOND = 1_000_000_000
 NOON = 20_000 * DAY_NS + 12 * HOUR_NS
@@ -181,7 +181,7 @@ async def client(archive):
     """Of a service that remembers the last three estimates of ten."""
     every = tuple(entry(NOON + k * SECOND, shift_x=0.1 * k) for k in range(10))
     archive.record((), [line(NOON + SECOND, "registration.jump")], every)
-    state = TrackerState(system="small", history=every[7:])
+    state = tracker_state(system="small", history=every[7:])
     service = SimpleNamespace(archive=archive, snapshot=lambda: SimpleNamespace(tracker=state))
     transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:

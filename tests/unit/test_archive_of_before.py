@@ -10,8 +10,9 @@ import pytest
 from service.archive import Archive, AuditEntry
 from service.archive.records import TrackingFile
 from service.control.gains import ModeGain
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.products import MatrixState, MeasureState
-from service.tracking.state import AcquisitionStage, Mode, Orders
+from service.tracking.state import Mode, Orders
 from service.wire import Pattern
 
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"

@@ -23,6 +23,7 @@ from service.runtime import recording
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
 from service.tracking.state import TrackerState
+from tests.states import changed, tracker_state
 from tests.unit.test_archive import product, record_of
 
 NOW = 20_000 * DAY_NS
@@ -142,7 +143,7 @@ async def kept_for_a_moment(archive, keeping, state, monkeypatch):
 
 async def test_a_running_service_removes_what_is_old_and_says_so(archive, quick, monkeypatch):
     archive.pin(Pin(id="cm-01", who="Ada", why="mine"))
-    state = TrackerState(system="small", in_use="cm-00")
+    state = tracker_state(system="small", in_use="cm-00")
     told, lines = await kept_for_a_moment(
         archive, RetentionPolicy(keep_days=26.5), state, monkeypatch
     )
@@ -158,7 +159,7 @@ async def test_little_room_is_an_alarm_until_there_is_more(archive, quick, monke
     told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), state, monkeypatch)
     assert "1.9 GB are free" in told[0].text
     assert (told[0].name, told[0].over) == ("disk-low", False)
-    raised = replace(state, alarms=(Alarm(name="disk-low", since_ns_utc=1, text=""),))
+    raised = changed(state, active=(Alarm(name="disk-low", since_ns_utc=1, text=""),))
     usage.free = 2_100_000_000  # not a tenth more: it would come and go
     told, _ = await kept_for_a_moment(archive, RetentionPolicy(reserve_gb=2.0), raised, monkeypatch)
     assert not told[0].over
@@ -175,7 +176,7 @@ async def test_little_room_is_an_alarm_until_there_is_more(archive, quick, monke
 
 async def test_who_pins_a_matrix_and_why_is_kept_and_told(archive):
     lines = []
-    tracker = TrackerState(system="small", in_use="cm-03")
+    tracker = tracker_state(system="small", in_use="cm-03")
     service = SimpleNamespace(
         archive=archive, audit=lines.append, snapshot=lambda: SimpleNamespace(tracker=tracker)
     )

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,16 +16,19 @@ from service.tracking.registration import Registration
 from service.tracking.resume import saved_of
 from service.tracking.state import Mode, Orders
 from service.wire import Pointing
+from tests.states import changed
 from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import START_NS, Story, moved, rtc
 from tests.unit.tracking.test_watchdog import learnt, watch
+
+DATA = Path(__file__).parents[1] / "data" / "archive"
 
 
 @pytest.fixture(scope="module")
 def saved():
     """What a night with windows, looks and a known pointing has left."""
     story = Story(Mode.AUTO).meet()
-    story.state = replace(story.state, pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0))
+    story.state = changed(story.state, pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0))
     story.see(n_windows=3, modes=(501, 509, 517, 525), gain_sigma=np.full(4, 0.01))
     learnt(story, n_looks=3)
     watch(story, moved(shift_x_subap=0.06))
@@ -55,6 +59,17 @@ def test_a_file_of_before_the_scatter_told_of_the_wind_is_read(file, saved):
     found = file.read().registration.bias
     np.testing.assert_array_equal(found.excess, np.zeros(4))
     assert found.loop == ()
+
+
+def test_what_a_service_of_before_the_renames_has_left_is_taken_up():
+    """The file is one that d5ba581 has written: with ``move`` and ``most_modes``."""
+    found = TrackingFile(DATA / "tracking-before-renames.json").read()
+    np.testing.assert_allclose(found.registration.alpha.vector[:2], (0.12041, -0.08), atol=1e-5)
+    assert found.registration.n_windows == 6
+    assert found.acquisition.max_modes == 250
+    assert found.acquisition.interruption.cause == "the service ended"
+    np.testing.assert_array_equal(found.offload.total, (0.3, -0.1, 0.0, 0.0))
+    assert (found.orders.mode, found.orders.dither_stopped) == (Mode.HOLD, True)
 
 
 def test_there_is_nothing_before_the_first_night(file):
@@ -184,7 +199,7 @@ def test_the_newest_replaces_what_was_there(file, saved, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["tracking.json"]
 
 
-def changed(**values):
+def altered(**values):
     def change(text):
         return json.dumps({**json.loads(text), **values})
 
@@ -206,9 +221,9 @@ def with_registration(**values):
         lambda text: text[: len(text) // 2],
         lambda text: "",
         lambda text: "[]",
-        changed(version=7),
-        changed(registration=None),
-        changed(shoe_size=43),
+        altered(version=7),
+        altered(registration=None),
+        altered(shoe_size=43),
         with_registration(alpha=[0.1, 0.2, 0.3]),
         with_registration(alpha=[0.1, 0.2, float("nan"), 1.0]),
         with_registration(covariance=np.diag([1.0, 1.0, -1.0, 1.0]).tolist()),

@@ -17,6 +17,7 @@ from service.runtime import trends as of_moments
 from service.runtime.trends import TrendSampler, residual_of, sample_of
 from service.tracking.products import Assessment
 from service.wire import Pointing
+from tests.states import changed
 from tests.unit.test_api import ALPHA, SECOND, SIGMA, STATE, service
 
 __all__ = ["service"]  # a fixture
@@ -91,12 +92,12 @@ def test_what_is_known_is_in_the_sample():
     expected = ExpectedGain(loss_m=1e-8, wavefront_m=5e-8, pole_radius=0.8, fresh_pole_radius=0.8)
     gains = tuple(ModeGain(mode=k, gain=g, sigma=0.1, scatter=0.1, t_ns_utc=1) for k, g in
                   enumerate((0.4, 0.6)))  # fmt: skip
-    state = replace(
+    state = changed(
         STATE,
-        registration=replace(STATE.registration, optical_gains=gains),
+        registration=replace(STATE.alpha.registration, optical_gains=gains),
         assessment=Assessment(id="rtc-0", alpha=ALPHA, expected=expected, t_ns_utc=1),
         pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0),
-        rtc=replace(STATE.rtc, magnitude=11.0, flux=np.full(4, 2.5, "<f4").tobytes()),
+        rtc=replace(STATE.loop.rtc, magnitude=11.0, flux=np.full(4, 2.5, "<f4").tobytes()),
     )
     found = sample_of(state, 9, 8, 7e-8)
     assert (found.t_ns_utc, found.telemetry_ns_utc, found.residual_m) == (9, 8, 7e-8)
@@ -105,8 +106,8 @@ def test_what_is_known_is_in_the_sample():
     assert found.optical_gain == pytest.approx(0.5)
     assert (found.n_controlled, found.magnitude, found.flux) == (400, 11.0, 2.5)
     assert (found.elevation_deg, found.azimuth_deg) == (61.0, 120.0)
-    np.testing.assert_array_equal(found.sigma, state.registration.sigma)
-    another = replace(state, in_use="cm-9")
+    np.testing.assert_array_equal(found.sigma, state.alpha.registration.sigma)
+    another = changed(state, in_use="cm-9")
     assert sample_of(another, 9, 8, None).wavefront_m is None, "it is of another matrix"
 
 

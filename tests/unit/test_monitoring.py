@@ -20,6 +20,7 @@ from service.tracking.alarms import (
     Responsible,
 )
 from service.tracking.registration import Validity
+from tests.states import changed
 from tests.unit.test_api import LINK, SECOND, STATE, assert_problem, service
 from tests.unit.test_house import ROOT
 
@@ -73,7 +74,7 @@ UNITS = ("_seconds", "_meters", "_bytes", "_ratio", "_radians", "_subapertures")
 @pytest.fixture
 async def families(client, service):
     """Every metric there is, of a service that knows everything."""
-    service.change(alarms=tuple(Alarm(name=name, since_ns_utc=0, text="") for name in ALARMS))
+    service.change(active=tuple(Alarm(name=name, since_ns_utc=0, text="") for name in ALARMS))
     text = (await client.get("/metrics")).text
     return {family.name: family for family in text_string_to_metric_families(text)}
 
@@ -89,8 +90,13 @@ def test_a_metric_is_in_a_base_unit(families):
 
 def test_no_label_holds_an_id(families, service):
     tracker = service.now.tracker
-    ids = {tracker.in_use, tracker.rtc.session, tracker.dither.id, tracker.system}
-    ids |= {record.id for record in tracker.reconstructors}
+    ids = {
+        tracker.matrices.in_use,
+        tracker.loop.rtc.session,
+        tracker.dithers.dither.id,
+        tracker.system,
+    }
+    ids |= {record.id for record in tracker.matrices.reconstructors}
     labels = {v for f in families.values() for s in f.samples for v in s.labels.values()}
     assert not labels & ids
     assert len(labels) > 40
@@ -141,12 +147,12 @@ def alarm(name, text):
             "odd",
         ),
         (
-            {"tracker": replace(STATE, alarms=(alarm(ARCHIVE_FAILED, "disk full"),))},
+            {"tracker": changed(STATE, active=(alarm(ARCHIVE_FAILED, "disk full"),))},
             "archive",
             "disk full",
         ),
         (
-            {"tracker": replace(STATE, alarms=(alarm(WORKER_BEHIND, "busy"),))},
+            {"tracker": changed(STATE, active=(alarm(WORKER_BEHIND, "busy"),))},
             "worker",
             "busy",
         ),
@@ -225,7 +231,7 @@ async def test_a_request_is_found_in_the_log_by_the_id_of_its_answer(client, ser
 
 
 def test_a_line_has_the_frame_and_the_matrices_it_is_about():
-    state = replace(STATE, rtc=replace(STATE.rtc, seq=81_234))
+    state = changed(STATE, rtc=replace(STATE.loop.rtc, seq=81_234))
     assert ids_of("cm-1 applied", state) == {
         "frame": 81_234,
         "in_use": "rtc-0",

@@ -11,8 +11,9 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.events import Event
 from service.tracking.products import MatrixState
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
 from service.wire import DitherRequest
+from tests.states import tracker_state
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -30,7 +31,7 @@ def apply_what_is_sent(story, effects, n_modes):
     (sent,) = of_kind(effects, ev.SendMatrix)
     story.acknowledge(sent.id, MatrixState.STAGED)
     story.acknowledge(sent.id)
-    playing = story.state.dither and story.state.dither.id
+    playing = story.state.dithers.dither and story.state.dithers.dither.id
     story.tell(rtc(n_modes, cm_id=sent.id, dither_id=playing))
 
 
@@ -45,14 +46,14 @@ def test_the_main_job_in_auto():
     story.wait(6)
     assert [effect.n_modes for effect in story.asked(ev.MakeMatrix)] == [400, 500]
     apply_what_is_sent(story, story.make("cm-2", n_modes=500), 500)
-    assert story.state.in_use == "cm-2"
-    assert [record.state for record in story.state.reconstructors] == [
+    assert story.state.matrices.in_use == "cm-2"
+    assert [record.state for record in story.state.matrices.reconstructors] == [
         MatrixState.SUPERSEDED,
         MatrixState.SUPERSEDED,
         MatrixState.APPLIED,
     ]
     assert not story.alarms
-    assert story.state.registration.alpha == ALPHA
+    assert story.state.alpha.registration.alpha == ALPHA
 
 
 def test_in_propose_nothing_is_sent_until_the_operator_has_spoken():
@@ -62,7 +63,7 @@ def test_in_propose_nothing_is_sent_until_the_operator_has_spoken():
     story.see(n_windows=30)
     assert not story.asked(ev.SendMatrix)
     apply_what_is_sent(story, story.tell(cmd.Approve(id="cm-1")), 400)
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     assert len(story.asked(ev.SendMatrix)) == 1
 
 
@@ -78,7 +79,7 @@ def test_after_a_jump_the_loop_gets_a_reconstructor_for_the_new_place():
     last = story.asked(ev.MakeMatrix)[before:]
     assert [effect.n_modes for effect in last] == [400]
     assert "moved by +0.2" in last[0].why
-    assert story.state.registration.alpha.shift_x_subap == pytest.approx(0.32, abs=0.003)
+    assert story.state.alpha.registration.alpha.shift_x_subap == pytest.approx(0.32, abs=0.003)
 
 
 def test_a_restarted_rtc_gets_its_reconstructors_again():
@@ -88,8 +89,8 @@ def test_a_restarted_rtc_gets_its_reconstructors_again():
     story.tell(ev.RtcVanished(), after_s=10)
     story.wait(20)
     story.meet(session="s2")
-    assert story.state.in_use == "initial"
-    assert story.state.registration.alpha == ALPHA
+    assert story.state.matrices.in_use == "initial"
+    assert story.state.alpha.registration.alpha == ALPHA
     dithers = story.asked(DitherRequest)
     assert dithers[-1].id != dithers[0].id
     (made,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
@@ -99,12 +100,12 @@ def test_a_restarted_rtc_gets_its_reconstructors_again():
 
 
 def test_a_restarted_service_knows_the_matrix_it_once_made():
-    shelf = Story(Mode.AUTO).meet().use("cm-1").state.reconstructors
-    again = Story(Mode.AUTO, state=TrackerState(system="flao", reconstructors=shelf[1:]))
+    shelf = Story(Mode.AUTO).meet().use("cm-1").state.matrices.reconstructors
+    again = Story(Mode.AUTO, state=tracker_state(system="flao", reconstructors=shelf[1:]))
     again.tell(ev.SessionStarted(session="s1"))
     again.tell(rtc(cm_id="cm-1"))
     assert again.asked(ev.FetchMatrix) == [ev.FetchMatrix(id="cm-1")]
-    assert again.state.in_use == "cm-1"
+    assert again.state.matrices.in_use == "cm-1"
     assert again.state.reconstructor("cm-1").parent == "initial"
 
 
@@ -116,20 +117,20 @@ def test_a_loop_that_diverges_stops_everything_and_is_named():
     assert not story.wait(60)
     assert story.alarms >= {"loop-diverging"}
     story.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
-    assert story.state.registration.n_windows == 1
+    assert story.state.alpha.registration.n_windows == 1
 
 
 def test_a_step_leaves_the_state_it_was_given_as_it_was():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=2)
     before = story.state
-    covariance = before.registration.covariance.copy()
-    n_logged, n_records = len(before.log), len(before.reconstructors)
+    covariance = before.alpha.registration.covariance.copy()
+    n_logged, n_records = len(before.log), len(before.matrices.reconstructors)
     after, _ = step(before, ev.RtcVanished(), POLICY, story.now_ns)
-    assert after.rtc is None
-    assert (len(before.log), len(before.reconstructors)) == (n_logged, n_records)
-    np.testing.assert_array_equal(before.registration.covariance, covariance)
-    assert before.rtc is not None
+    assert after.loop.rtc is None
+    assert (len(before.log), len(before.matrices.reconstructors)) == (n_logged, n_records)
+    np.testing.assert_array_equal(before.alpha.registration.covariance, covariance)
+    assert before.loop.rtc is not None
 
 
 def test_the_same_night_replays_to_the_same_decisions():
@@ -145,7 +146,7 @@ def test_the_same_night_replays_to_the_same_decisions():
     one, other = night(), night()
     assert [type(effect) for effect in one.effects] == [type(effect) for effect in other.effects]
     assert one.state.log == other.state.log
-    assert one.state.alarms == other.state.alarms
+    assert one.state.alarms.active == other.state.alarms.active
 
 
 def test_a_command_that_is_refused_changes_nothing():
@@ -153,7 +154,7 @@ def test_a_command_that_is_refused_changes_nothing():
     with pytest.raises(CommandError):
         story.tell(cmd.Rollback())
     assert story.state.log == ()
-    assert story.state.mode is Mode.PROPOSE
+    assert story.state.operator.mode is Mode.PROPOSE
 
 
 def test_there_is_a_reaction_to_every_event_and_command_and_to_nothing_else():

@@ -21,6 +21,7 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors, update_policy
+from service.tracking.acquisition_state import Acquisition, AcquisitionStage, Interruption
 from service.tracking.alarms import ACQUISITION, Interlock
 from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.events import Event
@@ -31,7 +32,7 @@ from service.tracking.operations.running import ramping
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
-from service.tracking.state import Acquisition, AcquisitionStage, Interruption, Mode, TrackerState
+from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, LoopRequest, Reply, Status
 
@@ -67,7 +68,7 @@ def acquire(context: StepContext, event: Event) -> None:
     if acquisition.stage is AcquisitionStage.INTERRUPTED:
         _take_up(context)
     elif not acquisition.under_way:
-        if context.state.windows_accepted > context.before.windows_accepted:
+        if context.windows.accepted > context.before.windows.accepted:
             stages.go_on(context, replace(acquisition, misses=0))
         _forget_when_over(context, event)
         stages.tell_of_misses(context)
@@ -88,10 +89,10 @@ def left_behind(state: TrackerState) -> Acquisition | None:
     One that was aborted matters while α is not known: it says why, and why the loop may be open. So
     does one that holds back the next.
     """
-    acquisition = state.acquisition
+    acquisition = state.operations.acquisition
     if acquisition.under_way:
         return _cut_off(state, "the service ended")
-    aborted = acquisition.stage is AcquisitionStage.ABORTED and state.registration is None
+    aborted = acquisition.stage is AcquisitionStage.ABORTED and state.alpha.registration is None
     lasts = acquisition.stage in _LASTING or acquisition.held_off
     return _kept(acquisition) if aborted or lasts else None
 
@@ -126,7 +127,9 @@ def _own_loop_lost(context: StepContext) -> str | None:
     On as many modes it would not hold the next time; the RTC's own matrix says nothing of that.
     """
     state = context.state
-    record = state.reconstructor(state.in_use) if state.in_use is not None else None
+    record = (
+        state.reconstructor(state.matrices.in_use) if state.matrices.in_use is not None else None
+    )
     if record is None or record.alpha is None:
         return None
     alarm = context.blocking_alarm(Interlock.HOLD)
@@ -158,7 +161,7 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
             stages.abort(context, f"because the mode is {mode}")
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
             stages.restart(context, "the RTC began a new session")
-        case ev.DitherMeasured(id=loud, text=text) if loud == state.dither_policy.loud_id and text:
+        case ev.DitherMeasured(id=loud, text=text) if loud == state.dithers.policy.loud_id and text:
             stages.give_up(context, text)
         case ev.DitherUnusable(text=text):
             stages.give_up(context, f"its dither cannot be read: {text}")
@@ -214,7 +217,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
         if acquisition.command is None:
             stages.request_loop(context, cmd.SetLoop(loop="closed"))
     else:
-        n_windows = context.state.windows_accepted
+        n_windows = context.windows.accepted
         stages.go_on(context, replace(acquisition, applied=record.id, windows=n_windows))
         text = f"closed on {record.n_modes} modes: sharpening the registration"
         stages.enter_stage(context, AcquisitionStage.WIDENING, text)
@@ -279,13 +282,13 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         stages.restart(context, "somebody opened the loop")
         return
     doubted = registration is not None and bool(registration.doubt)
-    waiting = doubted or context.state.making_since_ns_utc is not None
+    waiting = doubted or context.matrices.making_since_ns_utc is not None
     if record is not None and rtc.cm_id == record.id and not waiting:
         if record.applied_frame_seq is not None and acquisition.applied != record.id:
-            n_windows = context.state.windows_accepted
+            n_windows = context.windows.accepted
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
             stages.go_on(context, acquisition)
-        seen, goal = context.state.windows_accepted - acquisition.windows, _goal(acquisition)
+        seen, goal = context.windows.accepted - acquisition.windows, _goal(acquisition)
         if seen >= 1 and (
             record.n_modes < goal or update_policy.moved(context.state, record, context.policy)
         ):
@@ -300,9 +303,9 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
 def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0) -> None:
     """Ask for a reconstructor of so many modes, or fewer but more than ``at_least``."""
     found, state = context.acquisition.found, context.state
-    if state.making_since_ns_utc is not None or found is None:
+    if state.matrices.making_since_ns_utc is not None or found is None:
         return
-    if context.now_ns >= state.no_making_before_ns_utc:
+    if context.now_ns >= state.matrices.no_making_before_ns_utc:
         effect = ev.MakeMatrix(
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
@@ -350,10 +353,10 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
 
 def _followed(state: TrackerState) -> bool:
     """Return whether windows that came since agree on α, in a closed loop."""
-    rtc, registration = state.rtc, state.registration
+    rtc, registration = state.loop.rtc, state.alpha.registration
     if rtc is None or not rtc.in_loop or registration is None:
         return False
-    since = state.windows_accepted - state.acquisition.windows
+    since = state.windows.accepted - state.operations.acquisition.windows
     believed = registration.usable and registration.suspected_jump is None
     return believed and min(since, registration.n_windows) >= ENOUGH_WINDOWS
 
@@ -364,10 +367,10 @@ def _kept(acquisition: Acquisition) -> Acquisition:
 
 
 def _cut_off(state: TrackerState, cause: str) -> Acquisition:
-    session = None if state.rtc is None else state.rtc.session
-    doing = f"{state.acquisition.stage}: {state.acquisition.text}"
+    session = None if state.loop.rtc is None else state.loop.rtc.session
+    doing = f"{state.operations.acquisition.stage}: {state.operations.acquisition.text}"
     interruption = Interruption(doing=doing, session=session, cause=cause)
-    return replace(_kept(state.acquisition), interruption=interruption)
+    return replace(_kept(state.operations.acquisition), interruption=interruption)
 
 
 def _take_up(context: StepContext) -> None:
@@ -396,11 +399,11 @@ def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
     state = context.state
     if stages.left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
-    if state.mode is not Mode.AUTO:
-        return f"the mode is {state.mode}"
+    if state.operator.mode is not Mode.AUTO:
+        return f"the mode is {state.operator.mode}"
     if not context.policy.acquires:
         return "the settings forbid that"
-    if state.dither_stopped:
+    if state.dithers.stopped:
         return "the dither was stopped"
     return stages.why_not_now(state, context.policy)
 
@@ -408,7 +411,7 @@ def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
 def _wait(context: StepContext, what: str, do: str = "") -> None:
     """Say what was going on, and what it waits for."""
     text = f"{_cause_text(context.acquisition)}; {what}{'. ' if do else ''}{do}"
-    if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in context.state.alarms):
+    if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in context.alarms.active):
         return
     stage = AcquisitionStage.INTERRUPTED
     stages.go_on(

@@ -20,6 +20,7 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
+from service.tracking.acquisition_state import Acquisition, AcquisitionStage, LoopFound
 from service.tracking.alarms import ACQUISITION, NOT_FOUND, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
@@ -28,14 +29,7 @@ from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict
 from service.tracking.registration import Registration
-from service.tracking.state import (
-    Acquisition,
-    AcquisitionStage,
-    Level,
-    LoopFound,
-    Mode,
-    TrackerState,
-)
+from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import half_of, limit_modes
 from service.wire import DitherKind, DitherRequest, Status
@@ -137,7 +131,7 @@ def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
 def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
     """Return the loop as it is, and as it shall be closed again."""
     closed = rtc.loop != "open"
-    out_of_hand = blocking_alarm(state, Interlock.HOLD) is not None
+    out_of_hand = blocking_alarm(state.alarms.active, Interlock.HOLD) is not None
     goal = rtc.n_controlled or min(policy.n_modes_target, rtc.n_modes)
     gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
     return LoopFound(
@@ -154,10 +148,10 @@ def left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
 
     Opening a loop begins a session: the same one means that nobody has closed it in between.
     """
-    left = state.acquisition.interruption
+    left = state.operations.acquisition.interruption
     if left is None or left.session != rtc.session or rtc.loop != "open":
         return None
-    return state.acquisition
+    return state.operations.acquisition
 
 
 def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...]:
@@ -188,31 +182,40 @@ def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> No
 
 def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
     """Return why the service should acquire by itself, or None."""
-    rtc, acquisition = state.rtc, state.acquisition
-    if not policy.acquires or state.mode is not Mode.AUTO or rtc is None or rtc.loop == "open":
+    rtc, acquisition = state.loop.rtc, state.operations.acquisition
+    if (
+        not policy.acquires
+        or state.operator.mode is not Mode.AUTO
+        or rtc is None
+        or rtc.loop == "open"
+    ):
         return None
-    if not policy.dither_enabled or state.dither_stopped or state.measuring is not None:
+    if not policy.dither_enabled or state.dithers.stopped or state.measuring is not None:
         return None
     failed = acquisition.stage is AcquisitionStage.FAILED
-    if failed or acquisition.held_off or blocking_alarm(state, Interlock.SEND_NEW) is not None:
+    if (
+        failed
+        or acquisition.held_off
+        or blocking_alarm(state.alarms.active, Interlock.SEND_NEW) is not None
+    ):
         return None
-    for alarm in state.alarms:
+    for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
-    if _missed_enough(state) and not state.loop_holds:
+    if _missed_enough(state) and not state.loop.holds:
         return f"{acquisition.misses} windows in a row found no registration"
     return None
 
 
 def _missed_enough(state: TrackerState) -> bool:
-    known = state.registration is not None and state.registration.usable
-    return state.acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE)
+    known = state.alpha.registration is not None and state.alpha.registration.usable
+    return state.operations.acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE)
 
 
 def tell_of_misses(context: StepContext) -> None:
     """Say that no registration is found in a loop that holds well: it is not opened for that."""
-    if context.state.loop_holds and _missed_enough(context.state):
+    if context.loop.holds and _missed_enough(context.state):
         text = (
             "window after window finds no registration, though the loop holds well: modes or "
             "slopes are probably in another order, or of another sign, than the instrument file "
@@ -232,15 +235,15 @@ def count_miss(context: StepContext, kind: RefusalKind) -> None:
 
 def why_not_now(state: TrackerState, policy: Policy) -> str | None:
     """Return why no acquisition can begin now, or None."""
-    if state.rtc is None:
+    if state.loop.rtc is None:
         return NO_RTC
     if not policy.dither_enabled:
         return "the settings forbid any dither"
-    alarm = blocking_alarm(state, Interlock.SEND_NEW)
+    alarm = blocking_alarm(state.alarms.active, Interlock.SEND_NEW)
     if alarm is not None:
         return f"{alarm.name}: {alarm.text}"
-    modes, _ = _far_modes(AcquisitionStage.COARSE, state.rtc)
-    return _why_too_few(modes, state.rtc)
+    modes, _ = _far_modes(AcquisitionStage.COARSE, state.loop.rtc)
+    return _why_too_few(modes, state.loop.rtc)
 
 
 def sigma_of(acquisition: Acquisition) -> str:
@@ -273,7 +276,7 @@ def enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> Non
 def request_loop(context: StepContext, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop, and remember having asked."""
     set_loop(context, command)
-    asked = context.state.loop_command
+    asked = context.loop.command
     context.acquisition = replace(context.acquisition, command=None if asked is None else asked.id)
 
 
@@ -314,7 +317,7 @@ def give_up(context: StepContext, reason: str) -> None:
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
     make_way(context)
     validity.forget(context)
-    context.acquisition = replace(context.acquisition, windows=context.state.windows_accepted)
+    context.acquisition = replace(context.acquisition, windows=context.windows.accepted)
     if closed and out_of_hand:
         request_loop(context, cmd.SetLoop(loop="open"))
     text = (
@@ -339,7 +342,7 @@ def abort(context: StepContext, why: str, *, held_off: bool = False) -> None:
         left = "closed as it was found"
         request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
-    over = replace(context.acquisition, held_off=held_off, windows=context.state.windows_accepted)
+    over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
     context.acquisition = over
     enter_stage(context, AcquisitionStage.ABORTED, text)
 
@@ -398,8 +401,8 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         t_ns_utc=estimate.t_ns_utc,
         arrived_ns_utc=context.now_ns,
         n_windows=1,
-        basis_id=context.state.basis_id,
-        config_id=context.state.config_id,
+        basis_id=context.loop.basis_id,
+        config_id=context.loop.config_id,
     )
     validity.store_registration(context, registration)
     make_way(context)
@@ -417,7 +420,7 @@ def on_missed(context: StepContext, reason: str) -> None:
 
 def _keep_dithering(context: StepContext, rtc: Status) -> None:
     """Ask for the dither of the stage once no other one runs."""
-    if context.dither is not None or context.now_ns < context.state.no_dither_before_ns_utc:
+    if context.dither is not None or context.now_ns < context.dithers.no_dither_before_ns_utc:
         return
     if rtc.dither_id is not None:
         stopping = rtc.dither_id == context.dither_policy.stopped_id
@@ -435,7 +438,7 @@ def _keep_dithering(context: StepContext, rtc: Status) -> None:
 
 def _to_give_back(state: TrackerState) -> LoopFound | None:
     """Return the loop as it was found, if it held then and its matrix is still in the RTC."""
-    acquisition, rtc = state.acquisition, state.rtc
+    acquisition, rtc = state.operations.acquisition, state.loop.rtc
     found = acquisition.found
     if rtc is None or found is None or acquisition.sent or not (found.closed and found.held):
         return None

@@ -218,5 +218,7 @@ def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> 
 
 def keep(context: StepContext, record: MeasurementRecord) -> None:
     """Keep what is known of a measurement in place of what was known before."""
-    others = tuple(r for r in context.state.measurements if r.id != record.id)
-    context.state = replace(context.state, measurements=(*others, record)[-MEASUREMENTS_KEPT:])
+    others = tuple(r for r in context.operations.measurements if r.id != record.id)
+    context.operations = replace(
+        context.operations, measurements=(*others, record)[-MEASUREMENTS_KEPT:]
+    )

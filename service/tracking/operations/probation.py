@@ -73,10 +73,10 @@ _WORSE = frozenset(
 
 def follow(context: StepContext, event: Event) -> None:
     """Begin a probation with every matrix that is applied, and end one that nothing can end."""
-    if context.state.in_use != context.before.in_use:
-        _on_swap(context, context.before.in_use, context.state.in_use)
+    if context.matrices.in_use != context.before.matrices.in_use:
+        _on_swap(context, context.before.matrices.in_use, context.matrices.in_use)
         return
-    trial = context.state.probation
+    trial = context.operations.probation
     if trial is None:
         return
     told = _told_by_alarm(context, trial)
@@ -106,7 +106,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
 
     What was said of other matrices than the two on record is not meant.
     """
-    trial, found = context.state.probation, event.finding
+    trial, found = context.operations.probation, event.finding
     if trial is None or not trial.awaits(found.before, found.after):
         return
     if trial.state is ProbationState.WATCHED:
@@ -127,7 +127,7 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
 
     One that was being made when the verdict came has the same parent.
     """
-    trial = state.probation
+    trial = state.operations.probation
     if trial is None or trial.state is not ProbationState.ROLLING_BACK or trial.rollback:
         return False
     before = state.reconstructor(trial.before)
@@ -136,7 +136,7 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
 
 def go_back(context: StepContext, made: ev.MatrixMade) -> None:
     """Send the matrix before under its new id, unless something forbids it by now."""
-    trial = context.state.probation
+    trial = context.operations.probation
     reconstructors.propose(context, made.record)
     if trial is None:
         return
@@ -164,7 +164,7 @@ def _go_back(context: StepContext, trial: Probation, found: str) -> None:
 
 
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
-    trial = context.state.probation
+    trial = context.operations.probation
     record = None if in_use is None else context.state.reconstructor(in_use)
     if trial is not None and trial.state in _GOING_BACK and trial.rollback == in_use is not None:
         _begin_watch(context, trial, in_use)
@@ -187,8 +187,8 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
             text=why or f"compared with {before}",
             since_ns_utc=context.now_ns,
             until_ns_utc=context.now_ns + round(WITHIN_S * SECOND_NS),
-            loop=context.before.rtc,
-            opens=context.before.mode is Mode.AUTO if asked is None else asked,
+            loop=context.before.loop.rtc,
+            opens=context.before.operator.mode is Mode.AUTO if asked is None else asked,
         ),
     )
 
@@ -228,7 +228,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
 def _watch(context: StepContext, trial: Probation) -> None:
     """End the look at a loop with the matrix before: it is lost, opened, or nothing tells."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
-    lost = next((a for a in context.state.alarms if alarm_blocks(a, Interlock.HOLD)), None)
+    lost = next((a for a in context.alarms.active if alarm_blocks(a, Interlock.HOLD)), None)
     if context.rtc is None or not context.rtc.in_loop:
         why = "the RTC is gone" if context.rtc is None else why_open(context.rtc)
         _end_watch(context, trial, why, lost=False)
@@ -258,14 +258,14 @@ def _open(context: StepContext, trial: Probation) -> None:
 
 def _await_opening(context: StepContext, trial: Probation, event: Event) -> None:
     """Ask again until the loop is open, or an operator says how to go on."""
-    rtc, asked = context.rtc, context.state.loop_command
+    rtc, asked = context.rtc, context.loop.command
     if isinstance(event, cmd.SetMode):
         _set(context, replace(trial, state=ProbationState.KEPT))
         context.clear_alarm(LOOP_OPENED)
     elif rtc is not None and not rtc.in_loop:
         _set(context, replace(trial, state=ProbationState.OPENED))
         context.raise_alarm(LOOP_OPENED, _opening(trial, "the loop was asked to open, and is open"))
-    elif rtc is not None and asked is not None and not context.state.stopped_because:
+    elif rtc is not None and asked is not None and not context.operator.stopped_because:
         if asked.state in {CommandState.REFUSED, CommandState.FAILED}:
             why = f"the RTC was asked to open the loop and has not ({asked.reason}): open it there"
             context.raise_alarm(LOOP_OPENED, _opening(trial, why))
@@ -286,7 +286,7 @@ def _told_by_alarm(context: StepContext, trial: Probation) -> str:
     late = context.now_ns > trial.since_ns_utc + LAW_WITHIN_S * SECOND_NS
     if trial.state not in judged or late or _why_not_comparable(context):
         return ""
-    since = (a for a in context.state.alarms if a.since_ns_utc >= trial.since_ns_utc)
+    since = (a for a in context.alarms.active if a.since_ns_utc >= trial.since_ns_utc)
     return next((alarm.text for alarm in since if alarm.name in _TELLING), "")
 
 
@@ -332,11 +332,11 @@ def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:
     state, rtc, record = context.state, context.rtc, context.state.reconstructor(trial.before)
     if rtc is None or record is None:
         return "it is no longer known, or the RTC is gone"
-    if record.id not in state.verified_ids:
+    if record.id not in state.matrices.verified_ids:
         return "the RTC has not shown its numbers in this session"
     if trial.loop is None or not same_but_for_modes(trial.loop, rtc):
         return "the loop has been changed since"
-    on_way = next((r.id for r in state.reconstructors if r.on_its_way), None)
+    on_way = next((r.id for r in state.matrices.reconstructors if r.on_its_way), None)
     if on_way is not None:
         return f"{on_way} is on its way to the RTC"
     return why_unsendable(state, record, trial.since_ns_utc)
@@ -347,7 +347,7 @@ def _keep(context: StepContext, trial: Probation, why: str) -> None:
     text = f"{trial.worse}; the service did not go back to {trial.before}: {why}"
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
     lost = out_of_hand or (trial.finding is not None and trial.finding.lost)
-    if lost and trial.opens and context.rtc is not None and not context.state.stopped_because:
+    if lost and trial.opens and context.rtc is not None and not context.operator.stopped_because:
         _open(context, replace(trial, text=text))
         return
     _end(context, trial, ProbationState.KEPT, text)
@@ -361,4 +361,4 @@ def _end(context: StepContext, trial: Probation, state: ProbationState, text: st
 
 
 def _set(context: StepContext, trial: Probation) -> None:
-    context.state = replace(context.state, probation=trial)
+    context.operations = replace(context.operations, probation=trial)

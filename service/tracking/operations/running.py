@@ -51,7 +51,7 @@ def under_way(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:
 
 def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
     """Return the gain ramp that the RTC is busy with, or None: opening the loop ends one."""
-    asked, rtc = state.loop_command, state.rtc
+    asked, rtc = state.loop.command, state.loop.rtc
     if asked is None or not asked.lasts_s or rtc is None or rtc.loop == "open":
         return None
     if asked.state is CommandState.ASKED:
@@ -62,12 +62,12 @@ def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
 
 
 def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
-    for alarm in state.alarms:
+    for alarm in state.alarms.active:
         if alarm.name == STANDING_BY:
             yield RunningOperation(OperationKind.STANDING_BY, alarm.text)
-    if state.stopped_because:
+    if state.operator.stopped_because:
         yield RunningOperation(
-            OperationKind.STOPPED, f"{state.stopped_because}; release the stop first"
+            OperationKind.STOPPED, f"{state.operator.stopped_because}; release the stop first"
         )
     if state.measuring is not None:
         text = f"interaction matrix {state.measuring.id} is being measured"
@@ -80,16 +80,17 @@ def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
         left_s = max((ramp.until_ns_utc - now_ns) / SECOND_NS, 0.0) or ramp.lasts_s
         text = f"gain ramp {ramp.id} is under way; wait for it, {left_s:.0f} s"
         yield RunningOperation(OperationKind.RAMPING, f"{text}, or open the loop to end it")
-    if state.acquisition.under_way:
-        text = f"an acquisition is under way ({state.acquisition.text}); wait for it, or abort it"
+    if state.operations.acquisition.under_way:
+        doing = state.operations.acquisition.text
+        text = f"an acquisition is under way ({doing}); wait for it, or abort it"
         yield RunningOperation(OperationKind.ACQUIRING, text)
 
 
 def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     """Yield the dither that plays, followed or not; one that was told to stop does no more."""
-    known = None if state.dither is None else state.dither.id
-    told = now_ns - state.dither_policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
-    seen = None if state.rtc is None or told else state.rtc.dither_id
+    known = None if state.dithers.dither is None else state.dithers.dither.id
+    told = now_ns - state.dithers.policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
+    seen = None if state.loop.rtc is None or told else state.loop.rtc.dither_id
     playing = known or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
     if playing is not None:
         own = playing.startswith(OWN_DITHER)
@@ -98,11 +99,11 @@ def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
 
 
 def _of_matrices(state: TrackerState) -> Iterator[RunningOperation]:
-    if state.making_since_ns_utc is not None:
+    if state.matrices.making_since_ns_utc is not None:
         yield RunningOperation(
             OperationKind.MAKING, "a reconstructor is being computed; wait for it"
         )
-    for record in state.reconstructors:
+    for record in state.matrices.reconstructors:
         if record.on_its_way:
             text = f"reconstructor {record.id} is on its way to the RTC; wait for it"
             yield RunningOperation(OperationKind.SENDING, text)
@@ -192,7 +193,7 @@ def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
         operation, because = ServiceState.NOT_READY, hindered
     elif serious is not None:
         operation, because = ServiceState.DEGRADED, serious.text
-    elif state.stopped_because:
+    elif state.operator.stopped_because:
         operation = ServiceState.READY
     elif occupation in {CurrentOperation.IDLE, CurrentOperation.HOLD, CurrentOperation.TRACKING}:
         idle = _why_nothing_to_do(state)
@@ -204,21 +205,23 @@ def _current_operation(state: TrackerState, now_ns: int) -> tuple[CurrentOperati
     for running in under_way(state, now_ns):
         if running.kind in OPERATION_OF:
             return OPERATION_OF[running.kind], running.text
-    if state.mode is Mode.HOLD:
+    if state.operator.mode is Mode.HOLD:
         return CurrentOperation.HOLD, "mode is hold: nothing is made or sent unless asked for"
     if _why_nothing_to_do(state):
         return CurrentOperation.IDLE, "there is no closed loop"
-    if state.registration is None:
+    if state.alpha.registration is None:
         return CurrentOperation.IDLE, "α is not known yet: no window has been accepted"
     return CurrentOperation.TRACKING, "α is known and the loop is closed"
 
 
 def _why_nothing_to_do(state: TrackerState) -> str:
-    rtc = state.rtc
+    rtc = state.loop.rtc
     if rtc is None:
         return NO_RTC
     return "" if rtc.in_loop else why_open(rtc)
 
 
 def _first(state: TrackerState, severity: Severity) -> Alarm | None:
-    return next((alarm for alarm in state.alarms if alarm.definition.severity is severity), None)
+    return next(
+        (alarm for alarm in state.alarms.active if alarm.definition.severity is severity), None
+    )

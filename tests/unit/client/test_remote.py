@@ -22,10 +22,12 @@ from service.archive.recordings import RecordingRecord
 from service.errors import CommandError
 from service.runtime.recording import Channel
 from service.runtime.snapshot import Snapshot
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import AcquisitionStage, Mode
+from service.tracking.state import Mode
 from service.web.connections import server_config
+from tests.states import changed
 from tests.unit.test_api import LINK, MATRIX, SECOND, STATE, FakeService
 from tests.unit.tracking.situations import ALL_SHOWN, POLICY
 
@@ -82,10 +84,10 @@ def service(served, monkeypatch):
     service, url = served
     monkeypatch.setenv("PYRCAL_URL", url)
     monkeypatch.setattr(orders, "time", clock())
-    tracker = replace(
+    tracker = changed(
         STATE,
-        reconstructors=(BEFORE, *STATE.reconstructors),
-        verified_ids=frozenset({STATE.rtc.cm_id}),
+        reconstructors=(BEFORE, *STATE.matrices.reconstructors),
+        verified_ids=frozenset({STATE.loop.rtc.cm_id}),
         mode_proof=ALL_SHOWN,
     )
     service.now = Snapshot(
@@ -109,7 +111,7 @@ def becomes(service, name, state):
     """What an order would lead to: a reconstructor is in another state."""
     known = (
         replace(one, state=state) if one.id == name else one
-        for one in service.now.tracker.reconstructors
+        for one in service.now.tracker.matrices.reconstructors
     )
     service.change(reconstructors=tuple(known))
 
@@ -257,7 +259,7 @@ def test_what_goes_out_again_is_followed_until_the_rtc_has_applied_it(
     capsys, service, monkeypatch, words
 ):
     copy = replace(BEFORE, id="cm-2", parent="cm-0", state=MatrixState.STAGED)
-    known = service.now.tracker.reconstructors
+    known = service.now.tracker.matrices.reconstructors
     coming = iter((known, (*known, copy), (*known, replace(copy, state=MatrixState.APPLIED))))
     at_the_next_look(monkeypatch, lambda: service.change(reconstructors=next(coming)))
     assert main([*words, "--yes"]) == 0
@@ -273,7 +275,7 @@ def test_an_rtc_that_never_applies_it_is_not_waited_for_for_ever(capsys, service
 
 
 def at(service, stage):
-    service.change(acquisition=replace(STATE.acquisition, stage=stage, text="so far"))
+    service.change(acquisition=replace(STATE.operations.acquisition, stage=stage, text="so far"))
 
 
 @pytest.mark.parametrize(

@@ -5,16 +5,16 @@ import json
 import socket
 import threading
 from contextlib import contextmanager
-from dataclasses import replace
 
 import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.client.status import status_lines
 from service.runtime.snapshot import Snapshot
-from service.tracking.state import Level, LogEntry, TrackerState
+from service.tracking.state import Level, LogEntry
 from service.web.views import STATE as STATE_VIEW
 from service.web.views import to_json
+from tests.states import changed, tracker_state
 from tests.unit.test_api import LINK, SECOND, STATE
 from tests.unit.tracking.situations import POLICY
 
@@ -23,7 +23,7 @@ def told(tracker=STATE, *, ready=True, **changes):
     """What the service would answer."""
     snapshot = Snapshot(
         policy=POLICY,
-        tracker=replace(tracker, **changes),
+        tracker=changed(tracker, **changes),
         link=LINK,
         now_ns=100 * SECOND,
         started_ns=40 * SECOND,
@@ -76,7 +76,7 @@ def test_it_says_why_the_last_window_was_refused():
 
 
 def test_a_service_that_knows_nothing_says_so():
-    text = "\n".join(status_lines(told(TrackerState(system="small", mode=STATE.mode))))
+    text = "\n".join(status_lines(told(tracker_state(system="small", mode=STATE.operator.mode))))
     assert "none has been heard" in text
     assert "not known yet" in text
     assert "unknown in use, not judged" in text
@@ -113,7 +113,7 @@ def answering(body, status=200):
 
 @pytest.mark.parametrize(
     ("state", "status"),
-    [(told(alarms=()), 0), (told(), 1), (told(ready=False, alarms=()), 1)],
+    [(told(active=()), 0), (told(), 1), (told(ready=False, active=()), 1)],
 )
 def test_the_exit_status_says_whether_all_is_well(capsys, state, status):
     with answering(json.dumps(state).encode()) as url:

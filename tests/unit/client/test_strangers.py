@@ -117,7 +117,7 @@ def test_half_a_file_is_none(capsys, tmp_path):
 
 
 def test_the_key_is_sent_where_there_is_one(tmp_path, monkeypatch):
-    state = said(json.dumps(told(alarms=())).encode())
+    state = said(json.dumps(told(active=())).encode())
     file = tmp_path / "key"
     file.write_text("from-file\n", encoding="ascii")
     with saying(state, state, state) as (url, asked):

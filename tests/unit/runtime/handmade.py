@@ -4,8 +4,8 @@ import numpy as np
 
 from service.model.misregistration import Misregistration
 from service.tracking.registration import Registration
-from service.tracking.state import TrackerState
 from service.wire import Reply, layout_of
+from tests.states import tracker_state
 from tests.unit.runtime.small import N_CONTROLLED, SIGMA
 from tests.unit.tracking.situations import START_NS, foreign, rtc
 
@@ -29,7 +29,7 @@ REGISTRATION = Registration(
     n_windows=2,
     optical_gain=0.6,
 )
-STATE = TrackerState(
+STATE = tracker_state(
     system="small",
     rtc=RTC,
     registration=REGISTRATION,

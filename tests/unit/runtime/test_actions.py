@@ -19,6 +19,7 @@ from service.wire import (
     checksum,
     layout_of,
 )
+from tests.states import changed
 from tests.unit.runtime.handmade import (
     ALPHA,
     BROUGHT,
@@ -41,8 +42,8 @@ pytestmark = pytest.mark.timeout(60)
 async def made(actions, n_modes=N_CONTROLLED, state=STATE):
     """Make a reconstructor; return its record and the state that knows it."""
     event = await actions.perform(ev.MakeMatrix(n_modes=n_modes, why="a test"), state)
-    shelf = (*state.reconstructors, event.record)
-    return event.record, replace(state, reconstructors=shelf)
+    shelf = (*state.matrices.reconstructors, event.record)
+    return event.record, changed(state, reconstructors=shelf)
 
 
 async def test_a_made_reconstructor_is_archived_before_anybody_hears_of_it(
@@ -67,7 +68,7 @@ async def test_every_reconstructor_has_an_id_of_its_own(actions):
 
 async def test_a_loop_that_no_matrix_can_hold_makes_a_refused_record(actions):
     wild = replace(RTC, gains=(1.9,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED))
-    found, _ = await made(actions, state=replace(STATE, rtc=wild))
+    found, _ = await made(actions, state=changed(STATE, rtc=wild))
     assert found.state is MatrixState.REFUSED
     assert "unstable" in found.gate.reason
 
@@ -87,7 +88,7 @@ async def test_more_modes_are_judged_with_the_gains_they_would_get(actions):
 )
 async def test_what_it_takes_to_make_one_must_be_there(actions, changes, error, match):
     with pytest.raises(error, match=match):
-        await made(actions, state=replace(STATE, **changes))
+        await made(actions, state=changed(STATE, **changes))
 
 
 async def test_sending_the_same_number_of_modes_needs_no_command(actions, bridge):
@@ -156,7 +157,7 @@ async def test_a_copy_has_the_same_numbers_a_new_id_and_a_new_verdict(actions, a
 async def test_a_copy_that_cannot_be_judged_says_so(actions, changes, unknown):
     source, state = await made(actions)
     copied = ev.RepublishMatrix(source=source.id, why="back")
-    copy = (await actions.perform(copied, replace(state, **changes))).record
+    copy = (await actions.perform(copied, changed(state, **changes))).record
     assert (copy.gate, copy.state) == (None, MatrixState.PROPOSED)
     assert copy.reason.startswith(f"back; the gate could not judge it: {unknown}")
 
@@ -165,12 +166,12 @@ async def test_a_copy_that_would_not_hold_the_loop_any_more_is_refused(actions):
     source, state = await made(actions)
     far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
     event = await actions.perform(
-        ev.RepublishMatrix(source=source.id, why="back"), replace(state, registration=far)
+        ev.RepublishMatrix(source=source.id, why="back"), changed(state, registration=far)
     )
     assert event.record.state is MatrixState.REFUSED
     event = await actions.perform(
         ev.RepublishMatrix(source=source.id, why="back", anyway=True),
-        replace(state, registration=far),
+        changed(state, registration=far),
     )
     assert (event.record.state, event.record.gate, event.anyway) == (
         MatrixState.PROPOSED,
@@ -185,7 +186,7 @@ async def test_the_margin_is_judged_at_the_registration_of_now(actions):
     event = await actions.perform(ev.JudgeMatrix(id=found.id), state)
     assert (event.id, event.verdict.accepted) == (found.id, True)
     far = replace(REGISTRATION, alpha=Misregistration(rotation_rad=0.5))
-    event = await actions.perform(ev.JudgeMatrix(id=found.id), replace(state, registration=far))
+    event = await actions.perform(ev.JudgeMatrix(id=found.id), changed(state, registration=far))
     assert not event.verdict.accepted
 
 
@@ -207,7 +208,7 @@ async def test_another_matrix_under_a_known_id_is_not_taken_for_the_same(actions
 
 async def test_other_numbers_under_an_id_the_tracker_knows_are_for_it_to_distrust(actions, bridge):
     event = await actions.perform(ev.FetchMatrix(id="initial"), STATE)
-    state = replace(STATE, reconstructors=(event.record,))
+    state = changed(STATE, reconstructors=(event.record,))
     other = BROUGHT * 2
     bridge.applied = (foreign().manifest(layout_of(other, 4096), RTC, "small"), other)
     found = await actions.perform(ev.FetchMatrix(id="initial"), state)
@@ -238,7 +239,7 @@ async def test_the_matrix_in_use_is_offered_to_an_rtc_that_comes_late(actions, b
 
 
 async def test_nothing_is_offered_while_none_is_in_use(actions, bridge):
-    actions.offer(replace(STATE, in_use=None))
+    actions.offer(changed(STATE, in_use=None))
     assert not bridge.offered
 
 

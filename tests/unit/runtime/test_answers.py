@@ -11,6 +11,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import AckState, Pattern, Reply
+from tests.states import changed
 from tests.unit.tracking.operations.test_running import (
     acquiring,
     gathering,
@@ -71,7 +72,7 @@ SILENT = "sent, the RTC has not answered yet"
 
 def test_an_approval_tells_the_frame():
     world = sending()
-    name = world.state.reconstructors[-1].id
+    name = world.state.matrices.reconstructors[-1].id
     order = CarriedOut(cmd.Approve(id=name), world.state, world.state)
     first, last = answered_in_the_end(world, order)
     assert first == (f"{name} {SILENT}", False)
@@ -85,7 +86,7 @@ def test_a_rollback_tells_which_one_went_out_under_which_name_and_that_it_is_hol
     order = given(world, cmd.Rollback())
     first, last = answered_in_the_end(world, order)
     assert first == ("initial is being judged before it is sent again", False)
-    new = world.state.reconstructors[-1]
+    new = world.state.matrices.reconstructors[-1]
     assert new.parent == "initial"
     frame = new.applied_frame_seq
     words = f"{new.id} sent, applied at frame {frame}; it is initial again; mode is hold"
@@ -100,7 +101,7 @@ def test_a_copy_that_may_not_be_sent_now_is_said_to_be_kept_and_why():
     )
     world.pass_(2.0)
     (text, final) = told(order, world)
-    new = world.state.reconstructors[-1].id
+    new = world.state.matrices.reconstructors[-1].id
     assert text.startswith(f"{new} is proposed and not sent: the RTC's matrix is of other slopes")
     assert final
 
@@ -135,7 +136,7 @@ def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
 )
 def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
     world = sending()
-    name = world.state.reconstructors[-1].id
+    name = world.state.matrices.reconstructors[-1].id
     order = CarriedOut(cmd.Approve(id=name), world.state, world.state)
     world.pending.clear()
     if state is None:
@@ -148,13 +149,13 @@ def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
 
 def test_what_the_gate_refuses_at_the_last_moment_is_a_refusal():
     world = sending()
-    record = world.state.reconstructors[-1]
+    record = world.state.matrices.reconstructors[-1]
     order = CarriedOut(cmd.Approve(id=record.id), world.state, world.state)
     refused = MatrixState.REFUSED
     reason = verdict(accepted=False).reason
-    changed = replace(record, state=refused, reason=reason)
-    others = tuple(r for r in world.state.reconstructors if r.id != record.id)
-    now = replace(world.state, reconstructors=(*others, changed))
+    refused_record = replace(record, state=refused, reason=reason)
+    others = tuple(r for r in world.state.matrices.reconstructors if r.id != record.id)
+    now = changed(world.state, reconstructors=(*others, refused_record))
     with pytest.raises(CommandError, match=f"the gate refused {record.id}: {reason}"):
         order.result(now)
 
@@ -165,7 +166,7 @@ def test_a_dither_tells_its_first_frame_and_its_cost():
     first, (text, final) = answered_in_the_end(world, order, 0.5)
     assert SILENT in first[0]
     assert not first[1]
-    start_seq = world.state.dither.start_seq
+    start_seq = world.state.dithers.dither.start_seq
     assert text.endswith(f"plays from frame {start_seq}: 2 nm RMS in all, budget 8 nm")
     assert final
 
@@ -173,7 +174,7 @@ def test_a_dither_tells_its_first_frame_and_its_cost():
 def test_a_dither_the_rtc_will_not_play_is_a_refusal():
     world = idle()
     order = given(world, cmd.StartDither())
-    request = world.state.dither.request
+    request = world.state.dithers.dither.request
     reply = Reply(id=request.id, accepted=False, reason="busy: other", start_seq=None)
     world.tell(ev.Answered(request=request, reply=reply))
     with pytest.raises(CommandError, match="the RTC refused the dither: busy: other"):

@@ -84,9 +84,9 @@ class Leaping(World):
 
 def seconds_to_a_window(world):
     """Live until a window has been accepted; return how long that took, at most a minute."""
-    before = world.state.windows_accepted
+    before = world.state.windows.accepted
     for k in range(120):
-        if world.state.windows_accepted > before:
+        if world.state.windows.accepted > before:
             return 0.5 * k
         world.pass_(0.5)
     return 60.0
@@ -97,7 +97,7 @@ def after_an_hour_ahead_and_back(world):
     world.pass_(20)
     world.machine.set_ns += HOUR
     world.pass_(30)
-    refused = dither_answered(world.state.dither.id, accepted=False, reason="busy: ramp")
+    refused = dither_answered(world.state.dithers.dither.id, accepted=False, reason="busy: ramp")
     world.playing = None
     world.tell(refused)
     world.pass_(9)

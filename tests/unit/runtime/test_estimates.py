@@ -40,7 +40,7 @@ async def test_a_look_is_taken_though_alpha_is_not_known(sums):
     worker, story = Worker(), Story(Mode.HOLD).meet()
     event = await fit_passive(sums, story.state, worker)
     assert worker.begun_at == [None]
-    assert event.loop == loop_numbers(story.state.rtc)
+    assert event.loop == loop_numbers(story.state.loop.rtc)
     assert event.t_ns_utc == sums.tail.t0_ns_utc + 39 * sums.tail.dt_ns
     story.tell(event)
     await fit_passive(sums, story.state, worker)

@@ -1,7 +1,5 @@
 """The noisy interaction matrix from windows to archive and picture, on a small instrument."""
 
-from dataclasses import replace
-
 import h5py
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MeasurementRecord, MeasureState
-from service.tracking.state import TrackerState
+from tests.states import changed, tracker_state
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc
 
@@ -40,7 +38,7 @@ RUNNING = MeasurementRecord(
     basis_id="kl",
     config_id="b1",
 )
-STATE = TrackerState(system="small", measurements=(RUNNING,))
+STATE = tracker_state(system="small", measurements=(RUNNING,))
 
 
 class NearCrew:
@@ -122,8 +120,8 @@ async def test_windows_of_another_dither_or_of_a_loop_out_of_hand_do_not_count(d
     (other,) = windows(workers, n=1, modes=MODES[:5])
     desk.take(other, STATE)
     (window,) = windows(workers, n=1)
-    desk.take(window, replace(STATE, measurements=()))
-    desk.take(window, replace(STATE, alarms=(DIVERGING,)))
+    desk.take(window, changed(STATE, measurements=()))
+    desk.take(window, changed(STATE, active=(DIVERGING,)))
     with pytest.raises(CommandError, match="no window of its dither was whole"):
         await desk.finish(RUNNING, STATE)
 
@@ -153,7 +151,7 @@ async def test_nothing_that_publishes_finds_one(workers, archive):
     await finish(actions.noisy, workers)
     with pytest.raises(UnknownIdError):
         actions.matrix("noisy-1")
-    state = replace(STATE, rtc=rtc())
+    state = changed(STATE, rtc=rtc())
     for effect in (
         ev.SendMatrix(id="noisy-1", n_modes=30, gains=None),
         ev.RepublishMatrix(source="noisy-1", why="a mistake"),

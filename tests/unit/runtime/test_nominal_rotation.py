@@ -14,8 +14,10 @@ from service.runtime.supervisor import Supervisor
 from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
-from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.acquisition_state import AcquisitionStage
+from service.tracking.state import Mode
 from studies.campaign.observatory import Observatory
+from tests.states import tracker_state
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 from tests.unit.runtime.test_supervisor import running
 from tests.unit.tracking.situations import POLICY, estimate, rtc
@@ -50,8 +52,8 @@ def test_alpha_is_tracked_and_no_healthy_loop_is_opened(turned):
         bench = OpticsWorker(load_instrument(str(turned)), COMPUTE)
         night = Observatory(words, policy, Mode.AUTO, bench, with_poles=False)
         night.advance(10.0)
-    assert night.state.acquisition.stage is AcquisitionStage.IDLE
-    registration = night.state.registration
+    assert night.state.operations.acquisition.stage is AcquisitionStage.IDLE
+    registration = night.state.alpha.registration
     assert registration.n_windows >= 3
     error = registration.alpha.vector - night.dome.alpha.vector
     assert (np.abs(error) < 5.0 * registration.sigma).all()
@@ -73,7 +75,7 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
             clock_ns=lambda: 5,
         )
         supervisor = Supervisor(
-            state=TrackerState(system="small", mode=Mode.HOLD),
+            state=tracker_state(system="small", mode=Mode.HOLD),
             policy=POLICY,
             bridge=bridge,
             workers=workers,
@@ -85,6 +87,6 @@ async def test_the_running_service_has_it_from_the_instrument_file(turned, tmp_p
             supervisor._post(rtc())
             near = Misregistration(rotation_rad=np.deg2rad(NOMINAL_DEG + 0.2))
             supervisor._post(ev.WindowFitted(estimate=estimate(near)))
-            registration = supervisor.snapshot().tracker.registration
+            registration = supervisor.snapshot().tracker.alpha.registration
     workers.close()
     assert registration.alpha == near

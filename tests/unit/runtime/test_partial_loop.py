@@ -46,28 +46,28 @@ def night():
 
 
 def test_alpha_is_tracked_and_a_matrix_made_for_it_is_in_use(night):
-    assert night.state.rtc.loop == "partial"
-    assert len(night.state.rtc.in_loop) == N_CONTROLLED - 15
-    known = night.state.registration
+    assert night.state.loop.rtc.loop == "partial"
+    assert len(night.state.loop.rtc.in_loop) == N_CONTROLLED - 15
+    known = night.state.alpha.registration
     assert known.n_windows > 5
     error = known.alpha.vector - night.dome.alpha.vector
     assert (np.abs(error) < 5.0 * known.sigma).all()
-    assert not night.state.alarms
+    assert not night.state.alarms.active
     assert night.swaps
     assert all(swap.time_s > 2.0 for swap in night.swaps)
 
 
 def test_the_gate_judges_the_modes_that_move_by_the_bound_it_was_given(night):
-    made = night.state.reconstructor(night.state.in_use)
+    made = night.state.reconstructor(night.state.matrices.in_use)
     assert made.gate.accepted
     assert made.gate.bound == 0.95
     assert made.gate.worst_pole_radius < 0.9
 
 
 def test_ordinary_telemetry_is_looked_at_and_agrees(night):
-    looks = [entry for entry in night.state.history if entry.source is Source.PASSIVE]
+    looks = [entry for entry in night.state.alpha.history if entry.source is Source.PASSIVE]
     assert looks
-    assert night.state.passive.consistent
+    assert night.state.alpha.passive.consistent
 
 
 @pytest.fixture

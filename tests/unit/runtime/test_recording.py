@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-from dataclasses import replace
 
 import pytest
 
@@ -13,6 +12,7 @@ from service.tracking import events as ev
 from service.tracking.registration import OffloadState
 from service.tracking.state import Level, LogEntry, TrackerState
 from service.wire import OffloadRequest
+from tests.states import changed
 from tests.system.pace import patience
 from tests.unit.test_archive_nights import NOON, entry
 from tests.unit.tracking.test_offload import a_story
@@ -29,7 +29,7 @@ def measured(recorder, first, last):
     """Have the tracker take in estimates one by one."""
     every = tuple(entry(NOON + k) for k in range(last))
     for n_known in range(first, last):
-        before, after = (replace(EMPTY, history=every[:n]) for n in (n_known, n_known + 1))
+        before, after = (changed(EMPTY, history=every[:n]) for n in (n_known, n_known + 1))
         recorder.changed(before, after, ())
 
 
@@ -62,7 +62,7 @@ async def test_two_estimates_of_one_event_keep_their_order_when_the_oldest_are_f
     recorder, archive
 ):
     every = tuple(entry(NOON + k) for k in range(5))
-    before, after = replace(EMPTY, history=every[:3]), replace(EMPTY, history=every[2:])
+    before, after = changed(EMPTY, history=every[:3]), changed(EMPTY, history=every[2:])
     recorder.changed(before, after, ())
     recorder.close()
     assert kept(archive) == [3, 4]
@@ -111,15 +111,15 @@ class TestDemandToMoveTheImage:
 
     async def test_a_write_that_began_before_it_does_not_come_after_it(self, archive, monkeypatch):
         story = a_story()
-        states = [replace(story.state, offload=None), story.state]
+        states = [changed(story.state, offload=None), story.state]
         (asked,) = story.asked(OffloadRequest)
         writing, go_on, written = threading.Event(), threading.Event(), []
 
         def slowly(_archive, state, _now_ns):
-            if state.offload is None:
+            if state.alpha.offload is None:
                 writing.set()
                 assert go_on.wait(patience(20.0))
-            written.append(state.offload)
+            written.append(state.alpha.offload)
 
         monkeypatch.setattr(recording, "leave", slowly)
         recorder = Recorder(archive, lambda: states[0], lambda event: None)
@@ -130,4 +130,4 @@ class TestDemandToMoveTheImage:
         await asyncio.wait({second}, timeout=0.2)
         go_on.set()
         await asyncio.gather(first, second)
-        assert written == [None, story.state.offload]
+        assert written == [None, story.state.alpha.offload]

@@ -1,6 +1,5 @@
 """What a service leaves on the disk and when, and a small telescope whose service is restarted."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,10 +14,12 @@ from service.runtime.recording import is_unsaved, is_urgent, leave, taken_up
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.resume import restored
-from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.state import Mode, TrackerState
 from studies.campaign.acquisition import Start
 from studies.campaign.observatory import Observatory
+from tests.states import changed, tracker_state
 from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import START_NS
 
@@ -41,7 +42,10 @@ class TestWhatCannotWait:
     @pytest.mark.parametrize("order", [cmd.SetMode(mode=Mode.HOLD), cmd.StopDither()])
     def test_what_an_operator_orders_and_takes_back(self, order):
         story = Acquiring()
-        back = {"SetMode": cmd.SetMode(mode=story.state.mode), "StopDither": cmd.StartDither()}
+        back = {
+            "SetMode": cmd.SetMode(mode=story.state.operator.mode),
+            "StopDither": cmd.StartDither(),
+        }
         for command in (order, back[type(order).__name__]):
             before = story.state
             story.tell(command)
@@ -74,8 +78,8 @@ def test_the_alpha_on_the_disk_goes_when_an_acquisition_forgets_it(tmp_path):
         story.tell(cmd.Acquire())
         leave(archive, story.state, story.now_ns)
         state = taken_up(archive, TrackerState(system="flao"), story.policy, story.now_ns)
-    assert state.registration is None
-    assert state.acquisition.stage is AcquisitionStage.INTERRUPTED
+    assert state.alpha.registration is None
+    assert state.operations.acquisition.stage is AcquisitionStage.INTERRUPTED
 
 
 def test_nothing_is_written_over_what_another_night_has_left(tmp_path):
@@ -95,35 +99,35 @@ def test_orders_are_left_beside_the_alpha_of_another_night_and_taken_back_there(
         story = Acquiring()
         story.see(n_windows=3)
         leave(archive, story.state, story.now_ns)
-        fresh = TrackerState(system="flao", mode=Mode.AUTO)
-        leave(archive, replace(fresh, dither_stopped=True), START_NS)
+        fresh = tracker_state(system="flao", mode=Mode.AUTO)
+        leave(archive, changed(fresh, stopped=True), START_NS)
         ordered = archive.tracking.read()
         assert ordered.orders.dither_stopped
-        assert ordered.registration.alpha == story.state.registration.alpha
+        assert ordered.registration.alpha == story.state.alpha.registration.alpha
         leave(archive, fresh, START_NS)
         state = taken_up(archive, fresh, story.policy, story.now_ns)
-    assert state.registration is not None
-    assert not state.dither_stopped
+    assert state.alpha.registration is not None
+    assert not state.dithers.stopped
 
 
 def test_orders_are_left_where_nothing_else_is_and_taken_back_there(tmp_path):
-    fresh = TrackerState(system="flao", mode=Mode.AUTO)
+    fresh = tracker_state(system="flao", mode=Mode.AUTO)
     with Archive(tmp_path) as archive:
         archive.open()
         story = Acquiring()
         for stopped in (True, False):
-            leave(archive, replace(fresh, dither_stopped=stopped), START_NS)
+            leave(archive, changed(fresh, stopped=stopped), START_NS)
             state = taken_up(archive, fresh, story.policy, START_NS)
-            assert state.dither_stopped is stopped
+            assert state.dithers.stopped is stopped
 
 
 def test_what_another_system_has_left_is_neither_read_nor_kept(tmp_path):
-    fresh = TrackerState(system="flao", mode=Mode.AUTO)
+    fresh = tracker_state(system="flao", mode=Mode.AUTO)
     with Archive(tmp_path) as archive:
         archive.open()
-        leave(archive, replace(fresh, system="other", dither_stopped=True), START_NS)
-        assert not taken_up(archive, fresh, Acquiring().policy, START_NS).dither_stopped
-        leave(archive, replace(fresh, dither_stopped=True), START_NS)
+        leave(archive, changed(fresh, system="other", stopped=True), START_NS)
+        assert not taken_up(archive, fresh, Acquiring().policy, START_NS).dithers.stopped
+        leave(archive, changed(fresh, stopped=True), START_NS)
         assert archive.tracking.read().system == "flao"
 
 
@@ -136,8 +140,8 @@ class Restartable(Observatory):
         self._agenda.clear()
         self._link.sent.clear()
         self._fitting, self._backlog, self._worker_free_ns = False, PendingWindow(), 0
-        shelf = restored(old.reconstructors)
-        fresh = TrackerState(system=old.system, mode=mode, reconstructors=shelf)
+        shelf = restored(old.matrices.reconstructors)
+        fresh = tracker_state(system=old.system, mode=mode, reconstructors=shelf)
         policy = self._engine.policy
         self._engine = Engine(taken_up(archive, fresh, policy, now_ns), policy, self)
         self._engine.set_description(bench.describe())
@@ -145,7 +149,7 @@ class Restartable(Observatory):
 
     def until(self, stage, within_s=30.0):
         over_s = self.time_s + within_s
-        while self.state.acquisition.stage is not stage:
+        while self.state.operations.acquisition.stage is not stage:
             assert self.time_s < over_s, [entry.text for entry in self.state.log]
             self.advance(0.05)
 
@@ -176,12 +180,12 @@ def interrupted(bench, tmp_path):
 def test_the_next_service_ends_tracking_where_the_mirror_is(interrupted):
     night = interrupted(AcquisitionStage.CONFIRMING, Mode.AUTO)
     assert not night.dome.moments[-1].closed
-    assert night.state.acquisition.stage is AcquisitionStage.INTERRUPTED
+    assert night.state.operations.acquisition.stage is AcquisitionStage.INTERRUPTED
     night.until(AcquisitionStage.TRACKING)
     assert night.dome.moments[-1].closed
-    assert night.state.acquisition.attempt == 2
-    error = night.state.registration.alpha.vector - night.dome.alpha.vector
-    assert (abs(error) < 5.0 * night.state.registration.sigma).all()
+    assert night.state.operations.acquisition.attempt == 2
+    error = night.state.alpha.registration.alpha.vector - night.dome.alpha.vector
+    assert (abs(error) < 5.0 * night.state.alpha.registration.sigma).all()
     assert all(swap.radius < 0.95 for swap in night.swaps)
 
 
@@ -191,7 +195,7 @@ def test_one_that_may_not_leaves_the_loop_open_and_asks_nothing_of_the_rtc(inter
     night.advance(3.0)
     assert not night.dome.moments[-1].closed
     assert len(night.dome.orders) == n_orders
-    assert "the mode is propose" in night.state.acquisition.text
+    assert "the mode is propose" in night.state.operations.acquisition.text
 
 
 def test_one_whose_loop_had_just_been_closed_goes_on_from_there(interrupted):
@@ -199,7 +203,7 @@ def test_one_whose_loop_had_just_been_closed_goes_on_from_there(interrupted):
     matrix = night.dome.moments[-1].cm_id
     night.advance(2.0)
     assert night.dome.moments[-1].closed
-    assert night.state.acquisition.stage is AcquisitionStage.ABORTED
-    assert matrix in night.state.acquisition.text
-    error = night.state.registration.alpha.vector - night.dome.alpha.vector
-    assert (abs(error) < 5.0 * night.state.registration.sigma).all()
+    assert night.state.operations.acquisition.stage is AcquisitionStage.ABORTED
+    assert matrix in night.state.operations.acquisition.text
+    error = night.state.alpha.registration.alpha.vector - night.dome.alpha.vector
+    assert (abs(error) < 5.0 * night.state.alpha.registration.sigma).all()

@@ -28,8 +28,8 @@ from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.dither_request import Dither
 from service.tracking.products import MatrixState
-from service.tracking.state import TrackerState
 from service.wire import DitherKind, DitherRequest
+from tests.states import changed, tracker_state
 from tests.unit.estimation import test_loopcheck as loops
 from tests.unit.runtime import handmade
 from tests.unit.tracking.situations import POLICY, START_NS, foreign, rtc
@@ -434,12 +434,12 @@ class TestVibrations:
 
     def test_a_line_is_heard_within_seconds_and_told_once(self, streams):
         streams = with_dither(streams, None, WINDOW_S)
-        state = TrackerState(system="flao", rtc=RTC)
+        state = tracker_state(system="flao", rtc=RTC)
         for number in range(130):
             streams, _ = process_block(streams, self.shaken(100 * number))
         (told,) = [e for e in detect_changes(0.0, streams, state) if isinstance(e, ev.Vibrations)]
         np.testing.assert_allclose(told.lines_hz, [130.0], atol=1.0)
-        known = replace(state, vibrations_hz=told.lines_hz)
+        known = changed(state, vibrations_hz=told.lines_hz)
         assert not [e for e in detect_changes(0.0, streams, known) if isinstance(e, ev.Vibrations)]
 
     def test_an_open_loop_is_not_listened_to(self, streams):
@@ -525,8 +525,10 @@ class TestLooks:
                 return START_NS
 
         since_ns = START_NS - round(age_s * 1e9)
-        registration = replace(handmade.STATE.registration, window_ns_utc=since_ns, doubt=doubt)
-        engine = Engine(replace(handmade.STATE, registration=registration), POLICY, Driver())
+        registration = replace(
+            handmade.STATE.alpha.registration, window_ns_utc=since_ns, doubt=doubt
+        )
+        engine = Engine(changed(handmade.STATE, registration=registration), POLICY, Driver())
         engine.bank, _ = play(streams, 0, 40)
         assert engine.take_sums().n_effective > 1000
         assert engine.bank.passive.from_seq == 4000 + 1000 * rest_s
@@ -607,7 +609,7 @@ class TestStrengthOfTheDither:
         assert "0.25 nm were asked for" in windows[0].reason
 
     def test_it_is_news_once_and_again_when_it_is_over(self, streams):
-        state = TrackerState(system="s", rtc=RTC)
+        state = tracker_state(system="s", rtc=RTC)
         asked = played(amplitude_m=(5e-9 / 20,))
         streams = with_dither(
             with_rtc(EstimatorBank(description=DESCRIPTION), RTC), asked, WINDOW_S
@@ -617,8 +619,8 @@ class TestStrengthOfTheDither:
             e for e in detect_changes(0.0, streams, state) if isinstance(e, ev.DitherMeasured)
         ]
         assert told.found_m == pytest.approx(5e-9, rel=0.01)
-        told_of = replace(state.dither_policy, amiss_id=told.id, amiss_m=told.found_m)
-        state = replace(state, dither_policy=told_of)
+        told_of = replace(state.dithers.policy, amiss_id=told.id, amiss_m=told.found_m)
+        state = changed(state, policy=told_of)
         assert not [
             e for e in detect_changes(0.0, streams, state) if isinstance(e, ev.DitherMeasured)
         ]
@@ -675,14 +677,14 @@ def test_frames_wait_only_while_alpha_is_followed_and_nothing_else_happens():
             return START_NS
 
     def gathered_s(**changes):
-        return Engine(replace(handmade.STATE, **changes), POLICY, Driver()).gather_s
+        return Engine(changed(handmade.STATE, **changes), POLICY, Driver()).gather_s
 
     assert gathered_s() == gathered_s(dither=DITHER) == STEADY_GATHER_S
     sent = replace(foreign(), id="cm-2", state=MatrixState.PUBLISHED)
     alarm = Alarm(name="edge-slip", since_ns_utc=START_NS, text="")
     for changes in (
         {"registration": None},
-        {"alarms": (alarm,)},
+        {"active": (alarm,)},
         {"making_since_ns_utc": START_NS},
         {"reconstructors": (foreign(), sent)},
     ):
@@ -706,7 +708,7 @@ def test_estimators_follow_the_rtc_again_after_a_look_that_fails(streams, monkey
     def broken(streams, block):
         raise ValueError("an inhomogeneous shape")
 
-    engine = Engine(replace(handmade.STATE, rtc=RTC), POLICY, Driver())
+    engine = Engine(changed(handmade.STATE, rtc=RTC), POLICY, Driver())
     engine.bank = streams
     monkeypatch.setattr("service.runtime.engine.process_block", broken)
     with pytest.raises(ValueError, match="inhomogeneous"):

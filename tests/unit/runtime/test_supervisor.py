@@ -20,6 +20,7 @@ from service.runtime.supervisor import Supervisor
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.state import Level, LogEntry, Mode, TrackerState
+from tests.states import changed, tracker_state
 from tests.system.cable import free_port
 from tests.system.fake_rtc import client_session
 from tests.system.pace import Deadline, in_time, patience
@@ -40,7 +41,7 @@ def bridge():
 @pytest.fixture
 def supervisor(workers, archive, bridge, actions):
     return Supervisor(
-        state=TrackerState(system="small", mode=Mode.HOLD),
+        state=tracker_state(system="small", mode=Mode.HOLD),
         policy=replace(POLICY),
         bridge=bridge,
         workers=workers,
@@ -81,7 +82,7 @@ async def test_it_is_ready_when_the_model_is(supervisor):
 async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor, archive):
     text = await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
     assert text == "mode is auto"
-    assert supervisor.snapshot().tracker.mode is Mode.AUTO
+    assert supervisor.snapshot().tracker.operator.mode is Mode.AUTO
     (entry,) = archive.audit_trail()  # the answer's own line may take its time
     assert (entry.who, entry.name) == ("operator", "SetMode")
     assert entry.text == '{"mode":"auto"}'
@@ -172,14 +173,14 @@ async def test_alpha_outlives_the_service_that_measured_it(supervisor, archive):
     async with running(supervisor):
         assert archive.tracking.read() is None
     again = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
-    assert again.registration.alpha == before.alpha
-    assert again.registration.n_windows == 0
+    assert again.alpha.registration.alpha == before.alpha
+    assert again.alpha.registration.n_windows == 0
 
 
 async def test_a_damaged_file_costs_alpha_and_not_the_start(archive, tmp_path):
     (tmp_path / "tracking.json").write_text("{")
     state = taken_up(archive, TrackerState(system="small"), POLICY, time.time_ns())
-    assert state.registration is None
+    assert state.alpha.registration is None
     assert "damaged" in state.log[-1].text
     assert (tmp_path / "tracking.damaged").exists()
 
@@ -218,10 +219,10 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
     story = Acquiring()
     story.see(n_windows=3)
     async with running(supervisor):
-        know(supervisor, registration=story.state.registration)
+        know(supervisor, registration=story.state.alpha.registration)
         await until(lambda: archive.tracking.read() is not None)
         story.tell(cmd.Acquire())
-        know(supervisor, registration=None, acquisition=story.state.acquisition)
+        know(supervisor, registration=None, acquisition=story.state.operations.acquisition)
         began = time.monotonic()
         await until(lambda: archive.tracking.read().acquisition is not None)
         assert in_time(began, 0.5)
@@ -239,13 +240,13 @@ async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_for
         await supervisor.submit(cmd.StopDither())
         await until(lambda: archive.tracking.read().orders is not None)
         assert in_time(began, 0.5)
-    again = TrackerState(system="small", mode=Mode.AUTO)
-    assert taken_up(archive, again, POLICY, time.time_ns()).dither_stopped
+    again = tracker_state(system="small", mode=Mode.AUTO)
+    assert taken_up(archive, again, POLICY, time.time_ns()).dithers.stopped
 
 
 def told(story, n_windows):
     story.see(n_windows=n_windows)
-    return story.state.registration
+    return story.state.alpha.registration
 
 
 async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, bridge, monkeypatch):
@@ -253,7 +254,7 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         raise ValueError("an inhomogeneous shape")
 
     async with running(supervisor):
-        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         monkeypatch.setattr("service.runtime.engine.process_block", broken)
         monkeypatch.setattr(
             bridge, "drain", lambda **_: [SimpleNamespace(n_frames=50, dt_ns=10**6)]
@@ -275,7 +276,7 @@ async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, br
         monkeypatch.setattr(bridge, "drain", broken)
         await until(lambda: "internal.error" in [e.name for e in supervisor._engine.state.log])
         monkeypatch.undo()
-        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         await until(lambda: supervisor._engine.bank.rtc is not None)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a ring that is bent" in entry.text
@@ -292,7 +293,7 @@ async def test_frames_are_looked_at_before_what_was_told_after_them(
         return streams, []
 
     async with running(supervisor):
-        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         send(bridge._intake, 0)
         await until(lambda: bridge._intake.events() == [] and not bridge.drain())
         monkeypatch.setattr("service.runtime.engine.process_block", seen)
@@ -317,7 +318,7 @@ async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, br
         monkeypatch.setattr("service.runtime.engine.process_block", slowly)
         monkeypatch.setattr(bridge, "drain", lambda **_: [blocks.pop()] if blocks else [])
         await until(looking.is_set, 20.0)
-        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == "mode is auto"
         assert supervisor._engine.bank.received_ns_utc != 1
         go_on.set()
@@ -373,7 +374,7 @@ def full_disk(archive):
 
 def know(supervisor, **known):
     """Have the service know something that nobody has told it."""
-    supervisor._engine.state = replace(supervisor._engine.state, **known)
+    supervisor._engine.state = changed(supervisor._engine.state, **known)
 
 
 def trail(archive, who):
@@ -382,7 +383,7 @@ def trail(archive, who):
 
 
 def alarm_of(supervisor, name):
-    alarms = supervisor.snapshot().tracker.alarms
+    alarms = supervisor.snapshot().tracker.alarms.active
     return next((alarm for alarm in alarms if alarm.name == name), None)
 
 
@@ -396,7 +397,7 @@ async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, a
         with full_disk(archive):
             with pytest.raises(ArchiveError, match=r"index\.sqlite: .*full \(SQLITE_FULL\)"):
                 await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
-            assert supervisor.snapshot().tracker.mode is Mode.HOLD
+            assert supervisor.snapshot().tracker.operator.mode is Mode.HOLD
             alarm = alarm_of(supervisor, "archive-failed")
             assert "index.sqlite" in alarm.text
             assert "free space" in alarm.text
@@ -439,7 +440,7 @@ async def test_an_index_that_is_damaged_meanwhile_does_not_end_the_service(
             with pytest.raises(ArchiveError, match="move it away"):
                 await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
         await until(lambda: alarm_of(supervisor, "archive-failed") is None)
-        assert supervisor.snapshot().tracker.mode is Mode.HOLD
+        assert supervisor.snapshot().tracker.operator.mode is Mode.HOLD
     assert ("note", "first") in trail(archive, "service")
 
 
@@ -465,9 +466,9 @@ async def test_a_matrix_is_not_sent_while_it_cannot_be_recorded_why(
     matrix = np.zeros((3, 4), np.float32)
     archive.reconstructors.store(record("cm-1", n_modes=3), matrix, None, {})
     story = Story(Mode.HOLD).meet()
-    known = replace(story.state, reconstructors=(record("cm-1", n_modes=3),))
+    known = changed(story.state, reconstructors=(record("cm-1", n_modes=3),))
     supervisor._engine.state = known
-    effect = ev.SendMatrix(id="cm-1", n_modes=known.rtc.n_controlled, gains=None)
+    effect = ev.SendMatrix(id="cm-1", n_modes=known.loop.rtc.n_controlled, gains=None)
     with full_disk(archive):
         supervisor._post(ev.LogEvent(name="why", text="it is sent"))
         await supervisor._do(effect, known)
@@ -515,7 +516,7 @@ async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
 
 async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):
     async with running(supervisor):
-        know(supervisor, rtc=Story(Mode.HOLD).meet().state.rtc)
+        know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         with pytest.raises(PyrcalError):
             await supervisor.submit(cmd.SetLoop(loop="open"))
         await until(lambda: len(trail(archive, "operator")) == 2)

@@ -24,6 +24,7 @@ from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
 from service.tracking.update_policy import fewer_than
 from service.wire import LoopRequest
+from tests.states import changed
 from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
 from tests.unit.runtime.small import COMPUTE, N_CONTROLLED, SIGMA, conditions, small_instrument
 from tests.unit.tracking.situations import START_NS, rtc
@@ -69,7 +70,7 @@ class TestFewer:
         assert (made.record.n_modes, made.asked_modes, made.why_fewer) == (45, 45, "")
 
     async def test_the_most_that_pass_where_they_do_not(self, actions):
-        state = replace(STATE, registration=unsure(0.3))
+        state = changed(STATE, registration=unsure(0.3))
         alone = {
             n: (await make(actions, state, n)).record.gate.accepted for n in (45, 30, 20, 10, 5)
         }
@@ -84,7 +85,7 @@ class TestFewer:
         assert "pole radius" in made.why_fewer
 
     async def test_what_was_asked_for_is_refused_where_none_pass(self, actions):
-        state = replace(STATE, rtc=loop_of(1.9))
+        state = changed(STATE, rtc=loop_of(1.9))
         made = await make(actions, state, fewer=(30, 10))
         assert made.record.state is MatrixState.REFUSED
         assert (made.record.n_modes, made.why_fewer) == (45, "")
@@ -133,14 +134,14 @@ class TestEdge:
         """Or it would be replaced by its like again and again."""
         gain = float(just_beyond.gains[0])
         registration = replace(REGISTRATION, alpha=Misregistration(), optical_gain=None)
-        state = replace(STATE, registration=registration, rtc=loop_of(gain))
+        state = changed(STATE, registration=registration, rtc=loop_of(gain))
         made = await make(actions, state, fewer=fewer_than(N_CONTROLLED))
         assert made.record.n_modes == N_CONTROLLED
         assert LIMIT_M < made.record.gate.edge_motion_m < HELD_LIMIT_M
-        state = replace(state, reconstructors=(made.record,))
+        state = changed(state, reconstructors=(made.record,))
         judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.verdict.accepted
-        slipping = replace(state, alarms=(slip_alarm(),))
+        slipping = changed(state, active=(slip_alarm(),))
         judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), slipping)
         assert not judged.verdict.accepted
 
@@ -150,7 +151,7 @@ class TestLoss:
 
     async def test_the_one_just_made_loses_nothing(self, actions):
         made = await make(actions, STATE)
-        state = replace(STATE, reconstructors=(made.record,))
+        state = changed(STATE, reconstructors=(made.record,))
         judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.alpha == REGISTRATION.alpha
         assert judged.expected.loss_m == pytest.approx(0.0, abs=1e-12)
@@ -158,7 +159,7 @@ class TestLoss:
     async def test_one_for_another_registration_loses_wavefront_and_margin(self, actions):
         made = await make(actions, STATE)
         moved = replace(REGISTRATION.alpha, shift_y_subap=0.25)
-        state = replace(STATE, registration=replace(REGISTRATION, alpha=moved))
+        state = changed(STATE, registration=replace(REGISTRATION, alpha=moved))
         judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.expected.loss_m > 1e-11
         assert judged.expected.pole_radius > judged.expected.fresh_pole_radius + 0.02
@@ -171,7 +172,7 @@ class TestGains:
         found = set()
         for gains in ((), MEASURED, tuple(replace(one, gain=0.3) for one in MEASURED)):
             for gain in (0.1, 0.4):
-                state = replace(
+                state = changed(
                     STATE,
                     rtc=loop_of(gain),
                     registration=replace(REGISTRATION, optical_gains=gains),
@@ -180,7 +181,7 @@ class TestGains:
         assert len(found) == 1
 
     async def test_the_table_is_in_the_file_beside_the_matrix(self, actions, archive, tmp_path):
-        state = replace(STATE, registration=replace(REGISTRATION, optical_gains=MEASURED))
+        state = changed(STATE, registration=replace(REGISTRATION, optical_gains=MEASURED))
         made = (await make(actions, state)).record
         assert made.optical_gains == MEASURED
         assert archive.reconstructors.records()[-1].optical_gains == MEASURED
@@ -191,7 +192,7 @@ class TestGains:
 
     async def test_gains_by_the_table_are_asked_for_when_the_gate_agrees(self, actions, bridge):
         made = await make(actions, STATE)
-        state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
+        state = changed(STATE, reconstructors=(made.record,), in_use=made.record.id)
         gains = tuple(np.linspace(0.5, 0.4, N_CONTROLLED)) + (0.0,) * (N_MODES - N_CONTROLLED)
         asked = ev.Ask(request=LoopRequest(id="loop-1", gains=gains), judged=True)
         answer = await actions.perform(asked, state)
@@ -200,7 +201,7 @@ class TestGains:
 
     async def test_and_never_reach_the_rtc_when_it_does_not(self, actions, bridge):
         made = await make(actions, STATE)
-        state = replace(STATE, reconstructors=(made.record,), in_use=made.record.id)
+        state = changed(STATE, reconstructors=(made.record,), in_use=made.record.id)
         gains = (2.5,) * N_CONTROLLED + (0.0,) * (N_MODES - N_CONTROLLED)
         asked = ev.Ask(request=LoopRequest(id="loop-1", gains=gains), judged=True)
         answer = await actions.perform(asked, state)
@@ -211,11 +212,11 @@ class TestGains:
     async def test_nothing_is_judged_for_a_matrix_nobody_knows(self, actions):
         asked = ev.Ask(request=LoopRequest(id="loop-1", gains=(0.1,) * N_MODES), judged=True)
         with pytest.raises(CommandError, match="cannot be judged"):
-            await actions.perform(asked, replace(STATE, in_use=None))
+            await actions.perform(asked, changed(STATE, in_use=None))
 
 
 def loop_with(registration):
-    state = replace(STATE, rtc=loop_of(0.4), registration=registration)
+    state = changed(STATE, rtc=loop_of(0.4), registration=registration)
     return loop_to_judge(state, (0.4,) * N_CONTROLLED)
 
 
@@ -242,21 +243,21 @@ class TestModesThatHold:
     """Which loop the gate may take for one that holds."""
 
     def test_the_loop_that_is_closed_with_these_gains(self):
-        state = replace(STATE, rtc=loop_of(0.4))
+        state = changed(STATE, rtc=loop_of(0.4))
         assert modes_that_hold(state, (0.4,) * N_CONTROLLED) == N_CONTROLLED
         assert modes_that_hold(state, (0.4,) * (N_CONTROLLED + 9)) == N_CONTROLLED
 
     def test_not_with_other_gains_or_fewer_of_them(self):
-        state = replace(STATE, rtc=loop_of(0.4))
+        state = changed(STATE, rtc=loop_of(0.4))
         assert modes_that_hold(state, (0.5,) * N_CONTROLLED) is None
         assert modes_that_hold(state, (0.4,) * (N_CONTROLLED - 1)) is None
 
     def test_not_one_that_is_open_or_gone(self):
         opened = replace(loop_of(0.4), loop="open")
-        assert modes_that_hold(replace(STATE, rtc=opened), (0.4,) * N_CONTROLLED) is None
-        assert modes_that_hold(replace(STATE, rtc=None), (0.4,) * N_CONTROLLED) is None
+        assert modes_that_hold(changed(STATE, rtc=opened), (0.4,) * N_CONTROLLED) is None
+        assert modes_that_hold(changed(STATE, rtc=None), (0.4,) * N_CONTROLLED) is None
 
     @pytest.mark.parametrize("name", ["edge-slip", "loop-diverging", "commands-off-loop"])
     def test_not_one_that_is_out_of_hand(self, name):
-        state = replace(STATE, rtc=loop_of(0.4), alarms=(replace(slip_alarm(), name=name),))
+        state = changed(STATE, rtc=loop_of(0.4), active=(replace(slip_alarm(), name=name),))
         assert modes_that_hold(state, (0.4,) * N_CONTROLLED) is None

@@ -21,6 +21,7 @@ from service.runtime.readiness import (
 from service.tracking.alarms import Alarm, Prerequisite, Responsible
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
+from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import ALPHA, START_NS, Story, moved, record, rtc
 
 SECOND = 1_000_000_000
@@ -131,7 +132,7 @@ def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_l
     alarm = Alarm(
         name=made.name, since_ns_utc=START_NS, text=made.text, seen_ns_utc=START_NS + SECOND
     )
-    state = replace(state, alarms=(alarm,))
+    state = changed(state, active=(alarm,))
     (again,) = detect_link_changes(
         link(disposition("late", 950, text="x 2")), state, START_NS + SECOND
     )
@@ -161,7 +162,7 @@ def test_what_came_is_counted_for_two_seconds_and_remembered_for_good():
 
 
 def test_nothing_is_waited_for_while_all_is_well():
-    state = TrackerState(
+    state = tracker_state(
         system="small",
         mode=Mode.AUTO,
         rtc=rtc(cm_id="a"),
@@ -190,7 +191,7 @@ def test_what_the_rtc_does_not_send_is_waited_for(found, name, party, hinders):
 
 
 def test_what_the_rtc_says_of_itself_is_waited_for_in_its_words_while_it_is_there():
-    state = TrackerState(system="small", rtc=rtc(trouble="aol1_imWFS2: its counter stands at 7"))
+    state = tracker_state(system="small", rtc=rtc(trouble="aol1_imWFS2: its counter stands at 7"))
     wait = waits(link(*WELL), state)["rtc-trouble"]
     assert (wait.responsible, wait.blocks) == ("rtc", True)
     assert wait.text == "aol1_imWFS2: its counter stands at 7"
@@ -213,11 +214,11 @@ def test_the_model_is_waited_for_first():
 
 
 def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
-    state = TrackerState(system="s", rtc=rtc(cm_id=None), read_back_error="no answer")
+    state = tracker_state(system="s", rtc=rtc(cm_id=None), read_back_error="no answer")
     wait = waits(link(*WELL), state)["matrix-name"]
     assert "cm_id is nil" in wait.text
     assert "no answer" in wait.text
-    state = replace(state, rtc=rtc(cm_id="theirs"))
+    state = changed(state, rtc=rtc(cm_id="theirs"))
     assert "theirs" in waits(link(*WELL), state)["matrix-in-use"].text
 
 
@@ -233,15 +234,15 @@ def test_a_matrix_without_a_name_or_without_its_numbers_is_waited_for():
 )
 def test_alarms_that_keep_the_service_from_its_job_are_waits(name, party, hinders):
     alarm = Alarm(name=name, since_ns_utc=0, text="as the alarm says")
-    wait = waits(link(*WELL), TrackerState(system="s", alarms=(alarm,)))[name]
+    wait = waits(link(*WELL), tracker_state(system="s", active=(alarm,)))[name]
     assert (wait.responsible, wait.blocks, wait.text) == (party, hinders, "as the alarm says")
 
 
 def test_what_an_operator_has_to_do_is_named():
-    state = TrackerState(
+    state = tracker_state(
         system="s",
         mode=Mode.HOLD,
-        dither_stopped=True,
+        stopped=True,
         reconstructors=(record("a"), record("b", MatrixState.PUBLISHED)),
     )
     found = waits(link(*WELL), state)
@@ -256,9 +257,9 @@ def test_who_is_to_approve_of_a_proposal_hears_when_another_one_replaces_it():
     story.make("cm-1", created_ns_utc=START_NS)
     asked = "reconstructor cm-1 is proposed: approve or reject it"
     assert waits(link(*WELL), story.state)["approval"].text == asked
-    known = story.state.registration
+    known = story.state.alpha.registration
     moved_on = replace(known, alpha=moved(known.alpha, shift_x_subap=0.03))
-    found = waits(link(*WELL), replace(story.state, registration=moved_on))["approval"].text
+    found = waits(link(*WELL), changed(story.state, registration=moved_on))["approval"].text
     then = datetime.fromtimestamp(START_NS / SECOND + 30, UTC).strftime("%H:%M:%S")
     assert found == f"{asked}; α has moved on since: a newer one follows after {then} UTC"
 
@@ -320,7 +321,7 @@ def test_the_state_on_the_network_is_short_and_in_boundary_units():
     assert nothing.alpha is nothing.validity is None
     story.see()
     message = state_message(story.state, 5)
-    assert message.validity == story.state.registration.validity.level
+    assert message.validity == story.state.alpha.registration.validity.level
     assert (message.mode, message.in_use, message.t_ns) == ("hold", "initial", 5)
     assert message.alpha == pytest.approx(ALPHA.to_boundary())
     assert message.sigma["shift_x_subap"] == pytest.approx(np.hypot(0.002, 0.003))
@@ -392,7 +393,7 @@ def test_lost_frames_are_an_alarm_that_ends_by_itself():
     (made,) = detect_link_changes(link(*WELL), state, START_NS, {"frames-lost": text})
     assert made.name == "frames-lost"
     alarm = Alarm(name=made.name, since_ns_utc=0, text=made.text, seen_ns_utc=START_NS)
-    state = replace(state, alarms=(alarm,))
+    state = changed(state, active=(alarm,))
     assert detect_link_changes(link(*WELL), state, START_NS + 2 * SECOND) == []
     (over,) = detect_link_changes(link(*WELL), state, START_NS + 4 * SECOND)
     assert (over.name, over.over) == ("frames-lost", True)

@@ -6,12 +6,13 @@ from service.runtime import workers as workers_module
 from service.runtime.workers import WorkerLoadMeter
 from service.tracking.alarms import Alarm
 from service.tracking.state import TrackerState
+from tests.states import tracker_state
 
 QUIET = TrackerState(system="small")
 
 
 def alarmed(name):
-    return TrackerState(system="small", alarms=(Alarm(name=name, text="", since_ns_utc=1),))
+    return tracker_state(system="small", active=(Alarm(name=name, text="", since_ns_utc=1),))
 
 
 class Clocks:

@@ -7,10 +7,11 @@ from service.estimation.random_dither import RandomEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import ModeSet
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
 from service.wire import DitherKind
 from studies.campaign.golden import INSTRUMENT, Teller, first_difference, nights_in, read, written
 from studies.campaign.golden_codec import decoded, encoded
+from tests.states import tracker_state
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -74,7 +75,7 @@ def test_numbers_may_differ_as_much_as_processors_do():
 
 
 def test_the_same_entries_make_the_same_file(tmp_path):
-    teller = Teller(TrackerState(system="flao", mode=Mode.AUTO), POLICY)
+    teller = Teller(tracker_state(system="flao", mode=Mode.AUTO), POLICY)
     for event in (ev.SessionStarted(session="s1"), rtc(), ev.Tick()):
         teller.tell(event, START_NS)
     for name in ("one.jsonl.xz", INSTRUMENT):

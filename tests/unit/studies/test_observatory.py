@@ -93,7 +93,7 @@ def test_a_matrix_is_made_sent_and_applied_each_in_its_time(night):
     published_s, applied_s = (
         times_s(night, f"reconstructor.{name}")[0] for name in ("published", "applied")
     )
-    first = next(r for r in night.state.reconstructors if r.published_ns_utc is not None)
+    first = next(r for r in night.state.matrices.reconstructors if r.published_ns_utc is not None)
     asked_s = (first.created_ns_utc - START_NS) * 1e-9
     wait = night.latencies
     assert published_s - asked_s >= wait.make_s
@@ -141,22 +141,22 @@ def test_two_nights_of_one_seed_are_one_night(bench, policy, three_seconds):
     assert [m.wavefront_nm for m in first.dome.moments] == [
         m.wavefront_nm for m in second.dome.moments
     ]
-    assert first.state.registration is not None
+    assert first.state.alpha.registration is not None
     assert np.array_equal(
-        first.state.registration.alpha.vector, second.state.registration.alpha.vector
+        first.state.alpha.registration.alpha.vector, second.state.alpha.registration.alpha.vector
     )
 
 
 def test_an_rtc_that_restarts_brings_its_first_matrix_back(bench, policy):
     night = short(bench, policy, 1.0)
-    first, session = night.state.in_use, night.state.rtc.session
+    first, session = night.state.matrices.in_use, night.state.loop.rtc.session
     night.restart_rtc()
-    assert night.state.rtc is None
+    assert night.state.loop.rtc is None
     night.advance(1.0)
-    assert night.state.rtc.session != session
-    assert night.state.rtc.seq < 1000
-    assert night.state.in_use == first
-    assert night.state.dither.start_seq < 1000
+    assert night.state.loop.rtc.session != session
+    assert night.state.loop.rtc.seq < 1000
+    assert night.state.matrices.in_use == first
+    assert night.state.dithers.dither.start_seq < 1000
 
 
 def test_a_worker_too_slow_for_the_telemetry_gets_longer_windows(bench, policy):
@@ -165,7 +165,7 @@ def test_a_worker_too_slow_for_the_telemetry_gets_longer_windows(bench, policy):
     fitted = [event for _, event in night.events if isinstance(event, ev.WindowFitted)]
     lasted_s = [(e.estimate.t_ns_utc - e.began_ns_utc) * 1e-9 for e in fitted]
     assert max(lasted_s) > 1.8 * lasted_s[0]
-    assert night.state.windows_accepted == len(fitted) >= 2
+    assert night.state.windows.accepted == len(fitted) >= 2
     assert not [e.text for e in night.state.log if e.name == "window.refused"]
 
 
@@ -214,7 +214,9 @@ def test_a_matrix_that_breaks_the_loop_is_called_so():
 def test_nothing_is_published_that_nobody_approved(bench, policy):
     night = short(bench, policy, 7.0, Mode.PROPOSE)
     assert not night.swaps
-    (proposed,) = [r for r in night.state.reconstructors if r.state is MatrixState.PROPOSED]
+    (proposed,) = [
+        r for r in night.state.matrices.reconstructors if r.state is MatrixState.PROPOSED
+    ]
     night.command(cmd.Approve(id=proposed.id))
     night.advance(0.5)
     assert [swap.id for swap in night.swaps] == [proposed.id]
@@ -224,14 +226,14 @@ def test_a_mirror_that_does_not_answer_is_named_within_a_second_and_the_dither_i
     bench, policy
 ):
     night = short(bench, policy, 1.5, Mode.HOLD)
-    assert night.state.dither is not None
+    assert night.state.dithers.dither is not None
     night.dome.computer.hide_dithers()
     night.advance(2.1)  # the second under way had an answer, the next has none
-    (alarm,) = [alarm for alarm in night.state.alarms if alarm.name == "mirror-silent"]
+    (alarm,) = [alarm for alarm in night.state.alarms.active if alarm.name == "mirror-silent"]
     assert "of the power that modes" in alarm.text
-    assert night.state.dither is None
-    assert night.state.rtc.dither is None
+    assert night.state.dithers.dither is None
+    assert night.state.loop.rtc.dither is None
     night.dome.computer.hide_dithers(hidden=False)
     night.command(cmd.StartDither())
     night.advance(1.3)
-    assert "mirror-silent" not in {alarm.name for alarm in night.state.alarms}
+    assert "mirror-silent" not in {alarm.name for alarm in night.state.alarms.active}

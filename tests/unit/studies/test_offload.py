@@ -64,11 +64,11 @@ def test_from_30_percent_and_half_a_degree_it_is_home_in_five_moves(tmp_path):
     path = tmp_path / "pixels.toml"
     path.write_text(INSTRUMENT.read_text() + '\n[slopes]\nkind = "intensity"\n')
     night = a_night(26.0, path, "--alpha=0.3,-0.2,0.5,1.004", "--stage=1.2,0")
-    assert night.state.rtc.n_slopes == 4 * int(night.dome.telescope.plant.valid.sum())
+    assert night.state.loop.rtc.n_slopes == 4 * int(night.dome.telescope.plant.valid.sum())
     assert logged(night, "instrument-mismatch") == []
     assert len(night.swaps) >= 2
     moved = way(night)
-    assert 1 <= night.state.offload.n_moves <= 5, logged(night, "offload.asked")
+    assert 1 <= night.state.alpha.offload.n_moves <= 5, logged(night, "offload.asked")
     assert np.all(np.abs(moved[-1]) <= [0.02, 0.02, 0.02, 0.002])
     overshoot = (moved * -np.sign(moved[0])).max(axis=0) / np.abs(moved[0])
     assert overshoot.max() <= 0.1

@@ -118,21 +118,21 @@ def test_what_is_worse_is_counted_against_the_night_without_a_service():
 def test_a_service_that_is_killed_begins_again_from_what_it_has_written(tmp_path):
     night = OtherNight(Plan(**SMALL), tmp_path)
     night.pass_(7.0)
-    known = night.state.registration.alpha
+    known = night.state.alpha.registration.alpha
     night.kill()
     assert night.time_s == pytest.approx(7.0 + DOWN_S)
-    taken_up = night.state.registration.alpha
+    taken_up = night.state.alpha.registration.alpha
     assert np.abs(taken_up.vector - known.vector).max() < 0.01
     night.pass_(night.time_s + 2.0)
-    assert night.state.in_use == night.dome.computer.reconstructor.manifest.id
+    assert night.state.matrices.in_use == night.dome.computer.reconstructor.manifest.id
     night.close()
 
 
 def test_what_was_on_its_way_when_the_service_was_killed_arrives(tmp_path):
     night = OtherNight(Plan(**SMALL), tmp_path)
-    while not any(r.on_its_way for r in night.state.reconstructors):
+    while not any(r.on_its_way for r in night.state.matrices.reconstructors):
         night.advance(0.05)
-    sent = next(r.id for r in night.state.reconstructors if r.on_its_way)
+    sent = next(r.id for r in night.state.matrices.reconstructors if r.on_its_way)
     night.kill()
     assert night.dome.computer.reconstructor.manifest.id == sent
     night.close()
@@ -186,7 +186,7 @@ def test_where_all_modes_of_the_mirror_are_to_be_controlled_the_rotation_is_righ
     bench.write_text(EVERY_MODE)
     night = OtherNight(Plan(instrument=str(bench), n_controlled=100, n_target=143, seed=2))
     night.pass_(8.0)
-    registration = night.state.registration
+    registration = night.state.alpha.registration
     off = np.abs(registration.alpha.vector - night.dome.moments[-1].alpha.vector)
     assert np.all(off < 3.0 * registration.sigma)
     assert np.rad2deg(off[2]) < 0.1

@@ -32,16 +32,16 @@ def played(mischief, seconds):
 
 def test_a_dither_too_strong_is_stopped_within_three_seconds_and_nothing_is_measured_with_it():
     night = played(Mischief.STRONG_DITHER, 3.0)
-    (alarm,) = [a for a in night.state.alarms if a.name == "dither-over-budget"]
+    (alarm,) = [a for a in night.state.alarms.active if a.name == "dither-over-budget"]
     assert "the frames hold 100 nm RMS of dither in all, 40 nm were asked for" in alarm.text
     night.play([], 10.0)
-    assert night.state.rtc.dither_id is None
-    assert night.state.windows_accepted == 0
+    assert night.state.loop.rtc.dither_id is None
+    assert night.state.windows.accepted == 0
     assert not night.swaps
 
 
 @pytest.mark.long
 def test_gains_that_follow_the_seeing_cost_no_window():
     plain, following = (played(m, 12.0).state for m in (None, Mischief.SEEING_GAINS))
-    assert following.windows_accepted == plain.windows_accepted
-    assert following.windows_accepted >= 5
+    assert following.windows.accepted == plain.windows.accepted
+    assert following.windows.accepted >= 5

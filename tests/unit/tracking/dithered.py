@@ -48,8 +48,8 @@ class DitheredNight(Story):
             match effect:
                 case ev.Ask(request=DitherRequest() as request):
                     self.requests.append(request)
-                    self.windows_s.append(self.state.dither.window_s)
-                    self.playing = replace(self.state.dither, start_seq=self.seq)
+                    self.windows_s.append(self.state.dithers.dither.window_s)
+                    self.playing = replace(self.state.dithers.dither, start_seq=self.seq)
                     self.done_s = self.t_s + SETTLING_S
                     answer = dither_answered(
                         request.id, accepted=True, reason="", start_seq=self.seq
@@ -82,7 +82,9 @@ class DitheredNight(Story):
         playing = self.playing
         if playing is None:
             return
-        window_s = self.state.dither.window_s if self.state.dither else playing.window_s
+        window_s = (
+            self.state.dithers.dither.window_s if self.state.dithers.dither else playing.window_s
+        )
         while self.done_s + window_s <= self.t_s:
             self.done_s += window_s
             self.window(playing, window_s)

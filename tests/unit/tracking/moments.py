@@ -7,6 +7,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import AlarmRecord, Severity
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
+from tests.states import changed
 from tests.unit.tracking.operations.test_running import ACTIVITIES
 from tests.unit.tracking.situations import POLICY, Story, moved, rtc
 
@@ -56,17 +57,17 @@ def in_use():
 def refused_since():
     """The gate refuses now what is proposed."""
     story = proposed()
-    (*others, last) = story.state.reconstructors
+    (*others, last) = story.state.matrices.reconstructors
     gate = replace(last.gate, accepted=False, reason="too little margin")
-    story.state = replace(story.state, reconstructors=(*others, replace(last, gate=gate)))
+    story.state = changed(story.state, reconstructors=(*others, replace(last, gate=gate)))
     return story
 
 
 def left_behind():
     """α has moved since a reconstructor was proposed."""
     story = proposed()
-    known = story.state.registration
-    story.state = replace(
+    known = story.state.alpha.registration
+    story.state = changed(
         story.state, registration=replace(known, alpha=moved(known.alpha, shift_x_subap=0.1))
     )
     return story
@@ -75,7 +76,7 @@ def left_behind():
 def suspected():
     """The last window saw a jump, and the next one decides."""
     story = proposed()
-    story.see(moved(story.state.registration.alpha, shift_x_subap=0.4))
+    story.see(moved(story.state.alpha.registration.alpha, shift_x_subap=0.4))
     return story
 
 
@@ -114,7 +115,7 @@ def standing_by():
 def seen():
     """Every alarm is acknowledged, and one is muted."""
     story = diverging()
-    for alarm in story.state.alarms:
+    for alarm in story.state.alarms.active:
         story.tell(cmd.AcknowledgeAlarm(name=alarm.name, by="Ada"))
     story.tell(cmd.MuteAlarm(name="loop-diverging", for_s=60.0))
     return story
@@ -124,7 +125,7 @@ def gone():
     """An alarm went, and nobody had seen it."""
     story = in_use()
     record = AlarmRecord(name="margin", worst=Severity.SERIOUS, over_ns_utc=1)
-    story.state = replace(story.state, alarm_records=(record,))
+    story.state = changed(story.state, records=(record,))
     return story
 
 
@@ -151,11 +152,13 @@ MOMENTS = [
 
 def meant(state, order):
     """The command that an operator would give now; None: there is nothing that it could name."""
-    proposals = [r.id for r in state.reconstructors if r.state is MatrixState.PROPOSED]
-    used = [r.id for r in state.reconstructors if r.was_used]
+    proposals = [r.id for r in state.matrices.reconstructors if r.state is MatrixState.PROPOSED]
+    used = [r.id for r in state.matrices.reconstructors if r.was_used]
     work = state.measuring or state.noisy_measurement
-    unseen = [n.name for n in state.alarm_records if n.worst is not None and n.acknowledged is None]
-    muted = [note.name for note in state.alarm_records if note.muted is not None]
+    unseen = [
+        n.name for n in state.alarms.records if n.worst is not None and n.acknowledged is None
+    ]
+    muted = [note.name for note in state.alarms.records if note.muted is not None]
     named = {
         "approve": (cmd.Approve, proposals),
         "reject": (cmd.Reject, proposals),

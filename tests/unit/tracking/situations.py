@@ -16,7 +16,7 @@ from service.tracking.loop import commanded_gains
 from service.tracking.mode_limits import ModeProof
 from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
 from service.tracking.step_context import StepContext
 from service.wire import (
     Acknowledgement,
@@ -30,6 +30,7 @@ from service.wire import (
     Reply,
     Status,
 )
+from tests.states import tracker_state
 
 ORDERS = {request.name for request in REQUESTS} | {"acquisition", "loop", "noisy matrix", "ramp"}
 SECOND = 1_000_000_000
@@ -197,7 +198,7 @@ class Story:
     shows = True
 
     def __init__(self, mode=Mode.AUTO, policy=POLICY, state=None):
-        self.state = state or TrackerState(system="flao", mode=mode, mode_proof=ALL_SHOWN)
+        self.state = state or tracker_state(system="flao", mode=mode, mode_proof=ALL_SHOWN)
         self.policy = policy
         self.now_ns = START_NS
         self.effects = []
@@ -230,7 +231,7 @@ class Story:
         """Meet an RTC whose matrix is then known."""
         self.tell(ev.SessionStarted(session=changes.get("session", "s1")))
         self.tell(rtc(**changes))
-        view = self.state.rtc
+        view = self.state.loop.rtc
         if view.cm_id is not None and self.state.reconstructor(view.cm_id) is None:
             self.tell(ev.MatrixFetched(record=foreign(view.cm_id, view.n_controlled)))
         self.tell(ev.Tick(), after_s=3)  # a fetch keeps other questions back for so long
@@ -241,13 +242,15 @@ class Story:
         effects = ()
         for _ in range(n_windows):
             self.now_ns += round(every_s * SECOND)
-            fitted = estimate(alpha, t_ns=self.now_ns, session=self.state.rtc.session, **changes)
+            fitted = estimate(
+                alpha, t_ns=self.now_ns, session=self.state.loop.rtc.session, **changes
+            )
             effects += self.tell(ev.WindowFitted(estimate=fitted))
         return effects
 
     def make(self, matrix_id, state=MatrixState.PROPOSED, *, wanted=False, **changes):
         """Hand in a reconstructor, made for the current registration."""
-        registration, view = self.state.registration, self.state.rtc
+        registration, view = self.state.alpha.registration, self.state.loop.rtc
         changes = {
             "created_ns_utc": self.now_ns,
             "alpha": registration and registration.alpha,
@@ -259,7 +262,7 @@ class Story:
         return self.tell(ev.MatrixMade(record=made, wanted=wanted))
 
     def acknowledge(self, matrix_id, state=MatrixState.APPLIED, reason="", frame_seq=1000):
-        session = "s1" if self.state.rtc is None else self.state.rtc.session
+        session = "s1" if self.state.loop.rtc is None else self.state.loop.rtc.session
         return self.tell(
             acknowledged(
                 matrix_id, state=state, reason=reason, frame_seq=frame_seq, session=session
@@ -282,7 +285,7 @@ class Story:
 
     @property
     def alarms(self):
-        return {alarm.name for alarm in self.state.alarms}
+        return {alarm.name for alarm in self.state.alarms.active}
 
     @property
     def logged(self):

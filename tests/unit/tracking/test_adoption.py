@@ -33,8 +33,10 @@ def other(**changes):
 
 def test_a_running_dither_is_adopted_with_its_first_frame_and_none_is_asked_for():
     story = Story().meet(**with_dither())
-    assert story.state.dither == replace(RUNNING, asked_ns_utc=story.state.dither.asked_ns_utc)
-    assert story.state.dither.asked_ns_utc >= START_NS
+    assert story.state.dithers.dither == replace(
+        RUNNING, asked_ns_utc=story.state.dithers.dither.asked_ns_utc
+    )
+    assert story.state.dithers.dither.asked_ns_utc >= START_NS
     assert not story.asked(DitherRequest)
     assert not story.asked(DitherStop)
     assert "dither.adopted" in story.logged
@@ -52,7 +54,7 @@ def test_a_refusal_because_one_runs_is_no_alarm_once_it_is_adopted():
     story.tell(dither_answered(asked.id, accepted=False, reason="busy", start_seq=None))
     assert "dither" in story.alarms
     story.tell(rtc(**with_dither()))
-    assert story.state.dither.id == RUNNING.id
+    assert story.state.dithers.dither.id == RUNNING.id
     assert "dither" not in story.alarms
 
 
@@ -60,13 +62,13 @@ def test_an_operator_who_stopped_the_dither_is_obeyed():
     story = Story().meet(**with_dither())
     story.tell(cmd.StopDither())
     story.tell(rtc(**with_dither()))
-    assert story.state.dither is None
+    assert story.state.dithers.dither is None
 
 
 def test_lines_that_do_not_fit_a_window_are_not_adopted_and_the_services_own_is_stopped():
     odd = other(frequency_hz=(211.317, 239.0, 283.0, 331.0))
     story = Story().meet(**with_dither(odd))
-    assert story.state.dither is None
+    assert story.state.dithers.dither is None
     assert story.asked(DitherStop)
 
 
@@ -80,11 +82,11 @@ def test_one_over_budget_from_before_a_restart_is_stopped_and_read_only_where_it
     )
     assert OVER_BUDGET in story.alarms
     story.tell(ev.MatrixFetched(record=foreign()))
-    assert story.state.dither is None
+    assert story.state.dithers.dither is None
     story.tell(rtc(**with_dither(loud)), after_s=1)
-    assert story.state.dither is None
+    assert story.state.dithers.dither is None
     story.tell(rtc(**with_dither(loud)), after_s=5)
-    assert story.state.dither.id == loud.id
+    assert story.state.dithers.dither.id == loud.id
 
 
 def test_only_a_sine_can_be_demodulated():

@@ -33,17 +33,17 @@ def settled(name, **story):
 
 
 def made(story, matrix_id="cm-1", **changes):
-    known = story.state.registration
-    return record(matrix_id, **({"judged": judged(known, story.state.rtc)} | changes))
+    known = story.state.alpha.registration
+    return record(matrix_id, **({"judged": judged(known, story.state.loop.rtc)} | changes))
 
 
 @FORBIDDING
 def test_no_window_under_it_is_a_measurement(name):
     story = settled(name)
-    before = story.state.windows_accepted
+    before = story.state.windows.accepted
     story.see(n_windows=3)
-    assert story.state.windows_accepted == before
-    assert story.state.windows_refused == 3
+    assert story.state.windows.accepted == before
+    assert story.state.windows.refused == 3
 
 
 @FORBIDDING
@@ -64,7 +64,7 @@ def test_one_that_is_being_judged_when_it_comes_is_not_sent_either(name):
     effects = story.tell(ev.MatrixMade(record=made(story, judged=of_old), wanted=False))
     (asked,) = of_kind(effects, ev.JudgeProposal)
     story.tell(ev.ConditionChanged(name=name, text="found"))
-    now = judged(story.state.registration, story.state.rtc)
+    now = judged(story.state.alpha.registration, story.state.loop.rtc)
     passed = ev.ProposalJudged(id="cm-1", verdict=made(story).gate, judged=now, wanted=asked.wanted)
     assert not of_kind(story.tell(passed), ev.SendMatrix)
     assert story.matrix_state("cm-1") is MatrixState.PROPOSED

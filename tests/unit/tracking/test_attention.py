@@ -30,7 +30,7 @@ def raised(story, name, *, over=False):
 
 
 def note(story, name):
-    return next((note for note in story.state.alarm_records if note.name == name), None)
+    return next((note for note in story.state.alarms.records if note.name == name), None)
 
 
 def restarted(story, tmp_path):
@@ -72,7 +72,7 @@ def test_one_that_is_acknowledged_stays_while_it_lasts_and_is_then_done_with(sto
     raised(story, "edge-slip")
     assert note(story, "edge-slip").alarm_state is AlarmState.ACKNOWLEDGED
     raised(story, "edge-slip", over=True)
-    assert story.state.alarm_records == ()
+    assert story.state.alarms.records == ()
     raised(story, "edge-slip")
     assert note(story, "edge-slip").alarm_state is AlarmState.ACTIVE
 
@@ -92,20 +92,23 @@ def test_the_worst_is_kept_and_what_becomes_worse_is_acknowledged_again(story):
     assert note(story, "margin").alarm_state is AlarmState.ACTIVE
     margin(0.97)
     assert note(story, "margin").worst is worst(story.state) is Severity.CRITICAL
-    assert next(a for a in story.state.alarms if a.name == "margin").definition is ALARMS["margin"]
+    assert (
+        next(a for a in story.state.alarms.active if a.name == "margin").definition
+        is ALARMS["margin"]
+    )
     with pytest.raises(CommandError, match="margin has been critical, and serious was seen of it"):
         story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.SERIOUS))
     story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.CRITICAL))
 
 
 def judged_now(story):
-    return judged(story.state.registration, story.state.rtc)
+    return judged(story.state.alpha.registration, story.state.loop.rtc)
 
 
 def test_what_an_operators_order_ends_has_been_seen(story):
     story.tell(cmd.StopEverything())
     story.tell(cmd.Resume(**ADA))
-    assert story.state.alarm_records == ()
+    assert story.state.alarms.records == ()
 
 
 def test_what_makes_no_sense_is_refused_in_a_sentence(story):
@@ -126,7 +129,7 @@ def test_a_muted_one_forbids_what_it_forbids_and_comes_back_by_itself(story):
     raised(story, "matrix-mismatch")
     (quiet,) = muted(story.state)
     assert (quiet.name, quiet.alarm_state) == ("matrix-mismatch", AlarmState.ACTIVE)
-    assert blocking_alarm(story.state, Interlock.SEND_NEW).name == "matrix-mismatch"
+    assert blocking_alarm(story.state.alarms.active, Interlock.SEND_NEW).name == "matrix-mismatch"
     story.wait(61)
     assert muted(story.state) == ()
     assert note(story, "matrix-mismatch").alarm_state is AlarmState.ACTIVE
@@ -135,7 +138,7 @@ def test_a_muted_one_forbids_what_it_forbids_and_comes_back_by_itself(story):
 def test_one_muted_before_it_comes_can_be_unmuted(story):
     story.tell(cmd.MuteAlarm(name="rtc-vanished", for_s=60.0))
     story.tell(cmd.UnmuteAlarm(name="rtc-vanished"))
-    assert story.state.alarm_records == ()
+    assert story.state.alarms.records == ()
 
 
 def test_a_restart_changes_nothing_of_what_was_seen_and_what_was_not(small, tmp_path):
@@ -175,8 +178,8 @@ def test_a_file_of_before_there_were_acknowledgements_is_read(small, tmp_path):
 
 def test_what_lasts_without_news_costs_the_disk_nothing(story):
     raised(story, "frames-unused")
-    before = story.state.alarm_records
+    before = story.state.alarms.records
     for k in range(5):
         story.tell(ev.ConditionChanged(name="frames-unused", text=f"{k} frames"))
         story.wait(1)
-    assert story.state.alarm_records is before
+    assert story.state.alarms.records is before

@@ -10,6 +10,7 @@ from service.tracking import events as ev
 from service.tracking.dither import LONGEST_PATIENCE_S, PATIENCE_S
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest, DitherStop
+from tests.states import changed
 from tests.unit.tracking.situations import Story, dither_answered, of_kind, rtc
 
 START = 1000
@@ -24,7 +25,7 @@ def story():
 
 
 def accept(story, start_seq=START):
-    dither = story.state.dither
+    dither = story.state.dithers.dither
     story.tell(dither_answered(dither.id, accepted=True, reason="", start_seq=start_seq))
 
 
@@ -33,12 +34,14 @@ def status(story, seq, *, dither=None, after_s=0.5, **changes):
 
 
 def silence(story, silent_s):
-    return story.tell(ev.DitherSilent(id=story.state.dither.id, silent_s=silent_s), after_s=0.5)
+    return story.tell(
+        ev.DitherSilent(id=story.state.dithers.dither.id, silent_s=silent_s), after_s=0.5
+    )
 
 
 class TestTheStatusShowsNone:
     def test_it_is_missed_by_the_first_status_that_should_show_it_and_asked_for_again(self, story):
-        first = story.state.dither.id
+        first = story.state.dithers.dither.id
         (asked,) = of_kind(status(story, START + 500), DitherRequest)
         assert asked.id != first
         assert "dither-lost" in story.alarms
@@ -46,11 +49,11 @@ class TestTheStatusShowsNone:
 
     def test_a_status_made_before_it_began_says_nothing(self, story):
         status(story, START - 1)
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         assert not story.alarms
 
     def test_one_that_has_run_its_time_has_ended(self, story):
-        stop_seq = START + round(story.state.dither.request.duration_s * 1000)
+        stop_seq = START + round(story.state.dithers.dither.request.duration_s * 1000)
         status(story, stop_seq - 1500)
         assert "dither-lost" in story.alarms
         story = Story(Mode.HOLD).meet(seq=900)
@@ -74,7 +77,7 @@ class TestTheStatusShowsNone:
         status(story, START + 500)
         story.see()
         assert "dither-lost" not in story.alarms
-        assert story.state.dither_losses == 0
+        assert story.state.dithers.losses == 0
 
     def test_an_operator_who_wants_none_ends_the_alarm(self, story):
         status(story, START + 500)
@@ -86,17 +89,17 @@ class TestTheFramesHoldNone:
     @pytest.fixture
     def shown(self, story):
         """The status shows it all the same."""
-        shown = story.state.dither
+        shown = story.state.dithers.dither
         status(story, START + 100, dither=shown)
         return shown
 
     def test_it_is_named_after_a_second_and_another_is_asked_for_soon(self, story, shown):
         silence(story, 1.0)
         assert "dither-lost" in story.alarms
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         effects = silence(story, PATIENCE_S)
         assert of_kind(effects, DitherStop), "the RTC plays no second one beside it"
-        assert story.state.dither is None
+        assert story.state.dithers.dither is None
         status(story, START + 2000)
         assert of_kind(story.wait(2), DitherRequest)
 
@@ -104,28 +107,28 @@ class TestTheFramesHoldNone:
         silence(story, 2 * PATIENCE_S)
         for second in range(5):
             status(story, START + 3000 + 1000 * second, dither=shown, after_s=1)
-            assert story.state.dither is None
+            assert story.state.dithers.dither is None
 
     def test_the_next_is_given_more_time(self, story, shown):
         silence(story, PATIENCE_S)
         status(story, START + 3000, after_s=5)
         accept(story, START + 3100)
-        status(story, START + 3200, dither=replace(story.state.dither, asked_ns_utc=0))
+        status(story, START + 3200, dither=replace(story.state.dithers.dither, asked_ns_utc=0))
         silence(story, 1.5 * PATIENCE_S)
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         silence(story, 2 * PATIENCE_S)
-        assert story.state.dither is None
+        assert story.state.dithers.dither is None
 
     def test_patience_has_an_end(self, story, shown):
-        story.state = replace(story.state, dither_losses=50)
+        story.state = changed(story.state, losses=50)
         silence(story, LONGEST_PATIENCE_S - 1)
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         silence(story, LONGEST_PATIENCE_S)
-        assert story.state.dither is None
+        assert story.state.dithers.dither is None
 
     def test_silence_of_another_dither_means_nothing(self, story):
         story.tell(ev.DitherSilent(id="dither-0", silent_s=100.0))
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         assert not story.alarms
 
 
@@ -139,20 +142,20 @@ class TestTheFramesHoldNone:
 )
 def test_the_rtcs_word_counts_where_it_plays_something_else(story, changes):
     changes = dict(changes)
-    dither = story.state.dither
+    dither = story.state.dithers.dither
     playing = replace(dither, start_seq=changes.pop("start_seq", START))
     playing = replace(playing, request=replace(dither.request, **changes))
     status(story, START + 100, dither=playing)
-    assert story.state.dither == playing
+    assert story.state.dithers.dither == playing
     assert story.logged[-1] == "dither.other"
     before = story.state
     status(story, START + 200, dither=playing)
-    assert story.state.dither == before.dither
+    assert story.state.dithers.dither == before.dithers.dither
     assert story.logged.count("dither.other") == 1
 
 
 def test_the_services_own_come_and_go_without_a_word_in_the_audit_and_an_operators_do_not(story):
-    stop_seq = START + round(story.state.dither.request.duration_s * 1000)
+    stop_seq = START + round(story.state.dithers.dither.request.duration_s * 1000)
     status(story, stop_seq)
     told = {line.name: line.level for line in story.state.log}
     assert told["dither.started"] is told["dither.ended"] is Level.DEBUG

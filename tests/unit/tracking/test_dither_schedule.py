@@ -15,6 +15,7 @@ from service.tracking import events as ev
 from service.tracking.dither_plan import FAINT_WINDOW_S, LASTING_S, MIN_WINDOWS, budget_m
 from service.tracking.dither_request import SETTLING_S, DitherPhase, total_m
 from service.wire import DitherRequest, DitherStop
+from tests.states import changed
 from tests.unit.tracking.dithered import DitheredNight
 from tests.unit.tracking.situations import ALPHA, POLICY, Story, moved, of_kind
 
@@ -26,7 +27,7 @@ CALM = replace(BRISK, drift_rate=FAST / 10.0)
 
 
 def sigma_of(story):
-    return np.sqrt(np.diag(story.state.registration.covariance))
+    return np.sqrt(np.diag(story.state.alpha.registration.covariance))
 
 
 @cache
@@ -44,31 +45,31 @@ def calm_night():
 class TestHowMuch:
     def test_until_alpha_is_known_the_whole_budget_without_pause(self):
         night = DitheredNight(CALM).live(4)
-        assert night.state.dither_policy.phase is DitherPhase.ACQUIRE
+        assert night.state.dithers.policy.phase is DitherPhase.ACQUIRE
         assert total_m(night.requests[0]) == pytest.approx(CALM.dither_budget_m)
         night.live(4)
-        assert night.state.registration.n_windows >= MIN_WINDOWS
-        assert night.state.dither_policy.phase is not DitherPhase.ACQUIRE
+        assert night.state.alpha.registration.n_windows >= MIN_WINDOWS
+        assert night.state.dithers.policy.phase is not DitherPhase.ACQUIRE
 
     def test_a_calm_mirror_is_looked_at_once_a_minute(self):
         night = calm_night()
         later = np.array(night.lived[40:])
-        assert night.state.dither_policy.phase is DitherPhase.SPARSE
+        assert night.state.dithers.policy.phase is DitherPhase.SPARSE
         assert np.mean(later > 0.0) < 0.1
         assert np.all(sigma_of(night) < CALM.dither_sigma)
         assert len(night.requests) <= 7
 
     def test_a_brisk_one_is_followed_without_pause(self):
         night = brisk_night()
-        assert night.state.dither_policy.phase is DitherPhase.FOLLOW
+        assert night.state.dithers.policy.phase is DitherPhase.FOLLOW
         assert np.mean(np.array(night.lived[40:]) > 0.0) > 0.9
 
     def test_ordinary_telemetry_spares_most_of_it_and_what_is_left_costs_what_it_says(self):
         night = DitheredNight(BRISK, looks=True).live(300)
-        assert night.state.dither_policy.phase is DitherPhase.SPARSE
+        assert night.state.dithers.policy.phase is DitherPhase.SPARSE
         assert night.share_on < 0.4
         assert np.all(sigma_of(night) < 2.0 * BRISK.dither_sigma)
-        shown = np.sqrt(night.state.dither_policy.mean_square_m2)
+        shown = np.sqrt(night.state.dithers.policy.mean_square_m2)
         # of a memory of ten minutes, five
         assert shown == pytest.approx(night.mean_m * np.sqrt(1.0 - np.exp(-0.5)), rel=0.15)
 
@@ -87,7 +88,7 @@ class TestHowMuch:
     def test_faint_stars_have_long_windows(self):
         night = DitheredNight(BRISK, magnitude=12.5).live(60)
         assert all(window_s >= FAINT_WINDOW_S for window_s in night.windows_s)
-        assert night.state.windows_accepted >= 5
+        assert night.state.windows.accepted >= 5
 
     def test_a_nanometre_is_enough_for_half_a_percent_of_a_calm_mirror(self):
         policy = replace(CALM, dither_budget_m=1e-9, drift_rate=FAST / 100.0)
@@ -107,21 +108,23 @@ class TestHowMuch:
 class TestPrecision:
     def test_what_windows_show_replaces_the_table(self):
         night = DitheredNight(CALM, kappa=tabulated(10.0) / 10.0).live(60)
-        np.testing.assert_allclose(night.state.dither_policy.precision.ratio, 0.1, rtol=1e-6)
+        np.testing.assert_allclose(night.state.dithers.policy.precision.ratio, 0.1, rtol=1e-6)
         wary = DitheredNight(CALM).live(60)
-        assert night.state.dither_policy.plan.total_m < 0.7 * wary.state.dither_policy.plan.total_m
+        assert (
+            night.state.dithers.policy.plan.total_m < 0.7 * wary.state.dithers.policy.plan.total_m
+        )
 
     def test_it_is_kept_from_star_to_star_and_from_session_to_session(self):
         night = DitheredNight(CALM, kappa=tabulated(10.0) / 3.0).live(30)
         night.tell(ev.RtcVanished())
         night.meet(session="s2", magnitude=7.0)
-        assert night.state.dither_policy.precision.n_windows >= 3
+        assert night.state.dithers.policy.precision.n_windows >= 3
 
     def test_a_refused_window_teaches_nothing(self):
         night = DitheredNight(CALM, kappa=tabulated(10.0) * 15.0)
         night.live(30)
-        assert night.state.windows_accepted == 0
-        assert night.state.dither_policy.precision is None
+        assert night.state.windows.accepted == 0
+        assert night.state.dithers.policy.precision is None
 
 
 class TestWhen:
@@ -129,17 +132,17 @@ class TestWhen:
         night = DitheredNight(CALM).live(60)
         while night.playing is not None:
             night.live(0.5)
-        night.state = replace(night.state, dither_due_since_ns_utc=1, dither_due_reason="a doubt")
+        night.state = changed(night.state, dither_due_since_ns_utc=1, dither_due_reason="a doubt")
         asked = of_kind(night.tell(ev.Tick()), DitherRequest)
         assert [total_m(a) for a in asked] == pytest.approx([CALM.dither_budget_m])
-        assert night.state.dither_policy.reason == "a doubt"
+        assert night.state.dithers.policy.reason == "a doubt"
 
     def test_a_dither_that_has_done_its_work_is_stopped(self):
         night = DitheredNight(CALM).live(15)
         assert night.playing is None
         assert "dither.stopped" in night.logged
         assert night.requests[0].duration_s > 20.0
-        assert night.state.dither_policy.next_ns_utc > night.now_ns
+        assert night.state.dithers.policy.next_ns_utc > night.now_ns
 
     def test_the_one_just_stopped_is_not_adopted_while_the_status_still_shows_it(self):
         night = DitheredNight(CALM)
@@ -149,15 +152,15 @@ class TestWhen:
             night.live(0.5)
         shown = replace(night.view, seq=night.seq, dither=running)
         night.tell(shown, 0.5)
-        assert night.state.dither is None
+        assert night.state.dithers.dither is None
 
     def test_an_rtc_that_does_not_stop_it_is_not_asked_for_ever_and_read_all_the_same(self):
         night = DitheredNight(CALM)
         night.deaf = True
         night.live(25)
         assert 1 <= len(night.asked(DitherStop)) <= 3
-        assert night.state.dither.id == night.requests[0].id
-        assert night.state.windows_accepted > MIN_WINDOWS + 2
+        assert night.state.dithers.dither.id == night.requests[0].id
+        assert night.state.windows.accepted > MIN_WINDOWS + 2
 
     def test_no_request_outlives_a_dead_service_for_long(self):
         night = brisk_night()
@@ -175,7 +178,7 @@ class TestWhen:
             return moved(ALPHA, shift_x_subap=0.2 if t_s > 100 else 0.0)
 
         night = DitheredNight(CALM, alpha=alpha).live(240)
-        assert night.state.registration.alpha.shift_x_subap == pytest.approx(0.32, abs=0.02)
+        assert night.state.alpha.registration.alpha.shift_x_subap == pytest.approx(0.32, abs=0.02)
 
     def test_stopped_by_the_operator_it_says_so_and_stays_off(self):
         night = DitheredNight(BRISK).live(30)
@@ -183,19 +186,19 @@ class TestWhen:
         n_requests = len(night.requests)
         night.live(120)
         assert len(night.requests) == n_requests
-        assert night.state.dither_policy.phase is DitherPhase.OFF
-        assert night.state.dither_policy.reason == "stopped by the operator"
+        assert night.state.dithers.policy.phase is DitherPhase.OFF
+        assert night.state.dithers.policy.reason == "stopped by the operator"
         night.pass_on(night.tell(cmd.StartDither()))
         assert len(night.requests) == n_requests + 1
         night.live(60)
-        assert night.state.dither_policy.phase is DitherPhase.FOLLOW
+        assert night.state.dithers.policy.phase is DitherPhase.FOLLOW
 
     def test_an_operators_own_is_left_alone_to_its_end(self):
         night = DitheredNight(CALM).live(60)
         night.pass_on(night.tell(cmd.StopDither()))
         night.pass_on(night.tell(cmd.StartDither(amplitude_m=1e-9, duration_s=20.0)))
         night.live(15)
-        assert night.state.dither_policy.phase is DitherPhase.OPERATOR
+        assert night.state.dithers.policy.phase is DitherPhase.OPERATOR
         assert night.playing.id.startswith("operator-")
         night.live(10)
         assert night.playing is None
@@ -248,14 +251,14 @@ class TestLines:
     def test_a_vibration_the_settings_know_is_avoided_from_the_start(self):
         night = DitheredNight(replace(BRISK, dither_avoid_hz=(211.0,)))
         assert self.clear(night.requests[0], 211.0) >= 8.0
-        assert night.state.dither_policy.avoided_hz == (211.0,)
+        assert night.state.dithers.policy.avoided_hz == (211.0,)
 
     def test_where_vibrations_leave_no_room_the_lines_stay(self):
         everywhere = tuple(np.arange(190.0, 370.0, 5.0))
         night = DitheredNight(replace(BRISK, dither_avoid_hz=everywhere)).live(20)
         assert night.requests
         assert "dither.on-vibrations" in night.logged
-        assert night.state.windows_accepted > 0
+        assert night.state.windows.accepted > 0
 
 
 class TestOperatorsBudget:
@@ -309,7 +312,7 @@ def test_every_dither_asked_for_obeys_budget_limits_and_clearances(
     night = DitheredNight(policy, looks=True, **telescope).live(6)
     night.tell(ev.Vibrations(lines_hz=tuple(vibrations)))
     if due:
-        night.state = replace(night.state, dither_due_since_ns_utc=1)
+        night.state = changed(night.state, dither_due_since_ns_utc=1)
     known = len(night.requests)
     night.live(40)
     view = night.view

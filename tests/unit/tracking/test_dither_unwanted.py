@@ -6,11 +6,11 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither import CALM_S, TELL_EVERY_S
 from service.tracking.dither_request import GONE_WITHIN_S, DitherPhase, total_m
 from service.tracking.products import MeasureState
-from service.tracking.state import AcquisitionStage
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
 
@@ -56,21 +56,21 @@ def story():
 
 class TestOffByTheOperator:
     def test_a_stop_that_fails_is_repeated_until_the_status_shows_none(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         assert story.tell(cmd.StopDither()) == (stopping(story),)
         story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
         asked = of_kind(playing(story, dither, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
         assert NOT_STOPPED in story.alarms
-        assert story.state.dither_policy.phase is DitherPhase.OFF
-        assert dither.id in story.state.dither_policy.reason
+        assert story.state.dithers.policy.phase is DitherPhase.OFF
+        assert dither.id in story.state.dithers.policy.reason
         assert not silent(story, 60)
         assert NOT_STOPPED not in story.alarms
-        assert story.state.dither_policy.reason == "stopped by the operator"
+        assert story.state.dithers.policy.reason == "stopped by the operator"
 
     def test_a_start_that_overtakes_the_stop_is_stopped_too(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         story.tell(cmd.StopDither())
         accept(story, dither)
         assert of_kind(playing(story, dither, 4), DitherStop)
@@ -78,7 +78,7 @@ class TestOffByTheOperator:
         assert not story.alarms
 
     def test_a_status_from_before_the_stop_is_no_alarm_and_nothing_is_asked_twice(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
         assert not playing(story, dither)
@@ -87,40 +87,40 @@ class TestOffByTheOperator:
 
     @pytest.mark.parametrize("name", ["operator-1", "noisy-1", "acquire-1"])
     def test_whatever_of_the_services_it_is(self, story, name):
-        dither = named(story.state.dither, name)
+        dither = named(story.state.dithers.dither, name)
         story.tell(cmd.StopDither())
         assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_somebody_elses_is_left_alone_and_told_as_it_is(self, story):
-        dither = named(story.state.dither, "engineer-1")
+        dither = named(story.state.dithers.dither, "engineer-1")
         story.tell(cmd.StopDither())
         assert not playing(story, dither, 10)
         assert not story.alarms
 
     def test_what_it_costs_is_what_the_rtc_plays(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
         playing(story, dither, 2700)  # four and a half of its memories
         expected = pytest.approx(total_m(dither.request), rel=0.01)
-        assert story.state.dither_policy.mean_cost_m == expected
+        assert story.state.dithers.policy.mean_cost_m == expected
 
     @pytest.mark.parametrize("alarm", ["loop-diverging", "edge-slip"])
     def test_a_loop_out_of_hand_keeps_none_on_the_mirror(self, story, alarm):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
         story.tell(ev.ConditionChanged(name=alarm, text="x"))
         assert of_kind(playing(story, dither, 4), DitherStop)
 
     def test_nobody_knows_whose_it_is_while_two_rtcs_send(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         story.tell(cmd.StopDither())
         story.tell(ev.ConditionChanged(name="second-rtc", text="x"))
         assert not playing(story, dither, 4)
 
     def test_the_alarm_ends_with_the_rtc(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         story.tell(cmd.StopDither())
         playing(story, dither, 10)
         assert NOT_STOPPED in story.alarms
@@ -128,12 +128,12 @@ class TestOffByTheOperator:
         assert NOT_STOPPED not in story.alarms
 
     def test_an_rtc_that_does_not_answer_keeps_no_matrix_waiting(self, story):
-        before = story.state.no_dither_before_ns_utc
+        before = story.state.dithers.no_dither_before_ns_utc
         story.tell(ev.JobFailed(effect=stopping(story), text="no answer"))
-        assert story.state.no_dither_before_ns_utc == before
+        assert story.state.dithers.no_dither_before_ns_utc == before
 
     def test_the_operator_may_have_it_again(self, story):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         story.tell(cmd.StopDither())
         playing(story, dither, round(GONE_WITHIN_S) + 2)
@@ -151,14 +151,14 @@ class TestTooStrong:
     @pytest.fixture
     def loud(self, story):
         """80 nm where 8 nm were asked for."""
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         return louder(dither)
 
     def test_it_is_stopped_at_once_with_an_alarm_that_tells_how_strong_it_was(self, story, loud):
         assert playing(story, loud) == (stopping(story),)
-        assert story.state.dither is None
-        text = next(a.text for a in story.state.alarms if a.name == OVER_BUDGET)
+        assert story.state.dithers.dither is None
+        text = next(a.text for a in story.state.alarms.active if a.name == OVER_BUDGET)
         assert "a dither of 80 nm RMS in all, more than the budget of 8 nm" in text
         assert "dither.other" in story.logged
 
@@ -168,11 +168,11 @@ class TestTooStrong:
         playing(story, loud)
         assert not of_kind(silent(story, round(CALM_S) - 2), DitherRequest)
         assert OVER_BUDGET in story.alarms
-        assert "too strong" in story.state.dither_policy.reason
+        assert "too strong" in story.state.dithers.policy.reason
         assert of_kind(silent(story, 4), DitherRequest)
-        accept(story, story.state.dither)
+        accept(story, story.state.dithers.dither)
         assert OVER_BUDGET in story.alarms
-        playing(story, story.state.dither)
+        playing(story, story.state.dithers.dither)
         assert OVER_BUDGET not in story.alarms
 
     def test_an_rtc_that_does_so_always_does_it_for_a_second_a_minute(self, story, loud):
@@ -182,7 +182,7 @@ class TestTooStrong:
             for effect in playing(story, on) if on is not None else silent(story):
                 match effect:
                     case ev.Ask(request=DitherRequest()):
-                        dither = story.state.dither
+                        dither = story.state.dithers.dither
                         accept(story, dither)
                         on, n_tried = louder(dither), n_tried + 1
                     case ev.Ask(request=DitherStop()):
@@ -197,7 +197,7 @@ class TestTooStrong:
         asked = of_kind(playing(story, loud, 20), DitherStop)
         assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
         assert {OVER_BUDGET, NOT_STOPPED} <= story.alarms
-        assert story.state.dither.id == loud.id
+        assert story.state.dithers.dither.id == loud.id
         silent(story)
         assert NOT_STOPPED not in story.alarms
         assert "dither-lost" not in story.alarms
@@ -205,11 +205,11 @@ class TestTooStrong:
     def test_rounding_is_no_excess(self, story, loud):
         assert not playing(story, louder(loud, 0.1 * 1.0005), 3)
         assert not story.alarms
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
 
     def test_within_the_budget_the_rtcs_word_counts(self, story):
         story.see(n_windows=12)
-        weak = louder(story.state.dither, 0.5)
+        weak = louder(story.state.dithers.dither, 0.5)
         accept(story, weak)
         assert not playing(story, weak, 3)
         assert not story.alarms
@@ -220,7 +220,7 @@ class TestTooStrong:
     ):
         story.tell(cmd.StopDither())
         story.tell(cmd.StartDither(amplitude_m=10e-9, over_budget=True))
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         effects = playing(story, louder(dither, by), 3)
         assert bool(of_kind(effects, DitherStop)) is stopped
@@ -234,11 +234,11 @@ class TestTooStrong:
 
 
 def test_settings_that_forbid_it_do_not_tolerate_what_an_earlier_service_has_left():
-    dither = Story().meet().state.dither
+    dither = Story().meet().state.dithers.dither
     story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
     asked = of_kind(playing(story, dither, 20), DitherStop)
     assert len(asked) == pytest.approx(20 / TELL_EVERY_S, abs=1)
-    assert "the settings forbid" in next(a.text for a in story.state.alarms)
+    assert "the settings forbid" in next(a.text for a in story.state.alarms.active)
 
 
 class TestByTheFrames:
@@ -246,9 +246,9 @@ class TestByTheFrames:
 
     @pytest.fixture
     def on(self, story):
-        accept(story, story.state.dither)
-        playing(story, story.state.dither)
-        return story.state.dither
+        accept(story, story.state.dithers.dither)
+        playing(story, story.state.dithers.dither)
+        return story.state.dithers.dither
 
     def measured(self, story, dither, by, text="the frames hold much"):
         asked = total_m(dither.request)
@@ -258,17 +258,17 @@ class TestByTheFrames:
 
     def test_too_strong_it_is_stopped_at_once_and_named(self, story, on):
         assert of_kind(self.measured(story, on, 20.0), DitherStop)
-        assert story.state.dither is None
-        (alarm,) = [a for a in story.state.alarms if a.name == OVER_BUDGET]
+        assert story.state.dithers.dither is None
+        (alarm,) = [a for a in story.state.alarms.active if a.name == OVER_BUDGET]
         assert "the frames hold much; the budget is 8 nm" in alarm.text
 
     def test_a_status_that_goes_on_saying_all_is_well_ends_no_alarm(self, story, on):
         self.measured(story, on, 20.0)
         assert of_kind(silent(story, round(CALM_S) + 3), DitherRequest)
-        accept(story, story.state.dither)
-        playing(story, story.state.dither, 2)
+        accept(story, story.state.dithers.dither)
+        playing(story, story.state.dithers.dither, 2)
         assert OVER_BUDGET in story.alarms
-        self.measured(story, story.state.dither, 1.0, text="")
+        self.measured(story, story.state.dithers.dither, 1.0, text="")
         assert OVER_BUDGET not in story.alarms
 
     def test_one_that_is_not_stopped_is_told_again_and_again(self, story, on):
@@ -279,7 +279,7 @@ class TestByTheFrames:
 
     def test_otherwise_than_asked_but_within_the_budget_it_is_named_and_goes_on(self, story, on):
         assert not self.measured(story, on, 0.1)
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         assert NOT_AS_ASKED in story.alarms
         self.measured(story, on, 1.0, text="")
         assert NOT_AS_ASKED not in story.alarms
@@ -291,7 +291,7 @@ class TestByTheFrames:
             modes=(501,), frequency_hz=(250.0,), amplitude_m=15e-9, over_budget=True
         )
         story.tell(meant)
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         playing(story, dither)
         assert not self.measured(story, dither, 1.05)
@@ -303,17 +303,17 @@ class TestByTheFrames:
         story.tell(ev.SessionStarted(session="s2"))
         view = rtc(session="s2", loop="open", gains=(0.0,) * 594)
         story.tell(view)
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         self.measured(story, dither, 5.0)
-        assert story.state.acquisition.stage is AcquisitionStage.FAILED
-        assert "the frames hold much" in story.state.acquisition.text
+        assert story.state.operations.acquisition.stage is AcquisitionStage.FAILED
+        assert "the frames hold much" in story.state.operations.acquisition.text
 
     def test_a_noisy_matrix_ends_and_says_why(self, story):
         story.tell(cmd.StopDither())
         story.tell(rtc(), after_s=1.0)
         story.tell(cmd.MeasureNoisy(id="noisy-1"))
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         accept(story, dither)
         playing(story, dither)
         self.measured(story, dither, 5.0)

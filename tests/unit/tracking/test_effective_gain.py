@@ -10,6 +10,7 @@ from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking.state import Mode
 from service.wire import LoopRequest
+from tests.states import changed
 from tests.unit.tracking.situations import N_MODES, START_NS, Story, of_kind
 
 MEASURED = tuple(
@@ -22,8 +23,8 @@ MEASURED = tuple(
 def story():
     story = Story(Mode.HOLD).meet()
     story.see(n_windows=2)
-    known = replace(story.state.registration, optical_gains=MEASURED)
-    story.state = replace(story.state, registration=known)
+    known = replace(story.state.alpha.registration, optical_gains=MEASURED)
+    story.state = changed(story.state, registration=known)
     return story
 
 
@@ -35,7 +36,7 @@ def test_they_act_alike_on_every_controlled_mode_and_the_gate_is_asked(story):
     in_effect = np.array(asked.gains[:400]) * gain_table(MEASURED, 400).optical_gain
     np.testing.assert_allclose(in_effect, 0.3, rtol=1e-12)
     assert set(asked.gains[400:]) == {0.0}
-    assert "gain 0.3 in effect on every mode, by the gain table" in story.state.loop_command.text
+    assert "gain 0.3 in effect on every mode, by the gain table" in story.state.loop.command.text
 
 
 def test_asked_twice_they_are_the_same(story):

@@ -47,7 +47,7 @@ class Late(Story):
 
     @property
     def doubted(self):
-        registration = self.state.registration
+        registration = self.state.alpha.registration
         return bool(registration.doubt) or registration.validity.level is Validity.INVALID
 
     def at(self, s):
@@ -107,7 +107,7 @@ class TestLookThatBarks:
         night.window(14)
         night.look(9, ELSEWHERE, done_s=15)
         assert not night.doubted
-        assert "dithered window" in night.state.passive_unavailable_reason
+        assert "dithered window" in night.state.alpha.passive_unavailable_reason
 
     def test_a_clock_that_was_set_back_keeps_no_doubt_for_an_hour(self, night):
         night.look(3600, ELSEWHERE)
@@ -130,10 +130,10 @@ class TestWindowFarOut:
         assert night.doubted
         night.window(9, fitted_s=11)
         assert night.doubted
-        assert night.state.windows_outlying == 0
+        assert night.state.windows.outlying == 0
         night.window(12)
         assert not night.doubted
-        assert night.state.windows_outlying == 1
+        assert night.state.windows.outlying == 1
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -161,26 +161,26 @@ def test_in_whatever_order_it_comes_nothing_taken_before_a_doubt_ends_it(evidenc
 
 class TestLoopOutOfHand:
     def test_a_window_of_it_counts_for_nothing_once_it_is_over_either(self, night):
-        before = night.state.windows_accepted
+        before = night.state.windows.accepted
         night.at(10)
         night.tell(ev.ConditionChanged(name="loop-diverging", text="found"))
         night.at(14)
         night.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
         night.window(13, fitted_s=15)
-        assert night.state.windows_accepted == before
+        assert night.state.windows.accepted == before
         assert "diverging" in night.state.log[-1].text
         night.window(17)
-        assert night.state.windows_accepted == before + 1
+        assert night.state.windows.accepted == before + 1
 
     def test_the_frames_say_until_when(self, night):
-        before = night.state.windows_accepted
+        before = night.state.windows.accepted
         night.at(10)
         night.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         over_ns = night.zero_ns + round(14.8 * SECOND)
         night.at(14)
         night.tell(ev.ConditionChanged(name="edge-slip", text="back", over=True, t_ns_utc=over_ns))
         night.window(16, began_ns_utc=night.zero_ns + round(14.2 * SECOND))
-        assert night.state.windows_accepted == before
+        assert night.state.windows.accepted == before
 
     def test_a_look_at_it_counts_for_nothing_either(self, night):
         night.at(10)
@@ -189,7 +189,7 @@ class TestLoopOutOfHand:
         night.tell(ev.ConditionChanged(name="loop-diverging", text="calm", over=True))
         night.look(13, ELSEWHERE, done_s=15)
         assert not night.doubted
-        assert "not used" in night.state.passive_unavailable_reason
+        assert "not used" in night.state.alpha.passive_unavailable_reason
 
 
 def test_a_look_at_a_session_that_is_over_counts_for_nothing(night):
@@ -198,7 +198,7 @@ def test_a_look_at_a_session_that_is_over_counts_for_nothing(night):
     night.tell(rtc(session="s2", t_ns=night.now_ns))
     end_ns = night.zero_ns + 9 * SECOND
     night.tell(ev.PassiveFitted(estimate=watched(ELSEWHERE), t_ns_utc=end_ns), 1.0)
-    assert not night.state.registration.doubt
+    assert not night.state.alpha.registration.doubt
 
 
 class TestSlew:
@@ -225,7 +225,7 @@ class TestSlew:
 
 
 def made(story, matrix_id="cm-1", **changes):
-    known, view = story.state.registration, story.state.rtc
+    known, view = story.state.alpha.registration, story.state.loop.rtc
     return record(
         matrix_id,
         **({"judged": judged(known, view), "alpha": known.alpha} | changes),
@@ -247,22 +247,22 @@ class TestVerdicts:
             night.tell(cmd.Approve(id="cm-1"))
 
     def test_a_margin_of_the_place_before_a_jump_calms_nobody(self, night):
-        then = judged(night.state.registration, night.state.rtc)
+        then = judged(night.state.alpha.registration, night.state.loop.rtc)
         for end_s in (10, 12, 14):
             night.window(end_s, THERE)
-        now = judged(night.state.registration, night.state.rtc)
+        now = judged(night.state.alpha.registration, night.state.loop.rtc)
         short = verdict(accepted=False)
         night.tell(ev.MarginJudged(id="initial", verdict=short, judged=now))
         assert "margin" in night.alarms
         night.tell(ev.MarginJudged(id="initial", verdict=verdict(), judged=then))
         assert "margin" in night.alarms
-        assert not night.state.margin.accepted
+        assert not night.state.matrices.margin.accepted
 
     def test_a_margin_worked_out_while_alpha_came_into_doubt_is_none(self, night):
-        then = judged(night.state.registration, night.state.rtc)
+        then = judged(night.state.alpha.registration, night.state.loop.rtc)
         night.look(10, ELSEWHERE)
         night.tell(ev.MarginJudged(id="initial", verdict=verdict(), judged=then))
-        assert night.state.margin is None
+        assert night.state.matrices.margin is None
 
     def test_what_is_applied_after_a_jump_is_not_as_good_as_it_was_judged_before(self):
         night = Late(Mode.PROPOSE)
@@ -271,14 +271,14 @@ class TestVerdicts:
         for end_s in (10, 12, 14):
             night.window(end_s, THERE)
         effects = night.acknowledge("cm-1")
-        assert night.state.in_use == "cm-1"
-        assert night.state.margin is None
+        assert night.state.matrices.in_use == "cm-1"
+        assert night.state.matrices.margin is None
         assert of_kind(effects, ev.JudgeMatrix)
 
 
 def test_a_window_from_before_a_dither_was_lost_has_not_found_it_again(night):
     night.at(10)
-    asked = night.state.dither
+    asked = night.state.dithers.dither
     night.tell(dither_answered(asked.id, accepted=True, reason="", start_seq=10))
     night.tell(ev.DitherSilent(id=asked.id, silent_s=1.0))
     assert "dither-lost" in night.alarms
@@ -293,12 +293,12 @@ def test_what_was_seen_from_afar_before_an_acquisition_began_anew_counts_for_not
     night.at(10)
     night.tell(rtc(t_ns=night.now_ns, **open_loop))
     night.tell(cmd.Acquire())
-    dither = night.state.dither
+    dither = night.state.dithers.dither
     found = estimate(ALPHA, t_ns=night.zero_ns + 9 * SECOND, modes=dither.request.modes)
     found = replace(found, covariance=np.diag([0.01, 0.01, 3e-4, 1e-3]) ** 2)
     far = WideCaptureEstimate(estimate=found, unexplained=0.05, n_starts=1)
     night.tell(ev.WideCaptureFitted(found=far))
-    assert night.state.acquisition.alpha is None
+    assert night.state.operations.acquisition.alpha is None
     later = replace(found, t_ns_utc=night.zero_ns + 14 * SECOND)
     night.tell(ev.WideCaptureFitted(found=replace(far, estimate=later)), 5.0)
-    assert night.state.acquisition.alpha is not None
+    assert night.state.operations.acquisition.alpha is not None

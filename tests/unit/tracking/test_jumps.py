@@ -155,7 +155,7 @@ def test_a_large_jump_inside_a_window_is_told_by_that_window_and_the_next(share)
     for k in range(1, 19):
         sky.window(k * WINDOW_S)
     assert [at_s for at_s, name in sky.flags() if name == JUMP] == [40.0 + 2 * WINDOW_S]
-    error = sky.story.state.registration.alpha.vector - sky.mean(45.0, WINDOW_S)
+    error = sky.story.state.alpha.registration.alpha.vector - sky.mean(45.0, WINDOW_S)
     assert np.all(np.abs(error) < 4 * WINDOW)
 
 

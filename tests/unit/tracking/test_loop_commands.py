@@ -37,8 +37,8 @@ def test_opening_says_nothing_of_the_rest(story):
         None,
         None,
     )
-    assert story.state.loop_command.state is CommandState.ASKED
-    assert story.state.loop_command.text == "open"
+    assert story.state.loop.command.state is CommandState.ASKED
+    assert story.state.loop.command.text == "open"
 
 
 def test_gains_go_to_their_groups_and_the_other_modes_keep_theirs(story):
@@ -70,7 +70,7 @@ def test_an_open_loop_does_not_tell_its_gains_so_all_must_be_named(story):
 def test_what_the_loop_cannot_be_is_refused(story, changes, words):
     with pytest.raises(CommandError, match=words):
         ask(story, **changes)
-    assert story.state.loop_command is None
+    assert story.state.loop.command is None
 
 
 def test_nobody_changes_the_loop_of_nobody():
@@ -82,7 +82,7 @@ def test_nobody_changes_the_loop_of_nobody():
 def test_the_rtcs_answer_is_kept_with_the_command(story):
     asked = ask(story, leak=0.99)
     story.tell(loop_answered(asked.id, accepted=False, reason="range: leak 0.99"))
-    last = story.state.loop_command
+    last = story.state.loop.command
     assert (last.state, last.reason) == (CommandState.REFUSED, "range: leak 0.99")
     assert story.logged[-1] == "loop.refused"
 
@@ -90,7 +90,7 @@ def test_the_rtcs_answer_is_kept_with_the_command(story):
 def test_no_answer_is_told_as_not_known(story):
     asked = ask(story, leak=0.99)
     story.tell(ev.JobFailed(effect=ev.Ask(request=asked), text="no answer from the RTC"))
-    assert story.state.loop_command.state is CommandState.FAILED
+    assert story.state.loop.command.state is CommandState.FAILED
 
 
 def test_a_late_answer_does_not_settle_a_later_command(story):
@@ -98,7 +98,7 @@ def test_a_late_answer_does_not_settle_a_later_command(story):
     story.now_ns += 1
     ask(story, leak=0.98)
     story.tell(loop_answered(first.id, accepted=True, reason=""))
-    assert story.state.loop_command.state is CommandState.ASKED
+    assert story.state.loop.command.state is CommandState.ASKED
 
 
 def test_other_gains_have_another_margin():
@@ -117,7 +117,7 @@ def test_other_gains_have_another_margin():
 def test_a_verdict_on_the_gains_before_is_dropped_and_asked_for_again():
     story = Story(Mode.HOLD).meet()
     story.see(n_windows=2)
-    known = story.state.registration
+    known = story.state.alpha.registration
     before = ev.MarginJudged(
         id="initial", verdict=verdict(accepted=False), judged=judged(known, rtc())
     )
@@ -133,7 +133,7 @@ def test_a_ramp_tries_the_papers_groups(story):
     (asked,) = of_kind(story.tell(cmd.Ramp(gains=(0.2, 0.4))), RampRequest)
     assert asked.groups == ((0, 1), (2, 99), (100, 399))
     assert (asked.gains, asked.frames_per_gain) == ((0.2, 0.4), 1000)
-    assert story.state.loop_command.lasts_s == 6.0
+    assert story.state.loop.command.lasts_s == 6.0
 
 
 def test_a_ramp_of_few_modes_has_fewer_groups(story):
@@ -153,7 +153,7 @@ def test_a_ramp_needs_a_closed_loop_and_modes_it_controls(story):
 def test_nothing_is_made_while_gains_are_only_tried():
     story = Story(Mode.AUTO).meet()
     story.tell(cmd.Ramp(gains=(0.2, 0.4)))
-    story.tell(loop_answered(story.state.loop_command.id, accepted=True, reason=""))
+    story.tell(loop_answered(story.state.loop.command.id, accepted=True, reason=""))
     story.see(n_windows=2, every_s=2.0)
     assert not story.asked(ev.MakeMatrix)
     story.wait(3)
@@ -173,7 +173,7 @@ class TestAMeasurementGivenUp:
         assert len(of_kind(story.wait(2.2 * CLOSE_AGAIN_EVERY_S), LoopRequest)) == 2
         story.tell(rtc())
         assert not of_kind(story.wait(60), LoopRequest)
-        assert story.state.close_since_ns_utc is None
+        assert story.state.loop.close_since_ns_utc is None
 
     def test_a_loop_that_opens_only_then_is_closed_too(self, story):
         self.begin(story, loop="closed")
@@ -197,4 +197,4 @@ class TestAMeasurementGivenUp:
         self.begin(story)
         story.tell(cmd.GiveUp(id="im-1"))
         story.wait(3700, every_s=60)
-        assert story.state.close_since_ns_utc is None
+        assert story.state.loop.close_since_ns_utc is None

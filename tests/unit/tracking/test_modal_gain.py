@@ -68,7 +68,7 @@ def test_every_window_brings_those_of_its_lines():
     story = Story(Mode.HOLD).meet()
     modes, gains = (501, 519, 537, 555), np.array([0.5, 0.55, 0.6, 0.65]) * np.exp(0.01j)
     story.see(modes=modes, optical_gain=gains, gain_sigma=np.full(4, 0.01))
-    found = story.state.registration.optical_gains
+    found = story.state.alpha.registration.optical_gains
     assert [gain.mode for gain in found] == list(modes)
     np.testing.assert_allclose([gain.gain for gain in found], np.abs(gains))
 
@@ -76,4 +76,4 @@ def test_every_window_brings_those_of_its_lines():
 def test_a_window_that_does_not_know_its_modes_brings_none():
     story = Story(Mode.HOLD).meet()
     story.tell(ev.WindowFitted(estimate=estimate()))
-    assert story.state.registration.optical_gains == ()
+    assert story.state.alpha.registration.optical_gains == ()

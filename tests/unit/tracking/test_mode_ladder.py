@@ -47,8 +47,8 @@ class Night(Story):
             state,
             n_modes=n_modes,
             created_ns_utc=self.now_ns,
-            alpha=self.state.registration.alpha,
-            judged=judged(self.state.registration, self.state.rtc, n_modes),
+            alpha=self.state.alpha.registration.alpha,
+            judged=judged(self.state.alpha.registration, self.state.loop.rtc, n_modes),
         )
         effects = self.tell(
             ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes, why_fewer=why)
@@ -66,7 +66,7 @@ class Night(Story):
         self.make_for(more, 500)
         short = verdict(accepted=False, radius=0.97)
         self.wait(6)
-        effects = self.tell(ev.MarginJudged(id=self.state.in_use, verdict=short))
+        effects = self.tell(ev.MarginJudged(id=self.state.matrices.in_use, verdict=short))
         (fewer,) = of_kind((*effects, *self.wait(5)), ev.MakeMatrix)
         self.make_for(fewer, n_modes, why="500 modes: too little margin")
         return self
@@ -96,10 +96,10 @@ def test_raising_never_ends_below_the_present_number():
 
 def test_a_short_margin_lowers_the_number_of_modes_and_says_why():
     night = Night().lowered()
-    assert night.state.rtc.n_controlled == 300
+    assert night.state.loop.rtc.n_controlled == 300
     entry = next(e for e in night.state.log if e.name == "modes.lowered")
     assert entry.text.endswith("has 300 modes, 500 are controlled: 500 modes: too little margin")
-    assert night.state.mode_limit.n_modes == 300
+    assert night.state.matrices.mode_limit.n_modes == 300
 
 
 def test_more_are_tried_after_a_wait_while_the_margin_is_comfortable():
@@ -112,7 +112,7 @@ def test_more_are_tried_after_a_wait_while_the_margin_is_comfortable():
 @pytest.mark.parametrize("radius", [0.93, 0.949])
 def test_but_not_while_the_margin_is_only_just_enough(radius):
     night = Night().lowered()
-    night.tell(ev.MarginJudged(id=night.state.in_use, verdict=verdict(radius=radius)))
+    night.tell(ev.MarginJudged(id=night.state.matrices.in_use, verdict=verdict(radius=radius)))
     assert not of_kind(night.wait(3 * FIRST_WAIT_S), ev.MakeMatrix)
 
 
@@ -122,7 +122,7 @@ def test_a_raise_the_gate_refuses_doubles_the_wait_and_publishes_nothing():
     sent = len(night.asked(ev.SendMatrix))
     night.make_for(more, 500, state=MatrixState.REFUSED)
     assert len(night.asked(ev.SendMatrix)) == sent
-    assert night.state.mode_limit.wait_s == 2 * FIRST_WAIT_S
+    assert night.state.matrices.mode_limit.wait_s == 2 * FIRST_WAIT_S
     assert not of_kind(night.wait(2 * FIRST_WAIT_S - 5), ev.MakeMatrix)
     assert of_kind(night.wait(10), ev.MakeMatrix)
 
@@ -140,7 +140,7 @@ def test_a_raise_that_passes_is_published_and_logged():
     night = Night().lowered()
     (more,) = of_kind(night.wait(FIRST_WAIT_S + 5), ev.MakeMatrix)
     night.make_for(more, 500)
-    assert night.state.rtc.n_controlled == 500
+    assert night.state.loop.rtc.n_controlled == 500
     assert night.state.log[-1].name != "modes.lowered"
     raised = [e.text for e in night.state.log if e.name == "modes.raised"]
     assert raised[-1].endswith("has 500 modes, 300 are controlled")
@@ -150,7 +150,7 @@ def test_a_number_lowered_again_soon_waits_longer_and_never_for_ever():
     night = Night().lowered()
     waits = []
     for _ in range(8):
-        limit = night.state.mode_limit
+        limit = night.state.matrices.mode_limit
         waits.append(limit.wait_s)
         n_windows = round(limit.wait_s / 30) + 2
         (more,) = of_kind(night.see(n_windows=n_windows, every_s=30), ev.MakeMatrix)
@@ -205,14 +205,14 @@ class Declined(Night):
 
     def make_for_nobody(self, effect):
         self.made += 1
-        registration = self.state.registration
+        registration = self.state.alpha.registration
         made = record(
             f"cm-{self.made}",
             n_modes=effect.n_modes,
             created_ns_utc=self.now_ns,
             alpha=registration.alpha,
             sigma=registration.sigma,
-            judged=judged(registration, self.state.rtc, effect.n_modes),
+            judged=judged(registration, self.state.loop.rtc, effect.n_modes),
         )
         return self.tell(ev.MatrixMade(record=made, wanted=False, asked_modes=effect.n_modes))
 
@@ -237,7 +237,7 @@ def nobody_answers(night, _name, _effects):
 def test_an_operator_who_declines_more_modes_is_not_asked_again_for_an_hour():
     night = Declined(Mode.PROPOSE)
     assert [made.n_modes for made in night.for_s(OPERATORS_WAIT_S - 60, the_operator)] == [500]
-    limit = night.state.mode_limit
+    limit = night.state.matrices.mode_limit
     assert (limit.n_modes, limit.wait_s) == (400, OPERATORS_WAIT_S)
     assert limit.reason == "cm-2 was discarded: 400 will do"
     assert [made.n_modes for made in night.for_s(120, the_operator)] == [500]
@@ -248,7 +248,7 @@ def test_an_rtc_that_will_not_have_more_modes_is_asked_less_and_less(decline):
     night = Declined()
     asked = night.for_s(900, decline)
     assert [made.n_modes for made in asked] == [500] * 4  # 60, 120, 240, 480 s
-    assert night.state.mode_limit.wait_s == 480.0
+    assert night.state.matrices.mode_limit.wait_s == 480.0
 
 
 def test_so_is_a_gate_that_judges_more_modes_again_and_then_refuses_them():
@@ -259,7 +259,10 @@ def test_so_is_a_gate_that_judges_more_modes_again_and_then_refuses_them():
     no = verdict(accepted=False, radius=0.97)
     night.tell(ev.ProposalJudged(id="cm-2", verdict=no, judged=judged))
     assert night.matrix_state("cm-2") is MatrixState.REFUSED
-    assert (night.state.mode_limit.n_modes, night.state.mode_limit.wait_s) == (400, FIRST_WAIT_S)
+    assert (night.state.matrices.mode_limit.n_modes, night.state.matrices.mode_limit.wait_s) == (
+        400,
+        FIRST_WAIT_S,
+    )
     assert not of_kind(night.wait(FIRST_WAIT_S - 5), ev.MakeMatrix)
 
 
@@ -276,7 +279,7 @@ def test_declining_an_update_of_the_modes_in_use_says_nothing_of_more():
     (update,) = of_kind(night.see(moved(shift_x_subap=0.05), n_windows=4), ev.MakeMatrix)
     night.make_for(update, 400)
     night.tell(cmd.Reject(id="cm-2"))
-    assert night.state.mode_limit is None
+    assert night.state.matrices.mode_limit is None
 
 
 def test_a_proposal_that_another_one_replaces_has_not_been_declined():
@@ -285,7 +288,7 @@ def test_a_proposal_that_another_one_replaces_has_not_been_declined():
     night.make_for(more, 500)
     night.make("cm-other", n_modes=400)
     assert night.matrix_state("cm-2") is MatrixState.DISCARDED
-    assert night.state.mode_limit is None
+    assert night.state.matrices.mode_limit is None
 
 
 def test_an_operators_own_request_for_more_is_heard_at_once_and_lifts_the_limit():
@@ -293,13 +296,13 @@ def test_an_operators_own_request_for_more_is_heard_at_once_and_lifts_the_limit(
     night.for_s(20, the_operator)
     (asked,) = of_kind(night.tell(cmd.Refit(n_modes=500)), ev.MakeMatrix)
     night.make_for(asked, 500)
-    assert night.state.mode_limit.n_modes == 500
+    assert night.state.matrices.mode_limit.n_modes == 500
 
 
 def test_a_limit_found_by_the_gate_does_not_shorten_an_operators_no():
     night = Declined(Mode.PROPOSE)
     night.for_s(20, the_operator)
-    until_ns = night.state.mode_limit.until_ns_utc
+    until_ns = night.state.matrices.mode_limit.until_ns_utc
     (asked,) = of_kind(night.tell(cmd.Refit(n_modes=500)), ev.MakeMatrix)
     night.make_for(asked, 500, state=MatrixState.REFUSED)
-    assert night.state.mode_limit.until_ns_utc >= until_ns
+    assert night.state.matrices.mode_limit.until_ns_utc >= until_ns

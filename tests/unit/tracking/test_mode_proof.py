@@ -15,6 +15,7 @@ from service.tracking.mode_proof import TRIES, n_proven_modes, proven_modes
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
+from tests.states import changed
 from tests.unit.tracking.situations import N_MODES, POLICY, estimate, foreign, of_kind
 from tests.unit.tracking.world import STEP_S, WINDOW_S, World
 
@@ -30,7 +31,7 @@ class Shown(World):
 
     def tell(self, event, after_s=0.0):
         if isinstance(event, ev.SessionStarted):
-            self.state = replace(self.state, mode_proof=ModeProof())
+            self.state = changed(self.state, mode_proof=ModeProof())
         return super().tell(event, after_s)
 
     def of_matrices(self, effect):
@@ -42,7 +43,7 @@ class Shown(World):
     def windows(self):
         playing = self.playing
         self.since_window_s = 0.0 if playing is None else self.since_window_s + STEP_S
-        if self.since_window_s < WINDOW_S + STEP_S or self.state.dither is None:
+        if self.since_window_s < WINDOW_S + STEP_S or self.state.dithers.dither is None:
             return
         self.since_window_s = STEP_S
         modes = playing.request.modes
@@ -79,7 +80,7 @@ def test_modes_of_the_rtcs_own_matrix_are_known_and_all_others_are_shown_first()
     )
     before = of_kind(world.effects[:first_of_more], DitherRequest)
     assert set(range(400, 450)) <= {mode for request in before for mode in request.modes}
-    assert world.state.rtc.n_controlled == 450
+    assert world.state.loop.rtc.n_controlled == 450
     assert world.alarms == set()
 
 
@@ -101,7 +102,7 @@ def test_a_mode_that_answers_otherwise_is_named_and_no_matrix_controls_it(answer
     alarm = world.state.alarm(alarms.MODES_CONTRARY)
     assert alarm.text.startswith("mode 430 has not answered the dither")
     assert max(world.made) <= 430
-    assert world.state.rtc.n_controlled <= 430
+    assert world.state.loop.rtc.n_controlled <= 430
 
 
 def test_it_is_shown_again_after_a_wait_and_the_alarm_goes_once_it_answers():
@@ -111,7 +112,7 @@ def test_it_is_shown_again_after_a_wait_and_the_alarm_goes_once_it_answers():
     world.pass_(120.0)
     assert len(world.shown) > n_shown
     assert world.alarms == set()
-    assert world.state.rtc.n_controlled == 450
+    assert world.state.loop.rtc.n_controlled == 450
 
 
 def test_where_the_rtc_does_not_offer_its_matrix_every_mode_is_shown():
@@ -144,20 +145,20 @@ def test_an_operator_cannot_send_what_is_not_proven_and_is_told_what_to_do():
 
 def test_what_has_been_in_use_can_be_sent_again_whatever_is_proven():
     world = Shown().pass_(60.0)
-    world.state = replace(world.state, mode_proof=ModeProof())
+    world.state = changed(world.state, mode_proof=ModeProof())
     world.tell(cmd.Rollback())
     assert of_kind(world.effects[-3:], ev.RepublishMatrix)
 
 
 def test_dithers_that_show_nothing_are_given_up_for_a_while():
     world = Shown().pass_(6.0)
-    quiet = replace(world.state, mode_proof=ModeProof(proven=frozenset(range(400))))
+    quiet = changed(world.state, mode_proof=ModeProof(proven=frozenset(range(400))))
     world.state = quiet
     world.answers_of = dict.fromkeys(range(400, 450), 0.01 + 0.0j)
     world.windows = lambda: None
     world.pass_(120.0)
     assert 1 <= len(world.shown) <= 2 * TRIES + 2
-    assert "have not been seen to answer in 3 dithers" in world.state.mode_limit.reason
+    assert "have not been seen to answer in 3 dithers" in world.state.matrices.mode_limit.reason
 
 
 def test_an_answer_too_noisy_to_tell_proves_nothing_and_accuses_nobody():
@@ -175,7 +176,9 @@ def test_an_answer_too_noisy_to_tell_proves_nothing_and_accuses_nobody():
         )
     )
     assert {500, 501} <= proven_modes(world.state)
-    assert not {502, 503} & (world.state.mode_proof.proven | world.state.mode_proof.contrary)
+    assert not {502, 503} & (
+        world.state.matrices.mode_proof.proven | world.state.matrices.mode_proof.contrary
+    )
 
 
 def test_a_matrix_in_use_proves_its_modes():
@@ -197,7 +200,7 @@ def test_one_window_that_says_otherwise_accuses_nobody():
             gain_sigma=np.full(4, 0.02),
         )
         world.tell(ev.WindowFitted(estimate=seen))
-        assert not world.state.mode_proof.contrary
+        assert not world.state.matrices.mode_proof.contrary
         assert (410 in proven_modes(world.state)) is (gain > 0.0)
     assert world.alarms == set()
 
@@ -205,7 +208,7 @@ def test_one_window_that_says_otherwise_accuses_nobody():
 def test_a_mode_that_the_loop_runs_with_is_not_accused_by_its_dither():
     """The matrix in use is the better witness, and α is followed on."""
     world = Shown({410: 0.6}).pass_(60.0)
-    assert world.state.rtc.n_controlled == 450
+    assert world.state.loop.rtc.n_controlled == 450
     for _ in range(3):
         gains = np.array([0.6, 0.6, 0.6, -0.6], dtype=complex)
         seen = estimate(
@@ -230,7 +233,7 @@ def test_modes_that_nobody_knows_are_shown_after_one_window_where_the_loop_runs_
 def test_a_mode_accused_once_is_shown_again_though_fewer_are_wanted_meanwhile():
     """Mode 30 is named first, and no more than 30 are wanted: 120 is the other half of it."""
     world = Shown({30: 0.0, 120: 0.0}, offered=False).pass_(30.0)
-    assert world.state.mode_limit.n_modes == 30
+    assert world.state.matrices.mode_limit.n_modes == 30
     assert "modes 30, 120 have" in world.state.alarm(alarms.MODES_CONTRARY).text
 
 
@@ -239,7 +242,7 @@ def test_modes_that_were_known_already_do_not_make_a_dither_count_as_one_that_ha
     noisy = dict.fromkeys((0, 1, 2), 0.3 + 0.0j)
     world.answers_of, world.sigma_of = noisy, dict.fromkeys(noisy, 0.2)
     world.pass_(60.0)
-    assert "have not been seen to answer in 3 dithers" in world.state.mode_limit.reason
+    assert "have not been seen to answer in 3 dithers" in world.state.matrices.mode_limit.reason
 
 
 def told(world, gains, answers_as=None, first=410):
@@ -291,8 +294,8 @@ def test_optical_gains_that_change_along_the_basis_are_not_uneven():
     world = Shown().pass_(8.0)
     for _ in range(3):
         told(world, np.linspace(0.3, 0.9, 40).tolist())
-    assert not world.state.mode_proof.uneven
-    assert not world.state.mode_proof.perhaps_uneven
+    assert not world.state.matrices.mode_proof.uneven
+    assert not world.state.matrices.mode_proof.perhaps_uneven
 
 
 def test_a_mode_that_answers_otherwise_is_dithered_no_more_and_its_window_tells_no_alpha():

@@ -16,8 +16,9 @@ from service.tracking import events as ev
 from service.tracking.policy import Offloading
 from service.tracking.registration import OffloadState, Validity
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
 from service.wire import OffloadRequest, Reply
+from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, rtc
 
 LIMITS = Offloading(
@@ -77,7 +78,7 @@ def test_nothing_moves_where_nobody_asked_for_it():
 def test_nothing_moves_while_a_jump_is_suspected():
     story = a_story(n_windows=0)
     story.see(moved(shift_x_subap=0.4))
-    assert story.state.registration.doubt
+    assert story.state.alpha.registration.doubt
     story.wait(3.0)
     assert story.asked(OffloadRequest) == []
 
@@ -101,18 +102,18 @@ def test_where_it_was_drawn_nothing_is_asked_for():
 def test_the_filter_is_told_and_a_window_there_is_no_jump():
     story = a_story()
     answer(story)
-    known = story.state.registration
+    known = story.state.alpha.registration
     np.testing.assert_allclose(known.alpha.vector, AFTER.vector, atol=3e-3)
     assert known.n_windows == 0
     assert known.validity.level is Validity.STALE
-    assert story.state.offload.state is OffloadState.MOVED
+    assert story.state.alpha.offload.state is OffloadState.MOVED
     story.wait(4.0)
     story.see(AFTER, n_windows=2)
-    assert story.state.registration.n_windows == 2
+    assert story.state.alpha.registration.n_windows == 2
     assert not [name for name in story.logged if "jump" in name]
     # and the rest of the way is asked for
     assert len(story.asked(OffloadRequest)) == 2
-    assert story.state.offload.n_moves == 1
+    assert story.state.alpha.offload.n_moves == 1
 
 
 def test_telemetry_of_the_move_itself_measures_nothing():
@@ -120,32 +121,32 @@ def test_telemetry_of_the_move_itself_measures_nothing():
     story.tell(rtc(cm_id="cm-1", t_ns=story.now_ns))
     answer(story)
     story.see(AFTER)
-    assert story.state.windows_refused == 1
-    assert story.state.registration.n_windows == 0
+    assert story.state.windows.refused == 1
+    assert story.state.alpha.registration.n_windows == 0
     story.wait(3.0)
     story.see(AFTER)
-    assert story.state.registration.n_windows == 1
+    assert story.state.alpha.registration.n_windows == 1
 
 
 def test_without_a_reply_it_may_have_moved_or_not():
     story = a_story()
-    before = story.state.registration
+    before = story.state.alpha.registration
     (asked,) = story.asked(OffloadRequest)
     story.tell(ev.JobFailed(effect=ev.Ask(request=asked), text="nobody answered"))
-    known = story.state.registration
+    known = story.state.alpha.registration
     np.testing.assert_array_equal(known.alpha.vector, before.alpha.vector)
     assert np.sqrt(known.covariance[0, 0]) >= 0.06
-    assert story.state.offload.state is OffloadState.FAILED
-    assert story.state.offload.n_moves == 0
+    assert story.state.alpha.offload.state is OffloadState.FAILED
+    assert story.state.alpha.offload.n_moves == 0
     assert "offload.failed" in story.logged
 
 
 def test_a_device_that_refuses_is_asked_again_later_and_alpha_stands():
     story = a_story()
-    before = story.state.registration
+    before = story.state.alpha.registration
     answer(story, accepted=False, reason="busy: the stage is parked")
-    np.testing.assert_array_equal(story.state.registration.alpha.vector, before.alpha.vector)
-    assert story.state.offload.text == "busy: the stage is parked"
+    np.testing.assert_array_equal(story.state.alpha.registration.alpha.vector, before.alpha.vector)
+    assert story.state.alpha.offload.text == "busy: the stage is parked"
     story.see(n_windows=4)
     assert len(story.asked(OffloadRequest)) == 1
     story.see(n_windows=14)
@@ -169,7 +170,7 @@ def restarted(story, tmp_path):
     file = TrackingFile(tmp_path / "tracking.json")
     file.write(saved_of(story.state, story.now_ns))
     now_ns = story.now_ns + 5 * SECOND
-    fresh = TrackerState(system="flao", mode=Mode.AUTO)
+    fresh = tracker_state(system="flao", mode=Mode.AUTO)
     again = Story(Mode.AUTO, story.policy, state=resumed(fresh, file.read(), story.policy, now_ns))
     again.now_ns = now_ns
     return again
@@ -180,8 +181,8 @@ def test_the_reach_is_not_left_though_the_service_restarts_between_two_moves(tmp
     story = a_story(policy=replace(MOVES, offloading=short))
     answer(story)
     again = restarted(story, tmp_path)
-    np.testing.assert_allclose(again.state.offload.total, story.state.offload.total)
-    assert again.state.offload.n_moves == 1
+    np.testing.assert_allclose(again.state.alpha.offload.total, story.state.alpha.offload.total)
+    assert again.state.alpha.offload.n_moves == 1
     again.meet(cm_id="cm-1")
     again.see(moved(shift_x_subap=-0.04, shift_y_subap=0.03), n_windows=20)
     assert again.asked(OffloadRequest) == []
@@ -189,10 +190,10 @@ def test_the_reach_is_not_left_though_the_service_restarts_between_two_moves(tmp
 
 def test_a_move_that_nobody_had_answered_when_the_service_ended_may_have_been_made(tmp_path):
     story = a_story()
-    assert is_urgent(replace(story.state, offload=None), story.state)
+    assert is_urgent(changed(story.state, offload=None), story.state)
     again = restarted(story, tmp_path)
-    assert again.state.offload.state is OffloadState.FAILED
-    before, after = (one.state.registration.covariance[0, 0] for one in (story, again))
+    assert again.state.alpha.offload.state is OffloadState.FAILED
+    before, after = (one.state.alpha.registration.covariance[0, 0] for one in (story, again))
     assert after >= before + 0.06**2
 
 
@@ -205,11 +206,11 @@ def test_telemetry_of_a_move_measures_nothing_for_the_next_service_either(tmp_pa
     again = restarted(story, tmp_path)
     again.meet(cm_id="cm-1", t_ns=again.now_ns)
     again.see(ALPHA, n_windows=3)
-    assert again.state.windows_refused == 3
-    assert again.state.registration.n_windows == 0
+    assert again.state.windows.refused == 3
+    assert again.state.alpha.registration.n_windows == 0
     again.wait(20.0)
     again.see(AFTER, n_windows=2)
-    assert again.state.registration.n_windows == 2
+    assert again.state.alpha.registration.n_windows == 2
     assert not [name for name in again.logged if "jump" in name]
 
 
@@ -231,14 +232,14 @@ def test_what_else_happens_meanwhile_does_not_make_the_image_stand_still():
     story.tell(ev.ConditionChanged(name="loop-diverging", text="it does"))
     story.tell(ev.ConditionChanged(name="loop-diverging", text="", over=True))
     story.see(ALPHA)
-    assert story.state.windows_refused == 1
+    assert story.state.windows.refused == 1
 
 
 def test_a_service_that_moves_nothing_forgets_where_the_device_was(tmp_path):
     story = a_story()
     answer(story)
     story.policy = STAYS
-    assert restarted(story, tmp_path).state.offload is None
+    assert restarted(story, tmp_path).state.alpha.offload is None
 
 
 def test_the_image_is_not_led_away_from_the_matrix_in_use():
@@ -255,6 +256,8 @@ def test_the_image_is_not_led_away_from_the_matrix_in_use():
 def test_the_reply_may_say_from_which_frame_on_the_image_stands_still():
     story = a_story()
     story.meet(seq=10_000)
-    now_ns = story.state.rtc.t_ns
+    now_ns = story.state.loop.rtc.t_ns
     answer(story, start_seq=17_000)
-    assert story.state.offload.still_ns_utc == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)
+    assert story.state.alpha.offload.still_ns_utc == pytest.approx(
+        now_ns + 8 * SECOND, abs=SECOND / 10
+    )

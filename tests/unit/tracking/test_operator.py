@@ -8,6 +8,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
+from tests.states import changed
 from tests.unit.tracking.situations import Story, moved, of_kind, record, rtc, stopping
 
 
@@ -32,7 +33,7 @@ def refused(story, command, match, kind=CommandError):
 def test_the_mode_can_always_be_changed(mode):
     story = Story(Mode.PROPOSE)
     story.tell(cmd.SetMode(mode=mode))
-    assert story.state.mode is mode
+    assert story.state.operator.mode is mode
     assert story.state.log[-1].text == f"mode is {mode.value}"
 
 
@@ -108,7 +109,7 @@ class TestGoingBack:
     def test_a_rollback_copies_the_last_one_superseded_and_holds(self, story):
         (copied,) = of_kind(story.tell(cmd.Rollback()), ev.RepublishMatrix)
         assert copied.source == "cm-1"
-        assert story.state.mode is Mode.HOLD
+        assert story.state.operator.mode is Mode.HOLD
 
     def test_the_copy_is_sent_without_further_approval(self, story):
         story.tell(cmd.Rollback())
@@ -133,11 +134,11 @@ class TestGoingBack:
         assert story.state.log[-1].level is Level.WARNING
 
     def test_a_suspected_jump_keeps_nobody_from_it(self, story):
-        shelf = story.state.reconstructors
+        shelf = story.state.matrices.reconstructors
         summed = tuple(replace(r, sha256="ab") if r.id == "cm-1" else r for r in shelf)
-        story.state = replace(story.state, reconstructors=summed)
+        story.state = changed(story.state, reconstructors=summed)
         story.see(moved(shift_x_subap=0.15))
-        assert story.state.registration.suspected_jump is not None
+        assert story.state.alpha.registration.suspected_jump is not None
         story.tell(cmd.Rollback())
         made = story.make("cm-3", wanted=True, parent="cm-1", sha256="ab")
         assert of_kind(made, ev.SendMatrix)
@@ -152,19 +153,19 @@ class TestGoingBack:
     def test_any_known_reconstructor_can_be_published_again(self, story):
         (copied,) = of_kind(story.tell(cmd.Publish(id="initial")), ev.RepublishMatrix)
         assert copied.source == "initial"
-        assert story.state.mode is Mode.HOLD
+        assert story.state.operator.mode is Mode.HOLD
 
     def test_but_no_unknown_one(self, story):
         refused(story, cmd.Publish(id="cm-9"), "unknown reconstructor cm-9", UnknownIdError)
 
     def test_while_the_gate_cannot_judge_only_what_has_been_in_use_is_sent(self, story):
         story.make("cm-3", MatrixState.REFUSED)
-        story.state = replace(story.state, registration=None)
+        story.state = changed(story.state, registration=None)
         refused(story, cmd.Publish(id="cm-3"), "α is not known yet")
         assert of_kind(story.tell(cmd.Publish(id="cm-1")), ev.RepublishMatrix)
 
     def test_what_the_gate_could_not_judge_is_sent_and_said_to_be(self, story):
-        story.state = replace(story.state, registration=None)
+        story.state = changed(story.state, registration=None)
         story.tell(cmd.Rollback())
         why = "the operator goes back to cm-1; the gate could not judge it: α is unknown"
         effects = story.make("cm-3", wanted=True, gate=None, judged=None, alpha=None, reason=why)
@@ -209,7 +210,7 @@ class TestDither:
         story = Story().meet()
         assert story.tell(cmd.StopDither()) == (stopping(story),)
         story.wait(30)
-        assert story.state.dither is None
+        assert story.state.dithers.dither is None
         assert len(story.asked(DitherRequest)) == 1
         story.tell(cmd.StartDither())
         assert len(story.asked(DitherRequest)) == 2

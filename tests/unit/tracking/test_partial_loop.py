@@ -34,7 +34,7 @@ def test_alpha_is_dithered_for_and_followed_as_in_any_closed_loop():
     night = DitheredNight(POLICY, gains=ONE_STILL, loop="partial")
     night.live(200)
     assert night.share_on > 0.9
-    assert night.state.registration.validity.level is Validity.FRESH
+    assert night.state.alpha.registration.validity.level is Validity.FRESH
     assert not night.alarms
 
 
@@ -59,7 +59,7 @@ def test_it_is_logged_once_how_many_modes_are_in_the_loop():
 def test_a_loop_without_any_gain_is_an_open_one_and_says_why():
     story = Story().meet()
     story.tell(partial(NONE))
-    (alarm,) = [alarm for alarm in story.state.alarms if alarm.name == "loop-open"]
+    (alarm,) = [alarm for alarm in story.state.alarms.active if alarm.name == "loop-open"]
     assert alarm.text == "all gains of the loop are 0: close it to calibrate"
     story.tell(partial())
     assert "loop-open" not in story.alarms

@@ -165,7 +165,7 @@ class TestMargin:
 
     def test_at_once_where_alpha_may_be_out_of_its_reach(self):
         story = self.looked_at()
-        within = 3 * story.state.registration.sigma[0] + 0.04
+        within = 3 * story.state.alpha.registration.sigma[0] + 0.04
         assert not of_kind(story.see(moved(shift_x_subap=0.04)), ev.JudgeMatrix)
         effects = [e for _ in range(6) for e in story.see(moved(shift_x_subap=within + 0.1))]
         assert of_kind(effects, ev.JudgeMatrix)
@@ -173,7 +173,7 @@ class TestMargin:
     def looked_at(self, *, accepted=True):
         story = Story(Mode.HOLD).meet()
         story.see(n_windows=2)
-        then = judged(story.state.registration, rtc())
+        then = judged(story.state.alpha.registration, rtc())
         story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=accepted), judged=then))
         return story
 

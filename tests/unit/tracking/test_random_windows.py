@@ -41,16 +41,16 @@ def see(story, **changes):
 def test_a_window_of_random_dither_enters_the_registration_like_any_other():
     story = Story().meet()
     see(story)
-    known = story.state.registration
+    known = story.state.alpha.registration
     np.testing.assert_allclose(known.alpha.vector, ALPHA.vector)
-    assert story.state.history[-1].source is Source.RANDOM
+    assert story.state.alpha.history[-1].source is Source.RANDOM
     assert known.optical_gain == pytest.approx(0.6)
 
 
 def test_gains_of_hundreds_of_modes_are_kept_as_those_of_a_few_groups():
     story = Story().meet()
     see(story)
-    gains = story.state.registration.optical_gains
+    gains = story.state.alpha.registration.optical_gains
     assert 4 <= len(gains) <= 32
     assert gains[0].mode < 50 < 350 < gains[-1].mode
 
@@ -60,13 +60,13 @@ def test_one_noisy_gain_among_hundreds_is_no_reason_to_refuse_a_window():
     gains = np.full(400, 0.6)
     gains[7] = -0.2
     see(story, optical_gain=gains, gain_sigma=np.full(400, 0.3))
-    assert story.state.windows_accepted == 1
+    assert story.state.windows.accepted == 1
 
 
 def test_a_dither_nobody_sees_is_refused_for_its_gains():
     story = Story().meet()
     see(story, optical_gain=np.full(400, 0.02))
-    assert story.state.windows_refused == 1
+    assert story.state.windows.refused == 1
     assert "optical gains of 0.02 to 0.02" in story.state.log[-1].text
 
 
@@ -86,7 +86,7 @@ def test_a_jump_seen_by_random_signs_needs_a_second_window():
     for _ in range(3):
         see(story)
     see(story, alpha=moved(shift_x_subap=0.1))
-    assert story.state.registration.suspected_jump is not None
+    assert story.state.alpha.registration.suspected_jump is not None
 
 
 def test_an_operator_may_dither_every_mode_of_the_basis():

@@ -1,12 +1,11 @@
-from dataclasses import replace
-
 import pytest
 
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.loop import extended_gains
 from service.tracking.products import MatrixState
-from service.tracking.state import Level, Mode, TrackerState
+from service.tracking.state import Level, Mode
+from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import (
     POLICY,
     START_NS,
@@ -91,12 +90,12 @@ def test_an_applied_matrix_is_in_use_from_the_frame_the_rtc_names(story):
     story.make("cm-1", wanted=True)
     story.acknowledge("cm-1", MatrixState.STAGED)
     assert story.matrix_state("cm-1") is MatrixState.STAGED
-    assert story.state.in_use == "initial"
+    assert story.state.matrices.in_use == "initial"
     story.acknowledge("cm-1", frame_seq=4242)
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     assert story.state.reconstructor("cm-1").applied_frame_seq == 4242
     assert story.matrix_state("initial") is MatrixState.SUPERSEDED
-    assert story.state.margin == story.state.reconstructor("cm-1").gate
+    assert story.state.matrices.margin == story.state.reconstructor("cm-1").gate
 
 
 def test_a_late_acknowledgement_is_accepted_and_ends_the_alarm(story):
@@ -104,7 +103,7 @@ def test_a_late_acknowledgement_is_accepted_and_ends_the_alarm(story):
     story.wait(10)
     assert "no-acknowledgement" in story.alarms
     story.acknowledge("cm-1")
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     assert "no-acknowledgement" not in story.alarms
 
 
@@ -119,7 +118,7 @@ def test_an_acknowledgement_repeated_for_an_earlier_matrix_does_not_bring_it_bac
     story.use("cm-2")
     story.acknowledge("cm-1")
     story.tell(rtc(cm_id="cm-2"))
-    assert story.state.in_use == "cm-2"
+    assert story.state.matrices.in_use == "cm-2"
     assert story.matrix_state("cm-1") is MatrixState.SUPERSEDED
 
 
@@ -128,22 +127,22 @@ def test_the_rtcs_reason_for_a_rejection_is_kept(story):
     story.acknowledge("cm-1", MatrixState.REJECTED, "range: 399 modes, expected 400")
     assert story.matrix_state("cm-1") is MatrixState.REJECTED
     assert story.state.reconstructor("cm-1").reason == "range: 399 modes, expected 400"
-    assert story.state.in_use == "initial"
+    assert story.state.matrices.in_use == "initial"
     assert story.state.log[-1].level is Level.WARNING
 
 
 def test_an_acknowledgement_for_an_unknown_id_is_logged_and_changes_nothing(story):
-    before = story.state.reconstructors
+    before = story.state.matrices.reconstructors
     story.acknowledge("cm-unknown")
-    assert story.state.reconstructors == before
-    assert story.state.in_use == "initial"
+    assert story.state.matrices.reconstructors == before
+    assert story.state.matrices.in_use == "initial"
     assert story.state.log[-1].name == "acknowledgement.unknown"
     assert "cm-unknown" in story.state.log[-1].text
 
 
 def test_the_margin_of_the_matrix_in_use_is_kept_and_short_is_an_alarm(story):
     story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=False, radius=1.1)))
-    assert story.state.margin.worst_pole_radius == 1.1
+    assert story.state.matrices.margin.worst_pole_radius == 1.1
     assert story.state.reconstructor("initial").gate.worst_pole_radius == 1.1
     assert "margin" in story.alarms
     story.tell(ev.MarginJudged(id="initial", verdict=verdict()))
@@ -152,9 +151,9 @@ def test_the_margin_of_the_matrix_in_use_is_kept_and_short_is_an_alarm(story):
 
 def test_a_verdict_that_comes_too_late_belongs_to_its_own_matrix(story):
     story.use("cm-1")
-    margin = story.state.margin
+    margin = story.state.matrices.margin
     story.tell(ev.MarginJudged(id="initial", verdict=verdict(accepted=False, radius=1.1)))
-    assert story.state.margin is margin
+    assert story.state.matrices.margin is margin
     assert not story.alarms
     assert story.state.reconstructor("initial").gate.worst_pole_radius == 1.1
 
@@ -167,19 +166,19 @@ def test_the_alarm_of_a_short_margin_ends_with_the_matrix_it_was_about(story):
 
 def test_a_fetched_matrix_is_the_one_in_use(story):
     story.tell(ev.MatrixFetched(record=foreign("other", 300)))
-    assert story.state.in_use == "other"
+    assert story.state.matrices.in_use == "other"
     assert story.matrix_state("initial") is MatrixState.SUPERSEDED
 
 
 def test_a_matrix_made_while_the_rtc_was_away_is_not_sent_to_nobody():
     story = Story(Mode.AUTO).meet()
-    story.state = replace(story.state, rtc=None)
+    story.state = changed(story.state, rtc=None)
     assert not of_kind(story.make("cm-1"), ev.SendMatrix)
 
 
 class TestOldAcknowledgements:
     def test_one_of_another_session_changes_nothing(self):
-        state = TrackerState(
+        state = tracker_state(
             system="flao", rtc=rtc(), reconstructors=(record("cm-1", MatrixState.PUBLISHED),)
         )
         told = acknowledged("cm-1", session="s0", state=MatrixState.APPLIED, reason="", frame_seq=5)
@@ -187,7 +186,7 @@ class TestOldAcknowledgements:
         assert after.reconstructor("cm-1").state is MatrixState.PUBLISHED
 
     def test_one_repeated_for_a_matrix_since_replaced_does_not_bring_it_back(self):
-        state = TrackerState(
+        state = tracker_state(
             system="flao",
             rtc=rtc(cm_id="cm-2"),
             in_use="cm-2",
@@ -198,4 +197,4 @@ class TestOldAcknowledgements:
         )
         told = acknowledged("cm-1", session="s1", state=MatrixState.APPLIED, reason="", frame_seq=5)
         after, _ = step(state, told, POLICY, START_NS)
-        assert after.in_use == "cm-2"
+        assert after.matrices.in_use == "cm-2"

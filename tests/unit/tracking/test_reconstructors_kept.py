@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import pytest
 
 from service.errors import UnknownIdError
@@ -15,6 +13,7 @@ from service.tracking.reconstructors import (
 )
 from service.tracking.resume import restored
 from service.tracking.state import TrackerState
+from tests.states import changed
 from tests.unit.tracking.situations import Story, foreign, record, rtc, turned
 
 STATE = TrackerState(system="flao")
@@ -47,12 +46,12 @@ def test_a_restarted_service_gives_up_what_was_under_way_and_keeps_what_was_deci
 
 def test_a_restarted_service_knows_the_rtcs_own_matrices_and_believes_none_of_them():
     assert [kept.id for kept in restored((foreign(), record("cm-1")))] == ["initial", "cm-1"]
-    story = Story(state=replace(STATE, reconstructors=restored((foreign(),))))
+    story = Story(state=changed(STATE, reconstructors=restored((foreign(),))))
     story.shows = False
     story.tell(ev.SessionStarted(session="s1"))
     story.tell(rtc())
     assert story.asked(ev.FetchMatrix) == [ev.FetchMatrix(id="initial")]
-    assert story.state.in_use is None
+    assert story.state.matrices.in_use is None
 
 
 def test_a_restarted_service_takes_over_the_newest_only():
@@ -63,8 +62,11 @@ def test_a_restarted_service_takes_over_the_newest_only():
 def test_one_reconstructor_in_use_supersedes_another():
     state = with_record(with_record(STATE, foreign()), record("cm-1"))
     state = with_in_use(with_in_use(state, "initial"), "cm-1")
-    assert state.in_use == "cm-1"
-    assert [r.state for r in state.reconstructors] == [MatrixState.SUPERSEDED, MatrixState.APPLIED]
+    assert state.matrices.in_use == "cm-1"
+    assert [r.state for r in state.matrices.reconstructors] == [
+        MatrixState.SUPERSEDED,
+        MatrixState.APPLIED,
+    ]
 
 
 def test_telling_again_what_is_in_use_changes_nothing():
@@ -76,9 +78,9 @@ def test_the_reconstructor_in_use_stays_on_a_full_shelf():
     state = with_in_use(with_record(STATE, foreign()), "initial")
     for number in range(RECONSTRUCTORS_KEPT + 5):
         state = with_record(state, record(f"cm-{number}", MatrixState.REFUSED))
-    assert len(state.reconstructors) == RECONSTRUCTORS_KEPT
+    assert len(state.matrices.reconstructors) == RECONSTRUCTORS_KEPT
     assert state.reconstructor("initial") is not None
-    assert state.reconstructors[-1].id == f"cm-{RECONSTRUCTORS_KEPT + 4}"
+    assert state.matrices.reconstructors[-1].id == f"cm-{RECONSTRUCTORS_KEPT + 4}"
 
 
 @pytest.mark.parametrize(
@@ -89,11 +91,11 @@ def test_no_flood_of_what_nobody_wants_washes_away_the_way_back(unwanted):
     state = with_in_use(with_in_use(state, "cm-good"), "initial")
     for number in range(2 * RECONSTRUCTORS_KEPT):
         state = with_record(state, record(f"cm-{number}", unwanted))
-    assert len(state.reconstructors) == RECONSTRUCTORS_KEPT
+    assert len(state.matrices.reconstructors) == RECONSTRUCTORS_KEPT
     assert state.reconstructor("cm-good").state is MatrixState.SUPERSEDED
-    assert state.in_use == "initial"
+    assert state.matrices.in_use == "initial"
     assert state.reconstructor("initial") is not None
-    assert state.reconstructors[-1].id == f"cm-{2 * RECONSTRUCTORS_KEPT - 1}"
+    assert state.matrices.reconstructors[-1].id == f"cm-{2 * RECONSTRUCTORS_KEPT - 1}"
 
 
 def test_after_many_updates_the_newest_to_go_back_to_and_the_newest_refused_are_kept():
@@ -102,7 +104,7 @@ def test_after_many_updates_the_newest_to_go_back_to_and_the_newest_refused_are_
         state = with_record(state, record(f"cm-{number}", MatrixState.SUPERSEDED))
         state = with_record(state, record(f"no-{number}", MatrixState.REFUSED))
     last = RECONSTRUCTORS_KEPT + 19
-    assert len(state.reconstructors) == RECONSTRUCTORS_KEPT
+    assert len(state.matrices.reconstructors) == RECONSTRUCTORS_KEPT
     assert all(state.reconstructor(f"cm-{last - n}") is not None for n in range(RETURNS_KEPT))
     assert all(state.reconstructor(f"no-{last - n}") is not None for n in range(UNSENT_KEPT))
 

@@ -30,7 +30,7 @@ def refuse(story, n=1, kind=RefusalKind.OTHER, reason=MISSING):
 
 
 def text_of(story):
-    return next(alarm.text for alarm in story.state.alarms if alarm.name == WINDOWS_REFUSED)
+    return next(alarm.text for alarm in story.state.alarms.active if alarm.name == WINDOWS_REFUSED)
 
 
 @pytest.mark.parametrize("between", [0, 4])
@@ -46,7 +46,7 @@ def test_the_third_in_a_row_is_an_alarm_with_the_reason_and_the_service_is_degra
 def test_hundreds_of_them_are_one_line_of_alarm(story):
     refuse(story, 145)
     assert story.logged.count(WINDOWS_REFUSED) == 1
-    assert story.state.windows_refused == 145
+    assert story.state.windows.refused == 145
 
 
 def test_its_text_stays_while_the_cause_does_and_changes_with_it(story):
@@ -107,7 +107,7 @@ def test_it_ends_where_no_window_is_expected_and_does_not_begin_there(story, eve
 
 
 def test_a_dither_of_a_minute_without_any_window_is_one_as_well(story):
-    accepted = dither_answered(story.state.dither.id, accepted=True, reason="", start_seq=1)
+    accepted = dither_answered(story.state.dithers.dither.id, accepted=True, reason="", start_seq=1)
     story.tell(accepted)
     for _ in range(58):
         story.tell(ev.Tick(), after_s=1.0)

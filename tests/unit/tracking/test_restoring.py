@@ -9,6 +9,7 @@ from service.tracking import events as ev
 from service.tracking.registration import Validity
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Level, Mode, TrackerState
+from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -32,7 +33,7 @@ def restarted(before, away_s, **changes):
     """The service this much later, with nothing but what the one before has saved."""
     saved = saved_of(before.state, before.now_ns)
     now_ns = before.now_ns + round(away_s * SECOND)
-    fresh = TrackerState(**({"system": "flao", "mode": Mode.AUTO} | changes))
+    fresh = tracker_state(**({"system": "flao", "mode": Mode.AUTO} | changes))
     again = Story(state=resumed(fresh, saved, POLICY, now_ns))
     again.now_ns = now_ns
     return again
@@ -44,19 +45,21 @@ def test_nothing_is_saved_while_nothing_is_known():
 
 def test_alpha_is_known_at_once_with_its_sigma_grown_by_the_time_away(before):
     again = restarted(before, 100.0)
-    known = again.state.registration
-    assert known.alpha == before.state.registration.alpha
+    known = again.state.alpha.registration
+    assert known.alpha == before.state.alpha.registration.alpha
     walked = POLICY.drift_rate**2 * 100.0
-    expected = np.sqrt(np.diag(before.state.registration.covariance) + walked + POLICY.floor**2)
+    expected = np.sqrt(
+        np.diag(before.state.alpha.registration.covariance) + walked + POLICY.floor**2
+    )
     np.testing.assert_allclose(known.sigma, expected)
     assert known.restored_ns_utc == again.now_ns
     assert again.state.log[0].text == "α of 100 s ago; initial was in use then"
-    assert again.state.dither_due_since_ns_utc == again.now_ns
+    assert again.state.alpha.dither_due_since_ns_utc == again.now_ns
 
 
 def test_nothing_is_made_from_it_until_windows_confirm_it(before):
     again = restarted(before, 5.0)
-    assert again.state.registration.validity.level is Validity.STALE
+    assert again.state.alpha.registration.validity.level is Validity.STALE
     again.meet()
     assert not of_kind(again.wait(20), ev.MakeMatrix)
     assert not of_kind(again.see(), ev.MakeMatrix)
@@ -67,7 +70,7 @@ def test_a_window_is_weighed_against_the_time_away(before):
     """An hour: what was known counts for nothing beside a window."""
     again = restarted(before, 3600.0).meet()
     again.see(moved(shift_x_subap=0.05))
-    known = again.state.registration
+    known = again.state.alpha.registration
     assert known.alpha.shift_x_subap == pytest.approx(ALPHA.shift_x_subap + 0.05, abs=2e-4)
     assert known.covariance[0, 0] == pytest.approx(PRECISE[0, 0], rel=0.01)
 
@@ -81,11 +84,11 @@ def test_a_window_that_disagrees_is_a_suspected_jump_as_ever(before):
 def test_a_doubt_survives_but_the_window_that_raised_it_does_not(before):
     before.see(moved(shift_x_subap=0.2))
     again = restarted(before, 5.0)
-    assert again.state.registration.suspected_jump is None
-    assert again.state.registration.validity.level is Validity.INVALID
+    assert again.state.alpha.registration.suspected_jump is None
+    assert again.state.alpha.registration.validity.level is Validity.INVALID
     again.meet()
     again.see()
-    assert again.state.registration.usable
+    assert again.state.alpha.registration.usable
 
 
 @pytest.mark.parametrize(
@@ -99,16 +102,16 @@ def test_a_doubt_survives_but_the_window_that_raised_it_does_not(before):
 )
 def test_what_does_not_fit_is_left_and_said(before, changes, away_s, reason):
     again = restarted(before, away_s, **changes)
-    assert again.state.registration is None
+    assert again.state.alpha.registration is None
     (entry,) = again.state.log
     assert entry.level is Level.WARNING
     assert reason in entry.text
 
 
 def test_what_does_not_fit_the_rtc_that_comes_is_dropped(before):
-    known = replace(before.state.registration, basis_id="kl-300")
-    before.state = replace(before.state, registration=known)
+    known = replace(before.state.alpha.registration, basis_id="kl-300")
+    before.state = changed(before.state, registration=known)
     again = restarted(before, 5.0)
-    assert again.state.registration is not None
+    assert again.state.alpha.registration is not None
     again.meet()
-    assert again.state.registration is None
+    assert again.state.alpha.registration is None

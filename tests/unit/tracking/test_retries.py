@@ -30,7 +30,7 @@ def test_matrices_are_made_though_no_dither_fits_the_frame_rate(rate_hz):
 
 def test_what_can_be_dithered_at_such_a_rate_is_said():
     story = tracked(80.0)
-    (alarm,) = [alarm for alarm in story.state.alarms if alarm.name == "dither"]
+    (alarm,) = [alarm for alarm in story.state.alarms.active if alarm.name == "dither"]
     assert "room for the side bins" in alarm.text
     assert "random signs" in alarm.text
 
@@ -38,7 +38,7 @@ def test_what_can_be_dithered_at_such_a_rate_is_said():
 def test_a_dither_that_the_rtc_refuses_keeps_no_matrix_waiting():
     story = Story(Mode.AUTO).meet()
     story.see(n_windows=1)
-    dither = story.state.dither
+    dither = story.state.dithers.dither
     story.tell(dither_answered(dither.id, accepted=False, reason="busy", start_seq=None))
     assert of_kind(story.see(n_windows=1), ev.MakeMatrix)
     assert not story.asked(DitherRequest)[1:]
@@ -51,7 +51,9 @@ def test_a_matrix_that_cannot_be_fetched_keeps_no_dither_waiting():
     (fetch,) = story.asked(ev.FetchMatrix)[1:]
     story.effects.clear()
     story.tell(ev.JobFailed(effect=fetch, text="no answer"))
-    story.tell(dither_answered(story.state.dither.id, accepted=True, reason="", start_seq=5), 0.1)
+    story.tell(
+        dither_answered(story.state.dithers.dither.id, accepted=True, reason="", start_seq=5), 0.1
+    )
     story.tell(rtc(cm_id="foreign", seq=500_000), 1.0)
     assert story.asked(DitherRequest)
 

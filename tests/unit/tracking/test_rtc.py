@@ -9,6 +9,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
 from service.wire import DitherRequest
+from tests.states import changed
 from tests.unit.tracking.situations import (
     POLICY,
     Story,
@@ -29,10 +30,10 @@ def story():
 
 
 def test_the_first_basis_seen_is_adopted_and_a_pinned_one_stays():
-    assert Story().meet().state.basis_id == "kl-594"
+    assert Story().meet().state.loop.basis_id == "kl-594"
     pinned = Story()
-    pinned.state = replace(pinned.state, basis_id="pinned")
-    assert pinned.meet().state.basis_id == "pinned"
+    pinned.state = changed(pinned.state, basis_id="pinned")
+    assert pinned.meet().state.loop.basis_id == "pinned"
 
 
 def test_a_matrix_nobody_knows_is_fetched_and_asked_for_again_only_after_three_seconds():
@@ -46,7 +47,7 @@ def test_a_matrix_nobody_knows_is_fetched_and_asked_for_again_only_after_three_s
 def test_a_matrix_fetched_twice_is_on_the_shelf_once(story):
     fetched = story.state.reconstructor("initial")
     story.tell(ev.MatrixFetched(record=fetched))
-    assert [record.id for record in story.state.reconstructors] == ["initial"]
+    assert [record.id for record in story.state.matrices.reconstructors] == ["initial"]
 
 
 def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(story):
@@ -84,7 +85,7 @@ def test_an_open_loop_is_an_alarm_until_it_is_closed(story):
 def test_a_status_tells_which_matrix_is_in_use_even_when_its_acknowledgement_was_lost(story):
     story.make("cm-1", wanted=True)
     story.tell(rtc(cm_id="cm-1"))
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     assert story.matrix_state("initial") is MatrixState.SUPERSEDED
 
@@ -123,7 +124,7 @@ def test_but_not_one_that_shows_an_old_one(story):
 
 def test_a_vanished_rtc_is_an_alarm_that_ends_with_its_next_status(story):
     story.tell(ev.RtcVanished())
-    assert story.state.rtc is None
+    assert story.state.loop.rtc is None
     assert "rtc-vanished" in story.alarms
     story.meet(session="s2")
     assert "rtc-vanished" not in story.alarms
@@ -134,18 +135,22 @@ def test_nothing_known_is_lost_with_the_rtc(story, event):
     story.use("cm-1")
     before = story.state
     story.tell(event)
-    assert story.state.registration.alpha == before.registration.alpha
+    assert story.state.alpha.registration.alpha == before.alpha.registration.alpha
     np.testing.assert_array_equal(
-        story.state.registration.covariance, before.registration.covariance
+        story.state.alpha.registration.covariance, before.alpha.registration.covariance
     )
-    assert story.state.reconstructors == before.reconstructors
-    assert story.state.history == before.history
+    assert story.state.matrices.reconstructors == before.matrices.reconstructors
+    assert story.state.alpha.history == before.alpha.history
 
 
 def test_a_restarted_rtc_has_to_confirm_the_registration(story):
     story.tell(ev.SessionStarted(session="s2"))
-    assert story.state.registration.n_windows == 0
-    assert (story.state.in_use, story.state.margin, story.state.dither) == (None, None, None)
+    assert story.state.alpha.registration.n_windows == 0
+    assert (
+        story.state.matrices.in_use,
+        story.state.matrices.margin,
+        story.state.dithers.dither,
+    ) == (None, None, None)
 
 
 def test_a_restarted_rtc_has_lost_what_was_sent_to_it(story):
@@ -162,7 +167,7 @@ def test_a_window_of_the_session_before_is_not_used(story):
     story.tell(ev.SessionStarted(session="s2"))
     story.tell(rtc(session="s2"))
     story.tell(ev.WindowFitted(estimate=estimate(session="s1")))
-    assert story.state.registration.n_windows == 0
+    assert story.state.alpha.registration.n_windows == 0
 
 
 def test_a_missing_acknowledgement_fails_the_reconstructor_after_three_seconds(story):
@@ -184,9 +189,9 @@ def test_a_staged_reconstructor_that_is_never_applied_fails_too(story):
 def test_a_computation_that_never_ends_is_given_up_after_a_minute(story):
     story.tell(cmd.Refit())
     story.wait(60)
-    assert story.state.making_since_ns_utc is not None
+    assert story.state.matrices.making_since_ns_utc is not None
     story.wait(1)
-    assert story.state.making_since_ns_utc is None
+    assert story.state.matrices.making_since_ns_utc is None
     assert "reconstructor.lost" in story.logged
     story.tell(cmd.Refit())
 
@@ -215,7 +220,7 @@ def test_something_noted_changes_only_the_log(story):
     story.tell(ev.LogEvent(name="x", text="y", level=Level.WARNING))
     assert story.state.log[-1].text == "y"
     assert replace(story.state, log=()).alarms == replace(before, log=()).alarms
-    assert story.state.registration is before.registration
+    assert story.state.alpha.registration is before.alpha.registration
 
 
 class TestDither:
@@ -228,7 +233,7 @@ class TestDither:
     def answer(self, story, *, accepted=True, reason="", dither_id=None):
         return story.tell(
             dither_answered(
-                dither_id or story.state.dither.id,
+                dither_id or story.state.dithers.dither.id,
                 accepted=accepted,
                 reason=reason,
                 start_seq=777 if accepted else None,
@@ -237,12 +242,12 @@ class TestDither:
 
     def test_an_accepted_dither_has_a_first_frame(self, story):
         self.answer(story)
-        assert story.state.dither.start_seq == 777
+        assert story.state.dithers.dither.start_seq == 777
 
     def test_a_refused_dither_is_an_alarm_and_is_asked_for_again_after_ten_seconds(self, story):
         self.answer(story, accepted=False, reason="busy: measuring")
-        assert story.state.dither is None
-        assert "busy: measuring" in story.state.alarms[0].text
+        assert story.state.dithers.dither is None
+        assert "busy: measuring" in story.state.alarms.active[0].text
         assert not of_kind(story.wait(9), DitherRequest)
         assert of_kind(story.wait(1), DitherRequest)
         self.answer(story)
@@ -250,22 +255,22 @@ class TestDither:
 
     def test_an_answer_to_another_dither_is_not_mistaken_for_it(self, story):
         self.answer(story, dither_id="dither-0")
-        assert story.state.dither.start_seq is None
+        assert story.state.dithers.dither.start_seq is None
 
     def test_a_dither_that_ended_is_replaced_by_the_next(self, story):
         self.answer(story)
-        first = story.state.dither.id
-        story.tell(rtc(dither=story.state.dither), after_s=5)
-        assert story.state.dither.id == first
+        first = story.state.dithers.dither.id
+        story.tell(rtc(dither=story.state.dithers.dither), after_s=5)
+        assert story.state.dithers.dither.id == first
         story.tell(rtc(), after_s=POLICY.dither_duration_s - 5)
         assert "dither.ended" in story.logged
         assert not story.alarms
-        assert story.state.dither.id != first
+        assert story.state.dithers.dither.id != first
 
     def test_a_status_older_than_the_dither_does_not_end_it(self, story):
         self.answer(story)
         story.tell(rtc(), after_s=2)
-        assert story.state.dither is not None
+        assert story.state.dithers.dither is not None
         assert "dither.ended" not in story.logged
 
 
@@ -276,7 +281,7 @@ class TestFailures:
         story = Story().meet()
         (effect,) = of_kind(story.see(n_windows=2), ev.MakeMatrix)
         story.tell(ev.JobFailed(effect=effect, text="the worker process died"))
-        assert story.state.making_since_ns_utc is None
+        assert story.state.matrices.making_since_ns_utc is None
         assert of_kind(story.wait(6), ev.MakeMatrix)
         assert story.state.log[-1].level is Level.WARNING
 
@@ -287,14 +292,14 @@ class TestFailures:
         assert story.state.reconstructor("cm-1").reason == "the link is not open"
 
     def test_a_dither_the_rtc_did_not_answer_is_asked_for_after_five_seconds(self, story):
-        effect = ev.Ask(request=story.state.dither.request)
+        effect = ev.Ask(request=story.state.dithers.dither.request)
         story.tell(ev.JobFailed(effect=effect, text="no answer"))
-        assert story.state.dither is None
+        assert story.state.dithers.dither is None
         assert not of_kind(story.wait(4), DitherRequest)
         assert of_kind(story.wait(1), DitherRequest)
 
     def test_a_margin_that_could_not_be_judged_leaves_the_state_as_it_was(self, story):
         before = story.state
         story.tell(ev.JobFailed(effect=ev.JudgeMatrix(id="initial"), text="died"))
-        assert story.state.reconstructors == before.reconstructors
+        assert story.state.matrices.reconstructors == before.matrices.reconstructors
         assert story.state.log[-1].name == "job.failed"

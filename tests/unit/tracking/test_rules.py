@@ -13,7 +13,8 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarm_records import FIELDS, changes_value
 from service.tracking.alarms import Interlock, Severity, blocking_alarm
-from service.tracking.state import Mode, TrackerState
+from service.tracking.state import Mode
+from tests.states import tracker_state
 
 SHUTTER = """
 [[rules]]
@@ -49,7 +50,7 @@ class Night:
 
     def __init__(self, policy):
         self.policy, self.now_ns = policy, 10 * SECOND
-        self.state = TrackerState(system="small", mode=Mode.AUTO)
+        self.state = tracker_state(system="small", mode=Mode.AUTO)
         self.tell(ev.Tick())
 
     def tell(self, event, after_s=0.0):
@@ -58,7 +59,7 @@ class Night:
 
     @property
     def alarms(self):
-        return {alarm.name: alarm for alarm in self.state.alarms}
+        return {alarm.name: alarm for alarm in self.state.alarms.active}
 
 
 @pytest.fixture
@@ -70,11 +71,11 @@ def test_a_rule_holds_while_its_value_is_told_so_and_while_nobody_tells_it(night
     alarm = night.alarms["rule.shutter"]
     assert alarm.text.endswith("nothing is published (shutter_open is not known)")
     assert alarm.definition.severity is Severity.CRITICAL
-    assert blocking_alarm(night.state, Interlock.SEND_KNOWN) is alarm
-    assert blocking_alarm(night.state, Interlock.MEASURE) is None
+    assert blocking_alarm(night.state.alarms.active, Interlock.SEND_KNOWN) is alarm
+    assert blocking_alarm(night.state.alarms.active, Interlock.MEASURE) is None
     night.tell(cmd.SetValue(name="shutter_open", value=True, for_s=30.0, by="dome"))
     assert "rule.shutter" not in night.alarms
-    assert blocking_alarm(night.state, Interlock.SEND_NEW) is None
+    assert blocking_alarm(night.state.alarms.active, Interlock.SEND_NEW) is None
     night.tell(cmd.SetValue(name="shutter_open", value=False))
     assert night.alarms["rule.shutter"].text.endswith("(shutter_open is false)")
     night.tell(cmd.SetValue(name="shutter_open", value=True, for_s=30.0))
@@ -96,15 +97,15 @@ def test_a_field_of_the_state_is_compared_as_it_is_now(night):
 def test_a_rules_alarm_is_acknowledged_and_muted_like_others(night):
     night.tell(cmd.AcknowledgeAlarm(name="rule.shutter", by="Ada"))
     night.tell(cmd.MuteAlarm(name="rule.low", for_s=60.0))
-    notes = {note.name: note for note in night.state.alarm_records}
+    notes = {note.name: note for note in night.state.alarms.records}
     assert notes["rule.shutter"].acknowledged.by == "Ada"
     assert notes["rule.low"].muted is not None
 
 
 def test_a_rule_that_goes_on_to_hold_is_no_news(night):
-    before = night.state.alarms
+    before = night.state.alarms.active
     night.tell(ev.Tick(), after_s=1.0)
-    assert night.state.alarms is before
+    assert night.state.alarms.active is before
 
 
 def test_what_no_rule_asks_for_or_compares_otherwise_is_refused(night):

@@ -11,7 +11,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Registration
-from service.tracking.state import TrackerState
+from tests.states import tracker_state
 from tests.unit.tracking.situations import (
     ALL_SHOWN,
     ALPHA,
@@ -35,7 +35,7 @@ def proposed(alpha):
         n_windows=5,
     )
     then = judged(replace(registration, alpha=ALPHA), rtc())
-    return TrackerState(
+    return tracker_state(
         system="flao",
         rtc=rtc(),
         verified_ids=frozenset({"initial"}),

@@ -5,12 +5,14 @@ import pytest
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.interlocks import ALLOWS
 from service.tracking.operations.running import under_way
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.state import Mode
 from service.wire import DitherStop, Loop, LoopRequest
+from tests.states import tracker_state
 from tests.unit.tracking.operations.test_running import (
     ACTIVITIES,
     acquiring,
@@ -41,7 +43,7 @@ def stopped(world):
 
 
 def alarm(world):
-    return next((one for one in world.state.alarms if one.name == "stopped"), None)
+    return next((one for one in world.state.alarms.active if one.name == "stopped"), None)
 
 
 def test_it_is_allowed_whatever_runs_and_so_is_its_end():
@@ -75,8 +77,8 @@ def test_an_acquisition_gives_back_the_loop_and_does_not_begin_again():
     effects = world.tell(STOP)
     assert [one.loop for one in of_kind(effects, LoopRequest)] == [Loop.CLOSED]
     world.pass_(60.0)
-    assert world.state.acquisition.stage is AcquisitionStage.ABORTED
-    assert world.state.acquisition.held_off
+    assert world.state.operations.acquisition.stage is AcquisitionStage.ABORTED
+    assert world.state.operations.acquisition.held_off
     assert world.loop == "closed"
 
 
@@ -100,15 +102,15 @@ def test_a_matrix_that_was_being_made_is_kept_and_not_sent():
     world = making()
     world.tell(cmd.SetMode(mode=Mode.AUTO))
     stopped(world).pass_(10.0)
-    assert world.state.reconstructors[-1].state is MatrixState.PROPOSED
-    assert world.state.in_use == "cm-1"
+    assert world.state.matrices.reconstructors[-1].state is MatrixState.PROPOSED
+    assert world.state.matrices.in_use == "cm-1"
 
 
 def test_one_that_is_on_its_way_cannot_be_called_back():
     world = sending()
-    name = world.state.reconstructors[-1].id
+    name = world.state.matrices.reconstructors[-1].id
     stopped(world).pass_(3.0)
-    assert world.state.in_use == name
+    assert world.state.matrices.in_use == name
 
 
 @pytest.mark.parametrize(
@@ -135,7 +137,7 @@ def test_released_it_goes_on_as_it_was_ordered_before():
     assert world.playing is None
     world.tell(cmd.Resume(by="Ada"))
     assert alarm(world) is None
-    assert world.state.mode is Mode.AUTO
+    assert world.state.operator.mode is Mode.AUTO
     world.pass_(6.0)
     assert world.playing is not None
 
@@ -152,19 +154,19 @@ def test_only_what_is_stopped_is_released():
 def test_who_stopped_it_first_is_remembered():
     world = stopped(idle())
     world.tell(cmd.StopEverything(by="Bob"))
-    assert "Ada" in world.state.stopped_because
+    assert "Ada" in world.state.operator.stopped_because
 
 
 def test_a_restart_releases_nothing():
     world = stopped(idle())
     saved = saved_of(world.state, world.now_ns)
-    fresh = TrackerState(system=world.state.system, mode=Mode.AUTO)
+    fresh = tracker_state(system=world.state.system, mode=Mode.AUTO)
     world.state = resumed(fresh, saved, POLICY, world.now_ns)
     assert "Ada" in alarm(world).text
     world.pass_(30.0)
     assert [one for one in world.effects if not harmless(one)] == []
     world.tell(cmd.Resume())
-    assert not world.state.stopped_because
+    assert not world.state.operator.stopped_because
     assert not [one for one in under_way(world.state, world.now_ns) if "stopped" in one.text]
 
 
@@ -191,5 +193,5 @@ def test_a_dither_that_was_told_to_end_is_not_taken_for_one_that_runs():
     world = own_dither()
     world.tell(STOP)
     world.tell(cmd.Resume())
-    assert world.state.rtc.dither_id is not None
-    assert world.state.dither is None
+    assert world.state.loop.rtc.dither_id is not None
+    assert world.state.dithers.dither is None

@@ -11,6 +11,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Level, Mode
+from tests.states import changed
 from tests.unit.tracking.situations import (
     ALPHA,
     POLICY,
@@ -46,16 +47,16 @@ class TestSuspicion:
     """One window far out."""
 
     def test_it_is_flagged_at_once_and_does_not_move_the_registration(self, story):
-        before = story.state.registration
+        before = story.state.alpha.registration
         story.see(THERE)
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert known.alpha == before.alpha
         assert known.suspected_jump.alpha == THERE
         assert "jump-suspected" in story.alarms
         entry = next(e for e in story.state.log if e.name == "registration.jump-suspected")
         assert entry.level is Level.WARNING
         assert "+0.100" in entry.text
-        assert story.state.windows_accepted == 3
+        assert story.state.windows.accepted == 3
 
     def test_nothing_may_be_made_from_it(self, story):
         story.use("cm-1", 400)
@@ -63,8 +64,8 @@ class TestSuspicion:
         story.see(n_windows=2)
         made = len(story.asked(ev.MakeMatrix))
         story.see(THERE)
-        assert story.state.registration.validity.level is Validity.INVALID
-        assert not story.state.registration.usable
+        assert story.state.alpha.registration.validity.level is Validity.INVALID
+        assert not story.state.alpha.registration.usable
         story.wait(20)
         assert len(story.asked(ev.MakeMatrix)) == made
 
@@ -76,7 +77,7 @@ class TestSuspicion:
             story.tell(cmd.Approve(id="cm-1"))
 
     def test_one_that_is_made_while_it_jumps_is_not_sent_and_another_is_made_at_once(self, story):
-        assert story.state.making_since_ns_utc is not None
+        assert story.state.matrices.making_since_ns_utc is not None
         story.see(THERE, n_windows=3)
         effects = story.make("cm-1", alpha=ALPHA)
         assert not of_kind(effects, ev.SendMatrix)
@@ -87,16 +88,16 @@ class TestSuspicion:
 
     def test_a_dither_is_due_until_a_window_has_decided(self, story):
         story.see(THERE)
-        assert story.state.dither_due_since_ns_utc == story.now_ns
-        assert "jump" in story.state.dither_due_reason
+        assert story.state.alpha.dither_due_since_ns_utc == story.now_ns
+        assert "jump" in story.state.alpha.dither_due_reason
         story.see()
-        assert story.state.dither_due_since_ns_utc is None
+        assert story.state.alpha.dither_due_since_ns_utc is None
 
     def test_nobody_waits_for_the_deciding_window_for_ever(self, story):
         story.see(THERE)
         story.wait(61)
-        assert story.state.registration.suspected_jump is None
-        assert story.state.registration.validity.level is Validity.INVALID
+        assert story.state.alpha.registration.suspected_jump is None
+        assert story.state.alpha.registration.validity.level is Validity.INVALID
 
 
 class TestDecision:
@@ -105,7 +106,7 @@ class TestDecision:
     def test_one_that_agrees_makes_it_a_jump_with_both_windows_in_the_estimate(self, story):
         story.see(THERE)
         story.see(moved(THERE, shift_x_subap=0.002))
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert known.alpha.shift_x_subap == pytest.approx(THERE.shift_x_subap + 0.001, abs=1e-3)
         assert known.n_windows == 2
         assert known.suspected_jump is None
@@ -113,7 +114,7 @@ class TestDecision:
         assert "jump-suspected" not in story.alarms
         entry = next(e for e in story.state.log if e.name == "registration.jump")
         assert entry.level is Level.WARNING
-        assert story.state.windows_accepted == 5
+        assert story.state.windows.accepted == 5
         # half the variance of one, and the walk between the two
         walked = 2.0 * story.policy.drift_rate[0] ** 2
         assert PRECISE[0, 0] / 2 < known.covariance[0, 0] < (PRECISE[0, 0] + walked) / 2
@@ -135,10 +136,10 @@ class TestDecision:
     def test_one_that_agrees_with_all_before_makes_it_an_outlier(self, story):
         story.see(THERE)
         story.see()
-        known = story.state.registration
+        known = story.state.alpha.registration
         np.testing.assert_allclose(known.alpha.vector, ALPHA.vector, atol=1e-12)
         assert known.n_windows == 4
-        assert (story.state.windows_accepted, story.state.windows_outlying) == (4, 1)
+        assert (story.state.windows.accepted, story.state.windows.outlying) == (4, 1)
         assert "window.outlier" in story.logged
         assert "registration.jump" not in story.logged
         assert not story.alarms
@@ -146,16 +147,16 @@ class TestDecision:
     def test_one_that_agrees_with_neither_is_held_in_its_place(self, story):
         story.see(THERE)
         story.see(moved(shift_y_subap=-0.2))
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert known.suspected_jump.alpha == moved(shift_y_subap=-0.2)
-        assert known.alpha == story.state.history[2].filtered
-        assert story.state.windows_outlying == 1
+        assert known.alpha == story.state.alpha.history[2].filtered
+        assert story.state.windows.outlying == 1
         assert not known.usable
 
     def test_the_window_in_which_it_jumped_is_between_both_places_and_decides_nothing(self, story):
         story.see(moved(shift_x_subap=0.05))
         story.see(THERE, n_windows=2)
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert known.alpha.shift_x_subap == pytest.approx(THERE.shift_x_subap, abs=0.002)
         assert known.n_windows == 2
 
@@ -167,7 +168,7 @@ class TestDecision:
         story.see(there)
         assert "registration.jump" in story.logged
         story.see(there)
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert known.alpha.rotation_rad == pytest.approx(there.rotation_rad, abs=5e-5)
         assert "registration.jump" in story.logged
 
@@ -179,7 +180,7 @@ class TestDecision:
         story.see(there)
         assert "registration.jump" in story.logged
         assert "registration.jump-suspected" not in story.logged
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert known.jumped_ns_utc == story.now_ns
         assert known.alpha.rotation_rad == pytest.approx(there.rotation_rad, abs=1e-5)
 
@@ -201,7 +202,7 @@ class TestDecision:
         story, step = calm, np.deg2rad(0.02)
         story.see(moved(rotation_rad=0.6 * step))
         story.see(moved(rotation_rad=step))
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert "registration.jump" in story.logged
         assert known.n_windows == 1
         assert known.alpha.rotation_rad == pytest.approx(ALPHA.rotation_rad + step, abs=1e-5)
@@ -210,7 +211,7 @@ class TestDecision:
         for k in range(1, 20):
             story.see(moved(shift_x_subap=0.01 * k))
         assert "registration.jump" not in story.logged
-        shift = story.state.registration.alpha.shift_x_subap
+        shift = story.state.alpha.registration.alpha.shift_x_subap
         assert shift == pytest.approx(ALPHA.shift_x_subap + 0.19, abs=0.005)
 
     def test_outliers_in_a_row_never_move_it_while_no_two_agree(self, story):
@@ -220,7 +221,7 @@ class TestDecision:
                 zip(("shift_x_subap", "shift_y_subap"), rng.uniform(-0.5, 0.5, 2), strict=True)
             )
             story.see(moved(**far))
-        known = story.state.registration
+        known = story.state.alpha.registration
         assert (
             np.abs(known.alpha.vector - ALPHA.vector).max() < 1e-6
             or known.suspected_jump is not None
@@ -229,8 +230,14 @@ class TestDecision:
     def test_the_history_says_which_windows_entered(self, story):
         story.see(THERE)
         story.see()
-        assert [entry.entered for entry in story.state.history] == [True, True, True, False, True]
-        assert {entry.source for entry in story.state.history} == {Source.LOCK_IN}
+        assert [entry.entered for entry in story.state.alpha.history] == [
+            True,
+            True,
+            True,
+            False,
+            True,
+        ]
+        assert {entry.source for entry in story.state.alpha.history} == {Source.LOCK_IN}
 
 
 class TestTime:
@@ -238,11 +245,11 @@ class TestTime:
 
     def test_a_clock_set_back_does_not_stop_the_walk(self, story):
         """An hour earlier by the RTC, a minute later by arrival: a minute has passed."""
-        before = story.state.registration
+        before = story.state.alpha.registration
         story.now_ns += 60 * SECOND
         early = estimate(t_ns=START_NS - 3600 * SECOND, covariance=1e6 * PRECISE)
         story.tell(ev.WindowFitted(estimate=replace(early, covariance=PRECISE * 100.0)))
-        after = story.state.registration
+        after = story.state.alpha.registration
         walked = before.covariance[0, 0] + 60.0 * story.policy.drift_rate[0] ** 2
         expected = 1.0 / (1.0 / walked + 1.0 / (100.0 * PRECISE[0, 0]))
         assert after.covariance[0, 0] == pytest.approx(expected, rel=0.02)
@@ -250,11 +257,11 @@ class TestTime:
     def test_after_a_long_silence_a_window_stands_alone(self, story):
         story.wait(300)
         story.see(moved(shift_x_subap=0.05))
-        assert story.state.registration.n_windows == 1
+        assert story.state.alpha.registration.n_windows == 1
 
     def test_an_alpha_of_another_basis_is_dropped_when_the_rtc_names_its_own(self, story):
-        known = replace(story.state.registration, basis_id="kl-300")
-        story.state = replace(story.state, registration=known)
+        known = replace(story.state.alpha.registration, basis_id="kl-300")
+        story.state = changed(story.state, registration=known)
         story.tell(rtc())
-        assert story.state.registration is None
+        assert story.state.alpha.registration is None
         assert "kl-300" in next(e.text for e in story.state.log if e.name == "registration.void")

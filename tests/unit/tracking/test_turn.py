@@ -92,13 +92,13 @@ def test_the_log_forgets_its_oldest_lines():
 
 def test_an_alarm_raised_again_keeps_its_beginning_and_is_logged_once():
     state = with_alarm(with_alarm(STATE, "margin", "short", 5), "margin", "shorter", 8)
-    (alarm,) = state.alarms
+    (alarm,) = state.alarms.active
     assert (alarm.since_ns_utc, alarm.seen_ns_utc, alarm.text) == (5, 8, "shorter")
     assert [(entry.level, entry.text) for entry in state.log] == [(Level.ALARM, "short")]
 
 
 def test_an_alarm_that_ends_says_so_once():
     state = without_alarm(with_alarm(STATE, "margin", "short", 5), "margin", 9)
-    assert not state.alarms
+    assert not state.alarms.active
     assert state.log[-1].text == "margin: over"
     assert without_alarm(state, "margin", 10) is state

@@ -12,6 +12,7 @@ from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode, TrackerState
 from service.wire import Pointing
+from tests.states import changed
 from tests.unit.tracking.situations import (
     POLICY,
     PRECISE,
@@ -42,27 +43,27 @@ def point(story, pointing):
 
 
 def worth(story):
-    return story.state.registration.validity.level
+    return story.state.alpha.registration.validity.level
 
 
 class TestTime:
     """σ grows while nothing is measured."""
 
     def test_it_grows_with_the_square_root_of_time(self, story):
-        before = story.state.registration
+        before = story.state.alpha.registration
         story.wait(30)
-        after = story.state.registration
+        after = story.state.alpha.registration
         expected = np.sqrt(before.sigma**2 + 30.0 * POLICY.drift_rate**2)
         np.testing.assert_allclose(after.sigma, expected)
         np.testing.assert_array_equal(after.covariance, before.covariance)
 
     def test_the_rtcs_clock_counts_while_it_tells_the_time(self, story):
         """A simulated RTC that needs 30 s for one second of its own."""
-        before = story.state.registration
+        before = story.state.alpha.registration
         story.tell(rtc(t_ns=before.t_ns_utc + SECOND))
         story.wait(30)
         expected = np.sqrt(before.sigma**2 + 1.0 * POLICY.drift_rate**2)
-        np.testing.assert_allclose(story.state.registration.sigma, expected)
+        np.testing.assert_allclose(story.state.alpha.registration.sigma, expected)
 
     def test_it_is_fresh_then_ageing_then_stale_then_invalid(self, story):
         """Shifts: half of 5 % after (0.025/0.006)² = 17 s, 5 % after 69 s, 10 % after 278 s."""
@@ -76,29 +77,31 @@ class TestTime:
         assert seen[Validity.INVALID] == pytest.approx(278, abs=3)
 
     def test_until_when_it_is_valid_is_told_beforehand(self, story):
-        until_ns = story.state.registration.validity.until_ns_utc
+        until_ns = story.state.alpha.registration.validity.until_ns_utc
         story.wait((until_ns - story.now_ns) / SECOND - 1)
         assert worth(story) is Validity.AGEING
-        assert story.state.registration.validity.until_ns_utc == pytest.approx(until_ns, abs=1e6)
+        assert story.state.alpha.registration.validity.until_ns_utc == pytest.approx(
+            until_ns, abs=1e6
+        )
         story.wait(3)
         assert worth(story) is Validity.STALE
-        assert story.state.registration.validity.until_ns_utc is None
+        assert story.state.alpha.registration.validity.until_ns_utc is None
 
     def test_what_never_drifts_never_goes_stale(self):
         story = Story(Mode.AUTO, replace(POLICY, drift_rate=np.zeros(4))).meet()
         story.see(n_windows=2)
         story.wait(300)
         assert worth(story) is Validity.FRESH
-        assert story.state.registration.validity.until_ns_utc is None
+        assert story.state.alpha.registration.validity.until_ns_utc is None
 
     def test_stale_is_an_alarm_with_the_parameter_and_a_dither_is_due(self, story):
         story.wait(80)
-        alarm = next(a for a in story.state.alarms if a.name == "estimate-stale")
+        alarm = next(a for a in story.state.alarms.active if a.name == "estimate-stale")
         assert "shift_x_subap has grown beyond 0.05" in alarm.text
-        assert story.state.dither_due_since_ns_utc is not None
+        assert story.state.alpha.dither_due_since_ns_utc is not None
         story.see()
         assert not story.alarms
-        assert story.state.dither_due_since_ns_utc is None
+        assert story.state.alpha.dither_due_since_ns_utc is None
 
     def test_a_sigma_that_the_first_windows_still_bring_down_is_no_alarm(self):
         """On a faint star one says less of α than the limit asks; none that follows is one."""
@@ -115,7 +118,7 @@ class TestTime:
         texts = set()
         for _ in range(20):
             story.wait(1)
-            texts |= {a.text for a in story.state.alarms}
+            texts |= {a.text for a in story.state.alarms.active}
         assert len(texts) == 1
 
     def test_an_open_loop_needs_no_alpha(self, story):
@@ -134,10 +137,10 @@ class TestTime:
         story.tell(ev.MarginJudged(id="initial", verdict=short))
         story.wait(0.2, every_s=0.2)
         assert "estimate-stale" not in story.alarms
-        story.state = replace(story.state, dither=None, no_dither_before_ns_utc=2**63)
+        story.state = changed(story.state, dither=None, no_dither_before_ns_utc=2**63)
         story.wait(5)
         assert "estimate-stale" not in story.alarms
-        assert "stability gate" in story.state.dither_due_reason
+        assert "stability gate" in story.state.alpha.dither_due_reason
 
     def test_the_alarm_and_the_validity_say_the_same_at_every_moment(self, story):
         """It had come and gone with every window, four times in six seconds, while α was fresh."""
@@ -156,19 +159,19 @@ class TestTime:
         """A faint window brings σ a little below the limit, and the next seconds above it again."""
         story.wait(80)
         assert "estimate-stale" in story.alarms
-        known = story.state.registration
+        known = story.state.alpha.registration
         sigma = share * POLICY.stale_sigma
         after = replace(
-            known, covariance=np.diag(sigma**2 - known.floor**2), t_ns_utc=story.state.rtc.t_ns
+            known, covariance=np.diag(sigma**2 - known.floor**2), t_ns_utc=story.state.loop.rtc.t_ns
         )
-        story.state = replace(story.state, registration=replace(after, arrived_ns_utc=story.now_ns))
+        story.state = changed(story.state, registration=replace(after, arrived_ns_utc=story.now_ns))
         story.tell(ev.Tick())
         assert ("estimate-stale" in story.alarms) is stale
         assert (worth(story) is Validity.STALE) is stale
 
     def test_what_is_judged_is_judged_with_the_sigma_of_now(self, story):
         story.wait(40)
-        total = story.state.registration.total_covariance
+        total = story.state.alpha.registration.total_covariance
         grown = PRECISE[0, 0] / 3 + 40 * POLICY.drift_rate[0] ** 2
         assert total[0, 0] > grown
 
@@ -177,14 +180,14 @@ class TestPointing:
     """A telescope that moves bends."""
 
     def test_a_change_of_elevation_adds_flexure_and_one_of_azimuth_none(self, story):
-        before = story.state.registration.sigma
+        before = story.state.alpha.registration.sigma
         point(story, replace(HERE, azimuth_deg=102.0))
         story.wait(1)
-        turned = story.state.registration.sigma
+        turned = story.state.alpha.registration.sigma
         np.testing.assert_allclose(turned, np.sqrt(before**2 + POLICY.drift_rate**2))
         point(story, replace(HERE, elevation_deg=62.0))
         story.wait(1)
-        bent = story.state.registration.sigma
+        bent = story.state.alpha.registration.sigma
         added = 2.0 * POLICY.drift_rate**2 + (2.0 * BENDING.flexure_per_degree) ** 2
         np.testing.assert_allclose(bent, np.sqrt(before**2 + added))
 
@@ -193,14 +196,14 @@ class TestPointing:
         point(story, replace(HERE, elevation_deg=64.0))
         story.see(moved(shift_x_subap=0.08))
         assert not story.alarms
-        shift = story.state.registration.alpha.shift_x_subap
+        shift = story.state.alpha.registration.alpha.shift_x_subap
         assert shift == pytest.approx(0.2, abs=0.003)
 
     def test_a_slew_makes_alpha_invalid_until_the_next_window(self, story):
         point(story, replace(HERE, elevation_deg=48.0))
         story.wait(1)
         assert worth(story) is Validity.INVALID
-        assert story.state.dither_due_reason == (
+        assert story.state.alpha.dither_due_reason == (
             "the telescope has moved by 12 deg since the last dithered window"
         )
         assert "estimate-stale" in story.alarms
@@ -208,19 +211,19 @@ class TestPointing:
         assert story.matrix_state("cm-1") is MatrixState.PROPOSED
         story.see()
         assert worth(story) is Validity.FRESH
-        assert story.state.registration.n_windows == 1
+        assert story.state.alpha.registration.n_windows == 1
 
     def test_a_turn_in_azimuth_is_a_slew_as_well(self, story):
         point(story, replace(HERE, azimuth_deg=130.0))
         story.wait(1)
-        assert "moved by 15 deg" in story.state.registration.validity.reason
+        assert "moved by 15 deg" in story.state.alpha.registration.validity.reason
 
     def test_a_status_that_knows_it_overrules_what_was_told(self, story):
         there = Pointing(elevation_deg=30.0, azimuth_deg=0.0)
         story.tell(rtc(pointing=there))
-        assert story.state.pointing == there
+        assert story.state.alpha.pointing == there
         story.tell(rtc())
-        assert story.state.pointing == there
+        assert story.state.alpha.pointing == there
 
     def test_before_anybody_has_told_nothing_bends(self):
         story = Story(Mode.AUTO, BENDING).meet()
@@ -246,5 +249,5 @@ class TestPointing:
 def test_nothing_is_due_while_nothing_is_known():
     story = Story(state=TrackerState(system="flao"))
     story.wait(100)
-    assert story.state.dither_due_since_ns_utc is None
+    assert story.state.alpha.dither_due_since_ns_utc is None
     assert not story.alarms

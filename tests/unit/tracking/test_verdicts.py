@@ -10,6 +10,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
+from tests.states import changed
 from tests.unit.tracking.situations import (
     ALPHA,
     N_MODES,
@@ -35,7 +36,7 @@ def waiting():
 
 def judge(story, *, accepted=True, **changes):
     """Give the verdict that was asked for."""
-    now = judged(story.state.registration, story.state.rtc, **changes)
+    now = judged(story.state.alpha.registration, story.state.loop.rtc, **changes)
     event = ev.ProposalJudged(id="cm-1", verdict=verdict(accepted=accepted), judged=now)
     return story.tell(event, after_s=1.0)
 
@@ -57,7 +58,7 @@ def test_one_judged_for_another_loop_is_judged_again_with_the_gains_of_now(waiti
     effects = waiting.tell(cmd.Approve(id="cm-1"))
     assert not of_kind(effects, ev.SendMatrix)
     (asked,) = of_kind(effects, ev.JudgeProposal)
-    assert (asked.id, asked.gains) == ("cm-1", waiting.state.rtc.gains[:400])
+    assert (asked.id, asked.gains) == ("cm-1", waiting.state.loop.rtc.gains[:400])
     assert words in next(e for e in waiting.state.log if "judged-again" in e.name).text
 
 
@@ -71,9 +72,11 @@ def test_gains_that_follow_the_seeing_by_a_few_percent_change_no_verdict(waiting
 
 
 def test_so_is_one_whose_alpha_is_known_much_worse_by_now(waiting):
-    waiting.state = replace(
+    waiting.state = changed(
         waiting.state,
-        registration=replace(waiting.state.registration, grown=np.array([0.03, 0.03, 0, 0]) ** 2),
+        registration=replace(
+            waiting.state.alpha.registration, grown=np.array([0.03, 0.03, 0, 0]) ** 2
+        ),
     )
     assert of_kind(waiting.tell(cmd.Approve(id="cm-1")), ev.JudgeProposal)
 
@@ -84,7 +87,7 @@ def test_it_is_sent_when_it_passes_anew(waiting):
     assert of_kind(judge(waiting), ev.SendMatrix)
     assert waiting.matrix_state("cm-1") is MatrixState.PUBLISHED
     waiting.acknowledge("cm-1")
-    assert waiting.state.margin is waiting.state.reconstructor("cm-1").gate
+    assert waiting.state.matrices.margin is waiting.state.reconstructor("cm-1").gate
 
 
 def test_and_refused_with_the_gates_words_when_it_does_not(waiting):
@@ -154,7 +157,7 @@ class TestAuto:
 
     def made_before(self, story, change):
         """A matrix comes whose making began before something happened."""
-        then = judged(story.state.registration, story.state.rtc)
+        then = judged(story.state.alpha.registration, story.state.loop.rtc)
         change(story)
         return story.make("cm-1", judged=then, alpha=ALPHA)
 
@@ -182,7 +185,7 @@ class TestAuto:
 def test_a_matrix_an_operator_wants_back_is_judged_again_after_a_jump():
     story = Story(Mode.HOLD).meet()
     story.see(n_windows=3)
-    then = judged(story.state.registration, story.state.rtc)
+    then = judged(story.state.alpha.registration, story.state.loop.rtc)
     there = moved(shift_x_subap=0.3)
     story.see(there, n_windows=3)
     effects = story.make("cm-1", judged=then, alpha=ALPHA, wanted=True)
@@ -195,5 +198,5 @@ def test_an_acknowledgement_of_a_matrix_judged_for_another_loop_is_no_margin(wai
     waiting.tell(cmd.Approve(id="cm-1"))
     waiting.tell(rtc(gains=HIGH))
     waiting.acknowledge("cm-1")
-    assert waiting.state.margin is None
+    assert waiting.state.matrices.margin is None
     assert waiting.asked(ev.JudgeMatrix)[-1].id == "cm-1"

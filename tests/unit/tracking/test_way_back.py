@@ -64,11 +64,11 @@ def opened(told):
 
 
 def trial(told):
-    return told.state.probation
+    return told.state.operations.probation
 
 
 def alarm(told, name):
-    return next(a for a in told.state.alarms if a.name == name)
+    return next(a for a in told.state.alarms.active if a.name == name)
 
 
 def test_the_matrix_that_the_rtc_brought_is_gone_back_to_though_no_gate_has_judged_it():
@@ -79,7 +79,7 @@ def test_the_matrix_that_the_rtc_brought_is_gone_back_to_though_no_gate_has_judg
     copied(told)
     assert [e.id for e in told.asked(ev.SendMatrix)] == ["cm-2"]
     told.acknowledge("cm-2")
-    assert told.state.in_use == "cm-2"
+    assert told.state.matrices.in_use == "cm-2"
     assert trial(told).rollback == "cm-2"
     assert told.matrix_state("cm-1") is MatrixState.FAILED
 

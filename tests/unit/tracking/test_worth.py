@@ -43,7 +43,7 @@ def story():
 
 def judged(story, expected, alpha=NEAR, matrix_id="cm-1"):
     """Tell what the worker found; return the reconstructors asked for in the next seconds."""
-    now = situations.judged(story.state.registration, story.state.rtc)
+    now = situations.judged(story.state.alpha.registration, story.state.loop.rtc)
     effects = story.tell(
         ev.MarginJudged(id=matrix_id, verdict=verdict(), alpha=alpha, expected=expected, judged=now)
     )
@@ -115,7 +115,7 @@ def test_after_a_move_the_new_matrix_comes_before_the_margin_of_the_old_one(stor
 
 def test_a_registration_that_may_have_jumped_makes_nothing(story):
     story.see(moved(shift_x_subap=0.4))
-    assert story.state.registration.suspected_jump is not None
+    assert story.state.alpha.registration.suspected_jump is not None
     assert not judged(story, told(loss_m=5e-9))
 
 
@@ -147,9 +147,9 @@ def test_far_enough_needs_no_estimate(story):
 
 def test_the_state_remembers_what_was_found(story):
     judged(story, told(loss_m=0.1e-9))
-    assert story.state.assessment.id == "cm-1"
-    assert story.state.assessment.alpha == NEAR
-    assert story.state.assessment.expected.loss_m == 0.1e-9
+    assert story.state.matrices.assessment.id == "cm-1"
+    assert story.state.matrices.assessment.alpha == NEAR
+    assert story.state.matrices.assessment.expected.loss_m == 0.1e-9
     story.use("cm-2")
-    assert story.state.assessment is None
+    assert story.state.matrices.assessment is None
     assert ALPHA != NEAR

@@ -1,7 +1,5 @@
 """What the RTC says it holds is compared with what was sent; one without a name is asked for."""
 
-from dataclasses import replace
-
 import pytest
 
 from service.errors import CommandError
@@ -10,6 +8,7 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
+from tests.states import changed
 from tests.unit.tracking.situations import Story, acknowledged, foreign, record, rtc
 
 SUM, OTHER = "a" * 64, "b" * 64
@@ -45,11 +44,11 @@ def test_another_sum_than_was_sent_is_an_alarm_and_nothing_is_published_any_more
     answer(story, OTHER, state)
     story.effects.clear()
     assert story.matrix_state("cm-1") is MatrixState.FAILED
-    alarm = next(a for a in story.state.alarms if a.name == "wrong-matrix")
+    alarm = next(a for a in story.state.alarms.active if a.name == "wrong-matrix")
     assert SUM in alarm.text
     assert OTHER in alarm.text
     story.tell(rtc(cm_id="cm-1"))
-    assert story.state.in_use != "cm-1"
+    assert story.state.matrices.in_use != "cm-1"
     story.make("cm-2", MatrixState.PROPOSED)
     with pytest.raises(CommandError, match="cm-1"):
         story.tell(cmd.Approve(id="cm-2"))
@@ -75,7 +74,7 @@ def test_a_wrong_matrix_is_read_back_and_is_over_when_it_is_right():
     assert "wrong-matrix" in story.alarms
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=SUM)))
     assert "wrong-matrix" not in story.alarms
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
 
 
 def test_a_wrong_matrix_is_over_when_the_rtc_acknowledges_the_right_one_or_starts_over():
@@ -83,12 +82,12 @@ def test_a_wrong_matrix_is_over_when_the_rtc_acknowledges_the_right_one_or_start
     answer(story, OTHER)
     answer(story, SUM, frame_seq=1001)
     assert "wrong-matrix" not in story.alarms
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     story = sent()
     answer(story, OTHER)
     story.tell(ev.SessionStarted(session="s2"))
     assert "wrong-matrix" not in story.alarms
-    assert story.state.mismatched_id is None
+    assert story.state.matrices.mismatched_id is None
 
 
 def test_a_commit_the_rtc_could_not_read_is_rejected_though_it_names_none():
@@ -115,9 +114,9 @@ def restarted(story=None):
 def test_after_a_restart_a_known_matrix_is_read_back_before_it_is_believed():
     story = restarted()
     assert story.asked(ev.FetchMatrix) == [ev.FetchMatrix(id="cm-1")]
-    assert story.state.in_use is None
+    assert story.state.matrices.in_use is None
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=SUM)))
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     assert story.matrix_state("cm-1") is MatrixState.APPLIED
     story.effects.clear()
     story.tell(rtc(cm_id="cm-1", session="s2"))
@@ -144,7 +143,7 @@ def test_other_numbers_under_a_known_id_forbid_all_sending(order):
     story.tell(ev.MatrixFetched(record=record("cm-1", sha256=OTHER)))
     story.tell(rtc(cm_id="cm-1", session="s2"))
     assert "wrong-matrix" in story.alarms
-    assert story.state.in_use is None
+    assert story.state.matrices.in_use is None
     story.tell(order)
     story.make("cm-2", wanted=True)
     with pytest.raises(CommandError, match="other numbers"):
@@ -157,7 +156,7 @@ def test_an_rtc_that_does_not_offer_its_matrix_is_believed_by_the_id():
     (fetch,) = story.asked(ev.FetchMatrix)
     story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
     story.tell(rtc(cm_id="cm-1", session="s2"))
-    assert story.state.in_use == "cm-1"
+    assert story.state.matrices.in_use == "cm-1"
     story.tell(cmd.Rollback())
 
 
@@ -177,7 +176,7 @@ def test_what_it_answers_is_the_matrix_in_use():
     story = Story(Mode.AUTO)
     story.tell(rtc(cm_id=None))
     story.tell(ev.MatrixFetched(record=foreign("theirs")))
-    assert story.state.in_use == "theirs"
+    assert story.state.matrices.in_use == "theirs"
 
 
 def test_an_rtc_that_does_not_offer_its_matrix_is_dithered_all_the_same():
@@ -187,6 +186,6 @@ def test_an_rtc_that_does_not_offer_its_matrix_is_dithered_all_the_same():
     assert not story.asked(DitherRequest)
     story.tell(ev.JobFailed(effect=fetch, text="no answer on rtc/cm/applied"))
     story.wait(2.0)
-    assert story.state.read_back_error == "no answer on rtc/cm/applied"
+    assert story.state.matrices.read_back_error == "no answer on rtc/cm/applied"
     assert story.asked(DitherRequest)
-    assert replace(story.state, alarms=()).in_use is None
+    assert changed(story.state, active=()).matrices.in_use is None

@@ -132,11 +132,11 @@ class World(Story):
     def windows(self):
         """A window ends every two seconds of a dither that is read."""
         self.since_window_s = 0.0 if self.playing is None else self.since_window_s + STEP_S
-        if self.since_window_s < WINDOW_S + STEP_S or self.state.dither is None:
+        if self.since_window_s < WINDOW_S + STEP_S or self.state.dithers.dither is None:
             return
         self.since_window_s = STEP_S
         fitted = estimate(ALPHA, t_ns=self.now_ns, session=f"s{self.session}")
-        if self.state.acquisition.uses_wide_capture:
+        if self.state.operations.acquisition.uses_wide_capture:
             far = replace(fitted, modes=self.playing.request.modes, covariance=1e2 * PRECISE)
             self.tell(
                 ev.WideCaptureFitted(
@@ -202,7 +202,7 @@ class World(Story):
         yield loop_answered(asked.id, accepted=not busy, reason=busy)
 
     def of_matrices(self, effect):
-        registration, view = self.state.registration, self.state.rtc or self.status()
+        registration, view = self.state.alpha.registration, self.state.loop.rtc or self.status()
         match effect:
             case ev.MakeMatrix() | ev.RepublishMatrix() as asked:
                 self.n_made += 1

@@ -11,6 +11,7 @@ from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.dither_request import lock_in_plan
 from service.tracking.operations.acquisition import PATIENCE_S
 from service.tracking.operations.acquisition_stages import (
@@ -22,7 +23,7 @@ from service.tracking.operations.acquisition_stages import (
     wide_capture_dither,
 )
 from service.tracking.products import MatrixState
-from service.tracking.state import AcquisitionStage, Mode
+from service.tracking.state import Mode
 from service.tracking.update_policy import fewer_than
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import (
@@ -54,18 +55,18 @@ class Acquiring(Story):
 
     @property
     def stage(self):
-        return self.state.acquisition.stage
+        return self.state.operations.acquisition.stage
 
     @property
     def text(self):
-        return self.state.acquisition.text
+        return self.state.operations.acquisition.text
 
     @property
     def far_dithers(self):
         return [dither for dither in self.asked(DitherRequest) if dither.id.startswith("acquire-")]
 
     def status(self, after_s=0.2, **changes):
-        seen = {"session": f"s{self.session}", "cm_id": self.state.in_use} | changes
+        seen = {"session": f"s{self.session}", "cm_id": self.state.matrices.in_use} | changes
         return self.tell(rtc(**seen), after_s)
 
     def open(self):
@@ -84,7 +85,7 @@ class Acquiring(Story):
 
     def see_afar(self, alpha=FAR, sigma=0.01):
         """A window with the dither of this stage puts the mirror there."""
-        dither = self.state.dither
+        dither = self.state.dithers.dither
         self.tell(dither_answered(dither.id, accepted=True, reason="", start_seq=5000), 0.1)
         fitted = estimate(
             alpha,
@@ -231,7 +232,7 @@ class TestByItself:
         texts = set()
         for _ in range(2 * MISSES_DESPITE):
             story.miss_afar("it is far away", RefusalKind.OUT_OF_REACH)
-            alarms = story.state.alarms
+            alarms = story.state.alarms.active
             texts |= {a.text for a in alarms if a.name == "registration-not-found"}
         assert story.asked(LoopRequest) == []
         (told,) = texts
@@ -299,14 +300,14 @@ class TestNothingWrong:
         story.see_afar()
         story.see_afar(moved(FAR, rotation_rad=np.deg2rad(3.0)))
         assert story.stage in {AcquisitionStage.OPENING, AcquisitionStage.COARSE}
-        assert story.state.registration is None
+        assert story.state.alpha.registration is None
         assert not story.asked(ev.MakeMatrix)
 
     def test_a_window_of_another_session_is_not_used(self):
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        late = estimate(FAR, session="s1", modes=story.state.dither.request.modes)
+        late = estimate(FAR, session="s1", modes=story.state.dithers.dither.request.modes)
         story.tell(
             ev.WideCaptureFitted(
                 found=WideCaptureEstimate(estimate=late, unexplained=0.0, n_starts=1)
@@ -330,7 +331,7 @@ class TestNothingWrong:
         story = Acquiring()
         story.see(n_windows=3)
         story.tell(cmd.Acquire())
-        assert story.state.registration is None
+        assert story.state.alpha.registration is None
 
     def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
         story = Acquiring().to_partial()
@@ -346,7 +347,7 @@ class TestNothingWrong:
         assert story.stage is AcquisitionStage.FAILED
         assert not story.asked(ev.SendMatrix)
         assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
-        assert story.state.registration is None
+        assert story.state.alpha.registration is None
 
     def test_where_the_edge_would_slip_with_any_modes_a_leak_is_asked_for_first(self):
         story = Acquiring().to_partial()
@@ -403,7 +404,7 @@ class TestTrouble:
         story.see_afar()
         story.see_afar()
         assert story.asked(ev.MakeMatrix)[-1].n_modes == 70
-        assert story.state.mode_limit.n_modes == 70
+        assert story.state.matrices.mode_limit.n_modes == 70
 
     def test_one_that_slips_once_it_tracks_is_acquired_anew_on_half_as_many_modes(self):
         """More are tried after a while, and after a longer one when it slips again."""
@@ -415,8 +416,8 @@ class TestTrouble:
         story.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         story.wait(3)
         assert story.stage is AcquisitionStage.OPENING
-        assert story.state.acquisition.max_modes == 200
-        limit = story.state.mode_limit
+        assert story.state.operations.acquisition.max_modes == 200
+        limit = story.state.matrices.mode_limit
         assert (limit.n_modes, limit.reason) == (200, "edge-slip with 400 modes")
 
     def test_that_a_loop_slips_on_the_rtcs_own_matrix_says_nothing_of_the_modes(self):
@@ -424,15 +425,15 @@ class TestTrouble:
         story.tell(ev.ConditionChanged(name="edge-slip", text="found"))
         story.wait(3)
         assert story.stage is AcquisitionStage.OPENING
-        assert story.state.acquisition.max_modes is None
-        assert story.state.mode_limit is None
+        assert story.state.operations.acquisition.max_modes is None
+        assert story.state.matrices.mode_limit is None
 
     def test_windows_that_lead_nowhere_begin_it_anew_and_end_it_after_a_few_attempts(self):
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
         for _ in range(MAX_ATTEMPTS * MAX_MISSES):
-            assert story.state.acquisition.under_way
+            assert story.state.operations.acquisition.under_way
             story.miss_afar()
             story.still_open()
         assert story.stage is AcquisitionStage.FAILED
@@ -445,14 +446,14 @@ class TestTrouble:
         story.open()
         for _ in range(2 * MAX_MISSES):
             story.miss_afar("the worker is too slow: a window was given up", RefusalKind.OTHER)
-        assert story.state.acquisition.attempt == 1
+        assert story.state.operations.acquisition.attempt == 1
 
     def test_a_stage_that_takes_too_long_begins_it_anew(self):
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
         story.wait(PATIENCE_S + 2)
-        assert story.state.acquisition.attempt == 2
+        assert story.state.operations.acquisition.attempt == 2
 
     def test_an_rtc_that_will_not_open_its_loop_ends_it(self):
         story = Acquiring()
@@ -467,13 +468,13 @@ class TestTrouble:
         story.session += 1
         story.tell(ev.SessionStarted(session=f"s{story.session}"))
         assert story.stage is AcquisitionStage.OPENING
-        assert story.state.acquisition.attempt == 2
+        assert story.state.operations.acquisition.attempt == 2
 
     def test_a_refused_dither_is_asked_for_again(self):
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.open()
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         refused = dither_answered(dither.id, accepted=False, reason="busy", start_seq=None)
         story.tell(refused)
         for _ in range(12):
@@ -486,7 +487,7 @@ class TestTrouble:
         story.make("cm-150", n_modes=150)
         story.acknowledge("cm-150", MatrixState.REJECTED, reason="wrong basis")
         story.still_open()
-        assert story.state.acquisition.attempt == 2
+        assert story.state.operations.acquisition.attempt == 2
         assert "wrong basis" in story.text or "looking" in story.text
 
     def test_a_loop_somebody_closes_meanwhile_is_opened_again(self):
@@ -553,7 +554,7 @@ class TestOperator:
         n_asked = len(story.asked(LoopRequest))
         story.tell(cmd.AbortAcquisition())
         assert len(story.asked(LoopRequest)) == n_asked
-        assert story.state.registration is not None
+        assert story.state.alpha.registration is not None
 
     def test_stopping_the_dither_aborts_it(self):
         story = Acquiring()
@@ -573,7 +574,7 @@ class TestOperator:
         story = Acquiring()
         story.tell(cmd.Acquire())
         story.tell(cmd.SetMode(mode=Mode.HOLD))
-        assert story.state.acquisition.under_way
+        assert story.state.operations.acquisition.under_way
 
     def test_cannot_have_it_without_an_rtc(self):
         story = Acquiring()
@@ -628,7 +629,7 @@ def test_one_in_whose_dithers_no_window_ever_ends_comes_to_an_end():
     story.tell(cmd.Acquire())
     story.open()
     for _ in range(1200):
-        dither = story.state.dither
+        dither = story.state.dithers.dither
         if story.stage is AcquisitionStage.FAILED:
             break
         if story.stage is AcquisitionStage.OPENING:

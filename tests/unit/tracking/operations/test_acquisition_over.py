@@ -5,10 +5,11 @@ import pytest
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.operations.acquisition import ENOUGH_WINDOWS
 from service.tracking.operations.acquisition_stages import MISSES_DESPITE
 from service.tracking.products import MatrixState
-from service.tracking.state import AcquisitionStage, Mode
+from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest
 from tests.unit.tracking.operations.test_acquisition import CALM, DIVERGING, FAR, Acquiring
 from tests.unit.tracking.operations.test_acquisition_restart import Again
@@ -59,7 +60,7 @@ def test_the_next_trouble_is_met_as_the_first_was():
     story.tell(SLIPPED)
     story.wait(4)
     assert story.stage is AcquisitionStage.OPENING
-    assert story.state.acquisition.attempt == 1
+    assert story.state.operations.acquisition.attempt == 1
     assert story.asked(LoopRequest)[-1].loop is Loop.OPEN
 
 
@@ -78,7 +79,7 @@ def test_windows_that_contradict_one_another_are_not_enough():
     story = Failed().close_on_their_own()
     story.see()
     story.see(moved(shift_x_subap=0.4))
-    assert story.state.registration.suspected_jump is not None
+    assert story.state.alpha.registration.suspected_jump is not None
     assert story.stage is AcquisitionStage.FAILED
 
 
@@ -150,7 +151,10 @@ def test_windows_that_agree_in_a_closed_loop_let_the_next_trouble_count():
     story = Ended()
     story.tell(CALM)
     story.see(n_windows=ENOUGH_WINDOWS)
-    assert (story.stage, story.state.acquisition.held_off) == (AcquisitionStage.IDLE, False)
+    assert (story.stage, story.state.operations.acquisition.held_off) == (
+        AcquisitionStage.IDLE,
+        False,
+    )
     story.tell(DIVERGING)
     story.wait(4)
     assert story.stage is AcquisitionStage.OPENING
@@ -161,7 +165,7 @@ def test_windows_from_before_it_was_ended_do_not_count():
     story.see(FAR)
     story.widen(400)
     story.see(FAR)
-    assert story.state.registration.n_windows >= ENOUGH_WINDOWS
+    assert story.state.alpha.registration.n_windows >= ENOUGH_WINDOWS
     story.tell(cmd.AbortAcquisition())
     assert story.stage is AcquisitionStage.ABORTED
     story.tell(DIVERGING)
@@ -180,7 +184,7 @@ def test_so_does_an_operator_who_asks():
     story = Ended()
     story.tell(cmd.Acquire())
     assert story.stage is AcquisitionStage.OPENING
-    assert not story.state.acquisition.held_off
+    assert not story.state.operations.acquisition.held_off
 
 
 def test_a_restarted_service_does_not_begin_what_an_operator_ended():
@@ -197,5 +201,8 @@ def test_one_that_hold_ended_is_not_held_off():
     story.tell(DIVERGING)
     story.wait(4)
     story.tell(cmd.SetMode(mode=Mode.HOLD))
-    assert (story.stage, story.state.acquisition.held_off) == (AcquisitionStage.ABORTED, False)
+    assert (story.stage, story.state.operations.acquisition.held_off) == (
+        AcquisitionStage.ABORTED,
+        False,
+    )
     assert "none begins" not in story.text

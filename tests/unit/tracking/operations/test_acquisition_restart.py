@@ -6,11 +6,13 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.operations.acquisition_stages import MAX_ATTEMPTS
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
-from service.tracking.state import AcquisitionStage, Mode, TrackerState
+from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
+from tests.states import tracker_state
 from tests.unit.tracking.operations.test_acquisition import ACQUIRES, DIVERGING, FAR, Acquiring
 from tests.unit.tracking.situations import POLICY, SECOND, foreign
 
@@ -25,7 +27,7 @@ class Again(Acquiring):
         super().__init__(mode, policy)
         self.effects, self.session = [], before.session
         self.now_ns = before.now_ns + round(away_s * SECOND)
-        fresh = TrackerState(system="flao", mode=mode)
+        fresh = tracker_state(system="flao", mode=mode)
         saved = saved_of(before.state, before.now_ns)
         self.state = fresh if saved is None else resumed(fresh, saved, policy, self.now_ns)
 
@@ -34,7 +36,7 @@ class Again(Acquiring):
         seen = OPEN | {"session": f"s{self.session}"} | changes
         self.tell(ev.SessionStarted(session=seen["session"]), 0.1)
         self.status(**seen)
-        if self.state.rtc.cm_id == "initial":
+        if self.state.loop.rtc.cm_id == "initial":
             self.tell(ev.MatrixFetched(record=foreign()))
         return self
 
@@ -74,8 +76,8 @@ def test_in_auto_it_begins_anew_with_the_loop_the_one_before_had_opened(opened):
 
 
 def test_the_alpha_it_had_forgotten_is_not_believed_again(opened):
-    assert opened.state.registration is None
-    assert Again(opened).state.registration is None
+    assert opened.state.alpha.registration is None
+    assert Again(opened).state.alpha.registration is None
 
 
 @pytest.mark.parametrize("mode", [Mode.PROPOSE, Mode.HOLD])
@@ -85,7 +87,7 @@ def test_in_other_modes_it_waits_and_says_what_to_do(opened, mode):
     assert again.stage is AcquisitionStage.INTERRUPTED
     assert not again.asked(LoopRequest)
     assert not again.asked(DitherRequest)
-    (alarm,) = [alarm for alarm in again.state.alarms if alarm.name == "acquisition"]
+    (alarm,) = [alarm for alarm in again.state.alarms.active if alarm.name == "acquisition"]
     assert "looking for the registration" in alarm.text
     assert f"the mode is {mode}" in alarm.text
     assert "acquire again" in alarm.text
@@ -106,7 +108,7 @@ def test_it_begins_when_the_operator_asks_and_comes_back_to_the_loop_as_it_was(o
     again = Again(opened, Mode.PROPOSE).find()
     again.tell(cmd.Acquire())
     assert again.stage is AcquisitionStage.COARSE
-    found = again.state.acquisition.found
+    found = again.state.operations.acquisition.found
     assert (found.closed, found.n_controlled, set(found.gains[:400])) == (True, 400, {0.4})
 
 
@@ -129,7 +131,7 @@ def test_a_loop_that_is_open_in_another_session_is_not_touched(opened):
     assert not again.asked(DitherRequest)
     assert "another session" in again.text
     again.tell(cmd.Acquire())
-    assert again.state.acquisition.found.closed is False
+    assert again.state.operations.acquisition.found.closed is False
 
 
 def test_who_aborts_gets_a_healthy_loop_back_as_it_was(opened):
@@ -170,9 +172,9 @@ def test_a_loop_that_diverged_is_not_given_back():
 
 def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there():
     story = Acquiring().to_widening()
-    matrix = story.state.in_use
+    matrix = story.state.matrices.in_use
     again = Again(story)
-    assert again.state.registration is not None
+    assert again.state.alpha.registration is not None
     again.find(loop="closed", gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
     assert again.stage is AcquisitionStage.ABORTED
     assert f"closed on {matrix}, which had passed the gate" in again.text
@@ -245,7 +247,7 @@ def test_one_that_was_aborted_leaves_no_alpha_behind(opened):
     opened.tell(cmd.AbortAcquisition())
     again = Again(opened)
     assert again.stage is AcquisitionStage.ABORTED
-    assert again.state.registration is None
+    assert again.state.alpha.registration is None
     assert "acquisition" not in again.alarms
 
 
@@ -258,7 +260,7 @@ def test_one_that_ended_tracking_is_not_spoken_of():
     assert story.stage is AcquisitionStage.TRACKING
     again = Again(story)
     assert again.stage is AcquisitionStage.IDLE
-    assert again.state.registration is not None
+    assert again.state.alpha.registration is not None
 
 
 class TestGap:
@@ -274,7 +276,7 @@ class TestGap:
         opened.still_open()
         opened.still_open()
         assert opened.stage is AcquisitionStage.COARSE
-        assert opened.state.acquisition.attempt == 2
+        assert opened.state.operations.acquisition.attempt == 2
         assert not {"acquisition", "rtc-vanished", "loop-open"} & opened.alarms
         opened.see_afar()
         opened.see_afar()
@@ -287,11 +289,11 @@ class TestGap:
         opened.tell(ev.RtcVanished())
         opened.still_open()
         opened.still_open()
-        one, other = again.state.acquisition, opened.state.acquisition
+        one, other = again.state.operations.acquisition, opened.state.operations.acquisition
         assert (one.stage, one.attempt, one.found) == (other.stage, other.attempt, other.found)
 
     def test_what_the_gap_left_playing_is_stopped_before_another_dither_is_asked_for(self, opened):
-        left, n_before = opened.state.dither.id, len(opened.asked(DitherRequest))
+        left, n_before = opened.state.dithers.dither.id, len(opened.asked(DitherRequest))
         opened.tell(ev.RtcVanished())
         opened.still_open(dither_id=left)
         assert opened.asked(DitherStop)
@@ -322,13 +324,13 @@ class TestGap:
 
     def test_a_loop_closed_on_the_matrix_that_was_judged_is_followed_from_there(self):
         story = Acquiring().to_widening()
-        matrix, n_asked = story.state.in_use, len(story.asked(LoopRequest))
+        matrix, n_asked = story.state.matrices.in_use, len(story.asked(LoopRequest))
         story.tell(ev.RtcVanished())
         story.status(gains=(0.4,) * 150 + (0.0,) * 444, n_controlled=150, cm_id=matrix)
         assert story.stage is AcquisitionStage.ABORTED
         assert f"closed on {matrix}, which had passed the gate" in story.text
         assert "acquisition" not in story.alarms
-        assert story.state.registration is not None
+        assert story.state.alpha.registration is not None
         assert len(story.asked(LoopRequest)) == n_asked
 
     def test_a_link_that_fails_again_and_again_ends_it(self, opened):

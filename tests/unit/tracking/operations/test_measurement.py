@@ -10,6 +10,7 @@ from service.tracking.operations.measurement import LONGEST_S, OVERDUE_S
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, MeasureRequest, Pattern
+from tests.states import changed
 from tests.unit.tracking.situations import Story, of_kind, rtc
 
 
@@ -79,7 +80,7 @@ def test_nobody_measures_without_an_rtc():
 
 def test_nobody_measures_under_a_dither():
     story = Story(Mode.HOLD).meet()
-    assert story.state.dither is not None
+    assert story.state.dithers.dither is not None
     with pytest.raises(CommandError, match=r"dither-\d+ is running; stop it first"):
         ask(story)
 
@@ -136,16 +137,16 @@ def test_a_mode_can_be_chosen_and_a_dither_stopped_meanwhile(story):
 def test_the_service_does_nothing_by_itself_meanwhile(story, pattern):
     begin(story, pattern=pattern)
     story.tell(cmd.SetMode(mode=Mode.AUTO))
-    story.state = replace(story.state, dither_stopped=False)
+    story.state = changed(story.state, stopped=False)
     close(story)
     assert story.wait(10) == ()
 
 
 def test_windows_meanwhile_are_refused_with_the_reason(story):
     ask(story)
-    accepted = story.state.windows_accepted
+    accepted = story.state.windows.accepted
     story.see()
-    assert story.state.windows_accepted == accepted
+    assert story.state.windows.accepted == accepted
     assert "is being measured" in story.state.log[-1].text
 
 
@@ -191,7 +192,7 @@ def test_an_rtc_that_vanishes_takes_the_measurement_with_it(story):
     begin(story)
     story.tell(ev.RtcVanished())
     assert story.state.measurement("im-1").reason == "the RTC vanished"
-    assert story.state.rtc is None
+    assert story.state.loop.rtc is None
 
 
 def test_a_matrix_that_does_not_come_after_the_loop_has_closed_is_given_up(story):
@@ -266,6 +267,6 @@ def test_nothing_is_asked_while_tones_given_up_still_play(story):
     close(story)
     story.tell(cmd.GiveUp(id="im-1"))
     story.tell(cmd.SetMode(mode=Mode.AUTO))
-    story.state = replace(story.state, dither_stopped=False, in_use="initial")
+    story.state = changed(story.state, stopped=False, in_use="initial")
     assert not of_kind(story.wait(20), DitherRequest)
     assert of_kind(story.wait(15), DitherRequest)

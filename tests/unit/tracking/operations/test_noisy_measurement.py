@@ -52,7 +52,7 @@ def story():
 def dithering():
     """A loop in which the service's own dither runs."""
     story = Story().meet()
-    own = story.state.dither
+    own = story.state.dithers.dither
     answer = dither_answered(own.id, accepted=True, reason="", start_seq=500)
     story.tell(answer)
     status(story, dither=replace(own, start_seq=500))
@@ -70,7 +70,7 @@ def state_of(story, noisy_id="noisy-1"):
 def begun(story):
     story.tell(ASK)
     story.tell(dither_answered("noisy-1", accepted=True, reason="", start_seq=1000))
-    status(story, dither=story.state.dither, seq=1100)
+    status(story, dither=story.state.dithers.dither, seq=1100)
     return story
 
 
@@ -97,7 +97,7 @@ def test_the_services_own_dither_makes_way_and_none_of_its_own_follows(dithering
 
 
 def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
-    own = dithering.state.dither
+    own = dithering.state.dithers.dither
     dithering.tell(ASK)
     status(dithering, dither=own)
     dithering.wait(FREE_WITHIN_S + 2.0)
@@ -108,7 +108,7 @@ def test_a_dither_that_does_not_make_way_ends_the_wait(dithering):
 def test_it_runs_from_when_the_rtc_has_accepted(story):
     begun(story)
     assert state_of(story) is MeasureState.RUNNING
-    assert story.state.dither.id == "noisy-1"
+    assert story.state.dithers.dither.id == "noisy-1"
 
 
 def test_the_end_of_the_dither_is_the_beginning_of_the_fit(story):
@@ -171,7 +171,7 @@ def test_one_given_up_ends_its_dither_and_stays_given_up(story):
     begun(story)
     effects = story.tell(cmd.GiveUp(id="noisy-1"))
     assert of_kind(effects, DitherStop)
-    assert story.state.dither is None
+    assert story.state.dithers.dither is None
     record = replace(story.state.noisy[-1], state=MeasureState.STORED, finding=FINDING)
     story.tell(ev.MatrixMeasured(record=record))
     assert state_of(story) is MeasureState.GIVEN_UP

@@ -1,15 +1,15 @@
 """What the service is in, in a control room's words: derived from what runs and what is wrong."""
 
-from dataclasses import replace
-
 import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import Acquisition, AcquisitionStage
 from service.tracking.alarms import Alarm
 from service.tracking.operations.running import CurrentOperation, ServiceState, operating
-from service.tracking.state import Acquisition, AcquisitionStage, Mode
+from service.tracking.state import Mode
 from service.wire import Loop
+from tests.states import changed
 from tests.unit.tracking.situations import Story, rtc
 
 
@@ -27,7 +27,7 @@ def found(state, hindered="", now_ns=0):
 
 def alarmed(state, *names):
     raised = tuple(Alarm(name=name, since_ns_utc=1, text=f"{name} found") for name in names)
-    return replace(state, alarms=raised)
+    return changed(state, active=raised)
 
 
 def test_a_closed_loop_with_a_known_registration_is_tracked(story):
@@ -36,9 +36,9 @@ def test_a_closed_loop_with_a_known_registration_is_tracked(story):
 
 
 def test_without_a_closed_loop_it_is_ready_and_says_what_for(story):
-    gone = replace(story.state, rtc=None, alarms=())
+    gone = changed(story.state, rtc=None, active=())
     assert found(gone) == (ServiceState.READY, CurrentOperation.IDLE, "no RTC is there")
-    opened = replace(story.state, rtc=rtc(loop=Loop.OPEN), alarms=())
+    opened = changed(story.state, rtc=rtc(loop=Loop.OPEN), active=())
     assert found(opened) == (ServiceState.READY, CurrentOperation.IDLE, "the loop is open")
 
 
@@ -49,12 +49,12 @@ def test_what_is_not_known_yet_is_not_tracked():
 
 def test_what_has_the_mirror_is_what_it_does_whatever_the_loop(story):
     acquiring = Acquisition(stage=AcquisitionStage.COARSE, text="looking")
-    looking = replace(story.state, rtc=rtc(loop=Loop.OPEN), acquisition=acquiring)
+    looking = changed(story.state, rtc=rtc(loop=Loop.OPEN), acquisition=acquiring)
     assert found(looking)[:2] == (ServiceState.OPERATIONAL, CurrentOperation.ACQUIRING)
-    stopped = replace(story.state, stopped_because="Ada stopped it")
+    stopped = changed(story.state, stopped_because="Ada stopped it")
     assert found(stopped)[:2] == (ServiceState.READY, CurrentOperation.HOLD)
     assert "Ada stopped it" in found(stopped)[2]
-    assert found(replace(story.state, mode=Mode.HOLD))[1] is CurrentOperation.HOLD
+    assert found(changed(story.state, mode=Mode.HOLD))[1] is CurrentOperation.HOLD
 
 
 def test_the_worst_alarm_and_what_hinders_say_whether_it_does_its_work(story):

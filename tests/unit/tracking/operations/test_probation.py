@@ -9,6 +9,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, ProbationState
 from service.tracking.state import Mode
+from tests.states import changed
 from tests.unit.tracking.situations import Story, acknowledged, moved, rtc, verdict
 
 NUMBERS = "mode 30 moves 3.10 times as much"
@@ -46,7 +47,7 @@ def copied(told, name="cm-3", **changes):
 
 
 def trial(told):
-    return told.state.probation
+    return told.state.operations.probation
 
 
 def test_every_matrix_that_was_sent_is_on_probation_for_three_seconds():
@@ -56,22 +57,22 @@ def test_every_matrix_that_was_sent_is_on_probation_for_three_seconds():
     assert trial(told).until_ns_utc - trial(told).since_ns_utc == 3_000_000_000
     told.tell(found(Verdict.AS_GOOD))
     assert (trial(told).state, trial(told).text) == (ProbationState.PASSED, NUMBERS)
-    assert told.state.mode is Mode.AUTO
+    assert told.state.operator.mode is Mode.AUTO
     assert "probation" not in told.alarms
 
 
 def test_one_that_makes_the_loop_worse_gives_way_to_the_one_before():
     told = story()
     assert told.tell(found()) == (ev.RepublishMatrix(source="cm-1", why=WHY, judged=False),)
-    assert told.state.mode is Mode.HOLD
-    assert told.state.settings_mode is Mode.AUTO
-    (alarm,) = (a for a in told.state.alarms if a.name == "probation")
+    assert told.state.operator.mode is Mode.HOLD
+    assert told.state.operator.settings_mode is Mode.AUTO
+    (alarm,) = (a for a in told.state.alarms.active if a.name == "probation")
     assert NUMBERS in alarm.text
     copied(told)
     assert told.asked(ev.SendMatrix) == [ev.SendMatrix(id="cm-3", n_modes=400, gains=None)]
     told.acknowledge("cm-3")
     assert (trial(told).state, trial(told).rollback) == (ProbationState.WATCHED, "cm-3")
-    assert told.state.in_use == "cm-3"
+    assert told.state.matrices.in_use == "cm-3"
     assert told.matrix_state("cm-2") is MatrixState.FAILED
     assert told.state.previous != "cm-2", "an operator's rollback would use it again"
     told.tell(found(Verdict.AS_GOOD, after="cm-3"))
@@ -139,18 +140,18 @@ def test_nothing_is_sent_where_something_forbids_it(obstacle, text, late):
     if text:
         assert trial(told).state is ProbationState.KEPT
         assert text in trial(told).text
-        (alarm,) = (a for a in told.state.alarms if a.name == "probation")
+        (alarm,) = (a for a in told.state.alarms.active if a.name == "probation")
         assert "open the loop" in alarm.text
 
 
 def test_one_whose_numbers_the_rtc_has_not_shown_is_not_gone_back_to():
     told = story(after="")
-    told.state = replace(told.state, verified_ids=frozenset({"cm-1"}))
+    told.state = changed(told.state, verified_ids=frozenset({"cm-1"}))
     told.tell(found(before="initial", after="cm-1"))
     assert trial(told).state is ProbationState.KEPT
     assert "has not shown its numbers" in trial(told).text
     assert told.asked(ev.RepublishMatrix) == []
-    assert told.state.mode is Mode.HOLD
+    assert told.state.operator.mode is Mode.HOLD
 
 
 def test_what_the_gate_says_of_the_matrix_before_by_now_is_not_asked():
@@ -206,7 +207,7 @@ def test_a_loop_that_opens_or_goes_is_not_judged(event):
     assert trial(told).state is ProbationState.NOT_JUDGED
     told.tell(found())
     assert told.asked(ev.RepublishMatrix) == []
-    assert told.state.mode is Mode.AUTO
+    assert told.state.operator.mode is Mode.AUTO
 
 
 def test_a_copy_that_fails_or_that_the_rtc_rejects_is_said_to_have_failed():

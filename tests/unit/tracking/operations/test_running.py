@@ -9,9 +9,10 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.operations.running import under_way
 from service.tracking.products import MatrixState, MeasureState, ModeSet
-from service.tracking.state import AcquisitionStage, Mode
+from service.tracking.state import Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern
 from tests.unit.tracking.situations import POLICY, Story
 from tests.unit.tracking.world import World
@@ -29,7 +30,7 @@ def quiet():
     """A night on which α is known, no dither plays, and two matrices have been in use."""
     world = World(Mode.HOLD)
     world.pass_(10.0)
-    assert world.state.registration is not None
+    assert world.state.alpha.registration is not None
     world.tell(cmd.Refit())
     world.pass_(2.0)
     world.tell(cmd.Approve(id="cm-1"))
@@ -37,7 +38,7 @@ def quiet():
     world.tell(cmd.StopDither())
     world.tell(cmd.SetMode(mode=Mode.PROPOSE))
     world.pass_(4.0)
-    assert world.state.in_use == "cm-1"
+    assert world.state.matrices.in_use == "cm-1"
     assert not under_way(world.state, world.now_ns)
     return world
 
@@ -117,7 +118,9 @@ def sending():
     world = idle()
     world.tell(cmd.Refit())
     world.pass_(0.5)
-    proposed = [r.id for r in world.state.reconstructors if r.state is MatrixState.PROPOSED]
+    proposed = [
+        r.id for r in world.state.matrices.reconstructors if r.state is MatrixState.PROPOSED
+    ]
     world.tell(cmd.Approve(id=proposed[-1]))
     return world
 
@@ -185,13 +188,13 @@ def command_words(command):
 def strands(world):
     """What has neither ended nor goes on."""
     state = world.state
-    left = [f"{r.id} {r.state}" for r in state.measurements if r.under_way]
-    left += [f"{r.id} {r.state}" for r in state.reconstructors if r.state in SENT]
-    if state.acquisition.under_way:
-        left.append(state.acquisition.text)
-    if state.making_since_ns_utc is not None:
+    left = [f"{r.id} {r.state}" for r in state.operations.measurements if r.under_way]
+    left += [f"{r.id} {r.state}" for r in state.matrices.reconstructors if r.state in SENT]
+    if state.operations.acquisition.under_way:
+        left.append(state.operations.acquisition.text)
+    if state.matrices.making_since_ns_utc is not None:
         left.append("a matrix that is made")
-    left += [a.text for a in state.alarms if a.name == "dither-not-stopped"]
+    left += [a.text for a in state.alarms.active if a.name == "dither-not-stopped"]
     return left
 
 
@@ -296,7 +299,7 @@ def test_a_gain_ramp_ends_when_the_loop_is_opened():
     world = ramping()
     world.tell(cmd.SetLoop(loop="open"))
     world.pass_(2.0)
-    assert world.state.rtc.loop == "open"
+    assert world.state.loop.rtc.loop == "open"
     assert not under_way(world.state, world.now_ns)
 
 
@@ -317,7 +320,7 @@ def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_
     world.pass_(5.0)
     world.tell(ev.ConditionChanged(name="loop-diverging", text="found"))
     world.pass_(4.0)
-    assert world.state.acquisition.under_way
+    assert world.state.operations.acquisition.under_way
     (noisy,) = world.state.noisy
     assert noisy.state is MeasureState.FAILED
     assert "acquisition" in noisy.reason
@@ -343,10 +346,10 @@ def test_a_ramp_nobody_answers_for_keeps_nothing_back_for_ever():
 def test_an_acquisition_after_all_this_leads_to_tracking():
     world = acquiring()
     world.pass_(120.0)
-    assert world.state.acquisition.stage is AcquisitionStage.TRACKING
+    assert world.state.operations.acquisition.stage is AcquisitionStage.TRACKING
     assert not strands(world)
 
 
 def test_a_measurement_ends_stored():
     world = measuring().pass_(10.0)
-    assert [r.state for r in world.state.measurements] == [MeasureState.STORED]
+    assert [r.state for r in world.state.operations.measurements] == [MeasureState.STORED]

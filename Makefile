@@ -9,6 +9,8 @@ STAMP := .venv/.installed-for
 MANUAL := service/web/manual/index.html
 # A hundred processes that each compile the service anew cost a minute.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(PY) -m pytest
+# A test that hangs where no signal reaches it says where, ends its worker and is tried again.
+HUNG = -o faulthandler_exit_on_timeout=true -o faulthandler_timeout
 
 # The stamp names the folder it was made in: a copied or moved checkout gets an environment of its own.
 ifneq ($(wildcard $(PY)),)
@@ -29,10 +31,10 @@ demo: $(STAMP) $(MANUAL) ## service and simulated RTC together; ARGS="--seconds 
 docs: $(MANUAL) ## build the manual, which the service shows at /manual/
 
 test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go to pytest
-	@$(PYTEST) -n 3 -m 'not long and not slow' $(ARGS)  # for two cores: one may wait
+	@$(PYTEST) -n 3 $(HUNG)=240 -m 'not long and not slow' $(ARGS)  # for two cores: one may wait
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
-	@$(PYTEST) -n 4 -m 'long and not slow' $(ARGS)  # they wait more than they work
+	@$(PYTEST) -n 4 $(HUNG)=480 -m 'long and not slow' $(ARGS)  # they wait more than they work
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

@@ -142,16 +142,36 @@ def _place(nodeid):
     return folder, not nodeid.startswith(REAL_TIME)
 
 
+class InOrder(LoadScopeScheduling):
+    """Hands out whole modules in order, system tests one by one; outlives a worker that dies."""
+
+    def _split_scope(self, nodeid):
+        if nodeid.startswith(REAL_TIME):
+            return "real time"
+        alone = nodeid.startswith("tests/system/") and not nodeid.startswith(SHARED)
+        return nodeid if alone else nodeid.split("::")[0]
+
+    def remove_node(self, node):
+        """Put back only what is left to do: a new worker would wait for an empty unit."""
+        units = self.assigned_work[node]
+        for scope in [scope for scope, unit in units.items() if all(unit.values())]:
+            del units[scope]
+        return super().remove_node(node)
+
+    def mark_test_pending(self, item):
+        """Allow the second try of a test that has ended its worker: it is put back already."""
+
+    def _reschedule(self, node):
+        """Give a new worker more than one: it begins none before it knows the next."""
+        while True:
+            left = len(self.workqueue)
+            super()._reschedule(node)
+            if len(self.workqueue) in {left, 0}:
+                return
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Hand out whole modules in order, and system tests one by one."""
-
-    class InOrder(LoadScopeScheduling):
-        def _split_scope(self, nodeid):
-            if nodeid.startswith(REAL_TIME):
-                return "real time"
-            alone = nodeid.startswith("tests/system/") and not nodeid.startswith(SHARED)
-            return nodeid if alone else nodeid.split("::")[0]
-
+    """Hand out tests in the order of this suite."""
     config.option.loadscopereorder = False
     return InOrder(config, log)

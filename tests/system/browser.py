@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.night import wait_for
+from tests.system.pace import patience
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 errors = pytest.importorskip("selenium.common.exceptions", reason="selenium is not installed")
@@ -35,6 +36,8 @@ def a_browser():
     for word in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "disable-gpu"):
         options.add_argument(f"--{word}")
     driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    driver.set_script_timeout(patience(10.0))
+    driver.set_page_load_timeout(patience(20.0))
     try:
         yield driver
     finally:

@@ -23,7 +23,7 @@ from studies.peers_pushpull import Measured, read_product, write_job
 
 ROOT = Path(__file__).resolve().parent.parent
 KEPT = ROOT / "var" / "peers"
-PAGE = ROOT / "docs" / "results" / "peers.md"
+PAGE = KEPT / "peers.md"
 
 REQUIREMENTS = {"oopao": "OOPAO==1.0.0", "hcipy": "hcipy==0.7.1", "specula": "specula==1.1.0"}
 """What is installed for each peer."""

@@ -50,9 +50,23 @@ __all__ = ["Command", "Event", "Policy", "step"]
 
 
 def step(
-    state: TrackerState, event: Event, policy: Policy, now_ns: int
+    state: TrackerState, event: Event, policy: Policy, now_ns: int, cause: str = ""
 ) -> tuple[TrackerState, tuple[Effect, ...]]:
     """Return the next state and what is to be done.
+
+    Parameters
+    ----------
+    state
+        What is known.
+    event
+        What has happened, or a command.
+    policy
+        The user's numbers.
+    now_ns
+        The service's clock, nanoseconds.
+    cause
+        Id of the command or event that has led to this one; empty: it stands for itself, and what
+        it leads to has its own.
 
     Raises
     ------
@@ -63,7 +77,8 @@ def step(
     """
     if isinstance(event, Command):
         interlocks.require(state, event, policy, now_ns)
-    context = StepContext(state, policy, now_ns)
+    cause = cause or ev.new_id(ev.kebab(type(event)), now_ns)
+    context = StepContext(state, policy, now_ns, cause)
     alarm_records.judge_rules(context)
     measurement.watch(context, event)
     reaction = REACTIONS.get(type(event))

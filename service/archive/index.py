@@ -21,7 +21,7 @@ from service.tracking.registration import HistoryEntry
 Product = ReconstructorRecord | MeasurementRecord
 Indexed = TypeVar("Indexed", bound=Product)
 
-_VERSION = 4
+_VERSION = 5
 
 _PRODUCTS = """
 CREATE TABLE IF NOT EXISTS {} (
@@ -40,8 +40,8 @@ CREATE TABLE IF NOT EXISTS pin (
 );
 """
 
-_OF_ORDERS = ("address", "whence", "why", "answer")
-"""Columns of the audit trail that are there since version 3."""
+_OF_ORDERS = ("address", "whence", "why", "answer", "cause")
+"""Columns of the audit trail that are there since version 3; the last one since version 5."""
 
 _SCHEMA = f"""
 {_TABLES}
@@ -93,6 +93,10 @@ class AuditEntry:
 
     answer: str = ""
     """What the order was answered."""
+
+    cause: str = ""
+    """Id of the order or event that has led to it, the order's own for its two lines; empty: it was
+    none of the tracker's."""
 
     id: int = 0
     """Place in the trail, from 1 on, growing; 0: not written yet."""

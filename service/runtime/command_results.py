@@ -1,20 +1,21 @@
-"""What an order has led to, in one sentence, from the state after it."""
+"""What an order has led to, in one sentence: read from what the state holds of its id."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Final
 
 from service.errors import CommandError, LinkError
 from service.tracking import commands as cmd
 from service.tracking.alarm_records import as_text, muted
-from service.tracking.alarms import NO_DITHER, AlarmRecord
+from service.tracking.alarms import AlarmRecord
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
 from service.tracking.loop import CommandState
 from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
 from service.tracking.state import TrackerState
-from service.tracking.step_context import new_lines
 
 SILENT = "sent, the RTC has not answered yet"
 
@@ -35,193 +36,109 @@ class CommandResult:
 
 
 @dataclass(frozen=True, slots=True)
-class CarriedOut:
-    """An order that was carried out, as far as the service can by itself."""
+class Order:
+    """A command that was given."""
 
     command: Command
-    before: TrackerState
-    """What was known before it."""
+    id: str
+    """The cause of all that it leads to."""
 
-    then: TrackerState
-    """Right after it, before anything was heard of it."""
-
-    def result(self, now: TrackerState) -> CommandResult:  # noqa: C901 - one line for each command
+    def result(self, now: TrackerState) -> CommandResult:
         """Return what has come of it by now.
 
         Raises
         ------
         CommandError
-            If RTC or gate have refused it.
+            If RTC or gate have refused it, or what it asked for came to nothing.
         LinkError
             If the RTC did not answer in its time.
         """
-        match self.command:
-            case cmd.SetMode():
-                return CommandResult(f"mode is {now.operator.mode}")
-            case cmd.StopEverything():
-                return _stopped(now)
-            case cmd.Resume():
-                off = "; no dither is started until one is asked for"
-                return CommandResult(
-                    f"released: mode is {now.operator.mode}{off if now.dithers.stopped else ''}"
-                )
-            case cmd.SetPointing():
-                return _pointing(now)
-            case cmd.SetValue(name=name, value=value, for_s=for_s):
-                return CommandResult(f"{name} is {as_text(value)} for {for_s:g} s")
-            case cmd.Acquire():
-                return CommandResult(
-                    f"an acquisition is under way: {now.operations.acquisition.text}"
-                )
-            case cmd.AbortAcquisition():
-                return CommandResult(f"the acquisition has {now.operations.acquisition.text}")
-            case cmd.StartDither():
-                return self._dither(now)
-            case cmd.StopDither():
-                return _no_dither(now)
-            case cmd.SetLoop() | cmd.Ramp():
-                return self._loop(now)
-            case cmd.Measure(id=name) | cmd.MeasureNoisy(id=name):
-                return _measurement(now, name)
-            case cmd.GiveUp(id=name):
-                record = now.measurement(name)
-                why = "" if record is None else record.reason.removeprefix("given up ")
-                return CommandResult(f"{name} is given up {why}")
-            case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
-                return _alarm(now, name)
-            case cmd.UnmuteAlarm(name=name):
-                return CommandResult(f"{name} is not muted any more")
-            case _:
-                return self._of_matrices(now)
+        tell = _TOLD_LATER.get(type(self.command), _done)
+        result = tell(self.command, self.id, now)
+        failure = "" if result.final else now.failure(self.id)
+        if failure:
+            raise CommandError(failure)
+        return result
 
-    def _of_matrices(self, now: TrackerState) -> CommandResult:
-        match self.command:
-            case cmd.Refit():
-                return CommandResult(
-                    f"a reconstructor is being computed; mode is {now.operator.mode}"
-                )
-            case cmd.Approve(id=name):
-                return self._sent(now, name)
-            case cmd.Reject(id=name):
-                return CommandResult(f"{name} is discarded")
-            case cmd.Publish(id=name):
-                return self._republished(now, name)
-            case _:
-                return self._republished(now, self.before.previous or "")
 
-    def _republished(self, now: TrackerState, source: str) -> CommandResult:
-        """Tell of a reconstructor that goes out again, under an id of its own."""
-        known = {record.id for record in self.before.matrices.reconstructors}
-        made = [r for r in now.matrices.reconstructors if r.parent == source and r.id not in known]
-        if made:
-            if made[-1].state is MatrixState.REFUSED and isinstance(self.command, cmd.Rollback):
-                text = f"{_why_not(made[-1])}; ordered with anyway, it goes out all the same"
-                raise CommandError(text)
-            answer = self._sent(now, made[-1].id)
-            return CommandResult(
-                f"{answer.text}; it is {source} again; mode is {now.operator.mode}", answer.final
-            )
-        failed = [line for line in new_lines(self.then, now) if line.name == "job.failed"]
-        if now.matrices.making_since_ns_utc is None and failed:
-            raise CommandError(failed[-1].text)
+def _sent(command: cmd.Approve, _: str, now: TrackerState) -> CommandResult:
+    """Tell how far the reconstructor is on its way to the RTC that was approved."""
+    return _of_matrix(now, command.id)
+
+
+def _republished(
+    command: cmd.Publish | cmd.Rollback, cause: str, now: TrackerState
+) -> CommandResult:
+    """Tell of the reconstructor that goes out again, under an id of its own."""
+    copies = [each for each in now.matrices.reconstructors if each.cause == cause]
+    if not copies:
+        source = command.id if isinstance(command, cmd.Publish) else now.previous
         return CommandResult(f"{source} is being judged before it is sent again", final=False)
-
-    def _sent(self, now: TrackerState, name: str) -> CommandResult:
-        """Tell how far a reconstructor is on its way to the RTC."""
-        record = now.reconstructor(name)
-        if record is None:
-            raise CommandError(f"{name} is not known any more")
-        for line in new_lines(self.then, now):
-            if line.name == "reconstructor.not-sent" and line.text.startswith(name):
-                raise CommandError(line.text)
-        held = why_unsendable(now, record) if record.state is MatrixState.PROPOSED else None
-        if held is not None:
-            return CommandResult(f"{name} is proposed and not sent: {held}")
-        words = _ON_ITS_WAY.get(record.state)
-        if words is not None:
-            return CommandResult(f"{name} {words}", final=False)
-        if record.state is MatrixState.FAILED:
-            raise LinkError(record.reason)
-        if not record.was_used:
-            raise CommandError(_why_not(record))
-        return CommandResult(f"{name} sent, applied at frame {record.applied_frame_seq}")
-
-    def _dither(self, now: TrackerState) -> CommandResult:
-        asked = self.then.dithers.dither
-        name = "" if asked is None else asked.id
-        dither = now.dithers.dither
-        if dither is None or dither.id != name:
-            told = now.alarm(NO_DITHER)
-            gone = f"{name} is not followed any more: see the events"
-            raise CommandError(gone if told is None else told.text)
-        cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
-        cost = f"{cost}, budget {1e9 * now.dithers.policy.budget_m:.3g} nm"
-        if dither.start_seq is None:
-            return CommandResult(f"{name} {SILENT}: {cost}", final=False)
-        return CommandResult(f"{name} plays from frame {dither.start_seq}: {cost}")
-
-    def _loop(self, now: TrackerState) -> CommandResult:
-        asked, found = self.then.loop.command, now.loop.command
-        if asked is None or found is None or asked.id != found.id:
-            return CommandResult(f"{SILENT}: another change of the loop came after it")
-        match found.state:
-            case CommandState.ASKED:
-                return CommandResult(f"{found.text}: {SILENT}", final=False)
-            case CommandState.ACCEPTED:
-                return CommandResult(f"the RTC has accepted: {found.text}")
-            case CommandState.REFUSED:
-                raise CommandError(f"the RTC refused: {found.reason}")
-            case CommandState.FAILED:
-                raise LinkError(found.reason)
+    copy = copies[-1]
+    if copy.state is MatrixState.REFUSED and isinstance(command, cmd.Rollback):
+        raise CommandError(f"{_why_not(copy)}; ordered with anyway, it goes out all the same")
+    told = _of_matrix(now, copy.id)
+    text = f"{told.text}; it is {copy.parent} again; mode is {now.operator.mode}"
+    return CommandResult(text, told.final)
 
 
-def _pointing(now: TrackerState) -> CommandResult:
-    where = now.alpha.pointing
-    if where is None:
-        return CommandResult("the pointing is not known")
-    return CommandResult(
-        f"the telescope looks at elevation {where.elevation_deg:g} deg, azimuth "
-        f"{where.azimuth_deg:g} deg"
-    )
+def _of_matrix(now: TrackerState, name: str) -> CommandResult:
+    record = now.reconstructor(name)
+    if record is None:
+        raise CommandError(f"{name} is not known any more")
+    held = why_unsendable(now, record) if record.state is MatrixState.PROPOSED else None
+    if held is not None and not now.failure(record.cause):
+        return CommandResult(f"{name} is proposed and not sent: {held}")
+    words = _ON_ITS_WAY.get(record.state)
+    if words is not None:
+        return CommandResult(f"{name} {words}", final=False)
+    if record.state is MatrixState.FAILED:
+        raise LinkError(record.reason)
+    if not record.was_used:
+        raise CommandError(_why_not(record))
+    return CommandResult(f"{name} sent, applied at frame {record.applied_frame_seq}")
 
 
-def _stopped(now: TrackerState) -> CommandResult:
-    playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
-    text = f"{now.operator.stopped_because}; nothing is dithered, made or sent until it is released"
-    if playing is None:
-        return CommandResult(text)
-    return CommandResult(
-        f"{text}; the RTC's status still shows {playing}, it was told to stop it", False
-    )
+def _why_not(record: ReconstructorRecord) -> str:
+    who = {MatrixState.REJECTED: "the RTC", MatrixState.REFUSED: "the gate"}.get(record.state)
+    if who is None:
+        return f"{record.id} is {record.state}: {record.reason}"
+    gate = record.gate
+    reason = record.reason if gate is None or gate.accepted else gate.reason
+    return f"{who} refused {record.id}: {reason}"
 
 
-def _no_dither(now: TrackerState) -> CommandResult:
-    playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
-    off = "no dither is started until one is asked for"
-    if playing is None:
-        return CommandResult(f"no dither plays; {off}")
-    return CommandResult(
-        f"the RTC was told to stop {playing}, its status still shows it; {off}", False
-    )
+def _dither(_: cmd.StartDither, cause: str, now: TrackerState) -> CommandResult:
+    dither = now.dithers.dither
+    if dither is None or dither.cause != cause:
+        gone = "the dither is not followed any more: see the events"
+        raise CommandError(now.failure(cause) or gone)
+    cost = f"{1e9 * total_m(dither.request):.3g} nm RMS in all"
+    cost = f"{cost}, budget {1e9 * now.dithers.policy.budget_m:.3g} nm"
+    if dither.start_seq is None:
+        return CommandResult(f"{dither.id} {SILENT}: {cost}", final=False)
+    return CommandResult(f"{dither.id} plays from frame {dither.start_seq}: {cost}")
 
 
-def _alarm(now: TrackerState, name: str) -> CommandResult:
-    """Tell what is kept of an alarm that was acknowledged or muted."""
-    record = next(
-        (record for record in now.alarms.records if record.name == name), AlarmRecord(name=name)
-    )
-    said = []
-    if record.acknowledged is not None:
-        said.append("acknowledged; it stays until it is over")
-    elif record.worst is None:
-        said.append("over and done with")
-    if record.muted is not None:
-        left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
-        said.append(f"muted for {left_s:.0f} s, with {len(muted(now))} muted in all")
-    return CommandResult(f"{name} is {', '.join(said)}")
+def _loop(_: cmd.SetLoop | cmd.Ramp, cause: str, now: TrackerState) -> CommandResult:
+    found = now.loop.command
+    if found is None or found.cause != cause:
+        return CommandResult(f"{SILENT}: another change of the loop came after it")
+    match found.state:
+        case CommandState.ASKED:
+            return CommandResult(f"{found.text}: {SILENT}", final=False)
+        case CommandState.ACCEPTED:
+            return CommandResult(f"the RTC has accepted: {found.text}")
+        case CommandState.REFUSED:
+            raise CommandError(f"the RTC refused: {found.reason}")
+        case CommandState.FAILED:
+            raise LinkError(found.reason)
 
 
-def _measurement(now: TrackerState, name: str) -> CommandResult:
+def _measurement(
+    command: cmd.Measure | cmd.MeasureNoisy, _: str, now: TrackerState
+) -> CommandResult:
+    name = command.id
     record = now.measurement(name)
     if record is None:
         raise CommandError(f"{name} is not known any more")
@@ -240,10 +157,85 @@ def _measurement(now: TrackerState, name: str) -> CommandResult:
             return CommandResult(f"{name} is {record.state}, from frame {record.start_seq}")
 
 
-def _why_not(record: ReconstructorRecord) -> str:
-    who = {MatrixState.REJECTED: "the RTC", MatrixState.REFUSED: "the gate"}.get(record.state)
-    if who is None:
-        return f"{record.id} is {record.state}: {record.reason}"
-    gate = record.gate
-    reason = record.reason if gate is None or gate.accepted else gate.reason
-    return f"{who} refused {record.id}: {reason}"
+def _stopped(_: cmd.StopEverything, __: str, now: TrackerState) -> CommandResult:
+    playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
+    text = f"{now.operator.stopped_because}; nothing is dithered, made or sent until it is released"
+    if playing is None:
+        return CommandResult(text)
+    shows = f"the RTC's status still shows {playing}, it was told to stop it"
+    return CommandResult(f"{text}; {shows}", final=False)
+
+
+def _no_dither(_: cmd.StopDither, __: str, now: TrackerState) -> CommandResult:
+    playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
+    off = "no dither is started until one is asked for"
+    if playing is None:
+        return CommandResult(f"no dither plays; {off}")
+    told = f"the RTC was told to stop {playing}, its status still shows it"
+    return CommandResult(f"{told}; {off}", final=False)
+
+
+_TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]] = {
+    cmd.Approve: _sent,
+    cmd.Publish: _republished,
+    cmd.Rollback: _republished,
+    cmd.StartDither: _dither,
+    cmd.StopDither: _no_dither,
+    cmd.SetLoop: _loop,
+    cmd.Ramp: _loop,
+    cmd.Measure: _measurement,
+    cmd.MeasureNoisy: _measurement,
+    cmd.StopEverything: _stopped,
+}
+"""What the RTC, or a verdict, has a say in; the others are done when they are answered."""
+
+
+def _done(  # noqa: C901 - one line for each command
+    command: Command, _: str, now: TrackerState
+) -> CommandResult:
+    """Tell what the state is after a command that the service carries out by itself."""
+    match command:
+        case cmd.SetMode():
+            text = f"mode is {now.operator.mode}"
+        case cmd.Resume():
+            off = "; no dither is started until one is asked for" if now.dithers.stopped else ""
+            text = f"released: mode is {now.operator.mode}{off}"
+        case cmd.Refit():
+            text = f"a reconstructor is being computed; mode is {now.operator.mode}"
+        case cmd.Reject(id=name):
+            text = f"{name} is discarded"
+        case cmd.Acquire():
+            text = f"an acquisition is under way: {now.operations.acquisition.text}"
+        case cmd.AbortAcquisition():
+            text = f"the acquisition has {now.operations.acquisition.text}"
+        case cmd.GiveUp(id=name):
+            record = now.measurement(name)
+            why = "" if record is None else record.reason.removeprefix("given up ")
+            text = f"{name} is given up {why}"
+        case cmd.SetPointing(elevation_deg=up, azimuth_deg=round_):
+            text = f"the telescope looks at elevation {up:g} deg, azimuth {round_:g} deg"
+        case cmd.SetValue(name=name, value=value, for_s=for_s):
+            text = f"{name} is {as_text(value)} for {for_s:g} s"
+        case cmd.UnmuteAlarm(name=name):
+            text = f"{name} is not muted any more"
+        case cmd.AcknowledgeAlarm(name=name) | cmd.MuteAlarm(name=name):
+            text = _alarm(now, name)
+        case _:
+            raise TypeError(f"found {type(command).__name__}; expected it in _TOLD_LATER")
+    return CommandResult(text)
+
+
+def _alarm(now: TrackerState, name: str) -> str:
+    """Tell what is kept of an alarm that was acknowledged or muted."""
+    record = next(
+        (record for record in now.alarms.records if record.name == name), AlarmRecord(name=name)
+    )
+    said = []
+    if record.acknowledged is not None:
+        said.append("acknowledged; it stays until it is over")
+    elif record.worst is None:
+        said.append("over and done with")
+    if record.muted is not None:
+        left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
+        said.append(f"muted for {left_s:.0f} s, with {len(muted(now))} muted in all")
+    return f"{name} is {', '.join(said)}"

@@ -49,7 +49,7 @@ STEADY_GATHER_S = 0.55
 """Of frames, while nothing happens: windows last four times as long, and alarms have a second. Most
 often a status, which is heard at once, ends the wait before."""
 
-Step = Callable[[TrackerState, Event, Policy, int], tuple[TrackerState, tuple[Effect, ...]]]
+Step = Callable[[TrackerState, Event, Policy, int, str], tuple[TrackerState, tuple[Effect, ...]]]
 
 
 class Driver(Protocol):
@@ -112,8 +112,10 @@ class Engine:
             self.bank = EstimatorBank(description=self.bank.description)
             self._follow()
 
-    def post(self, event: Event) -> tuple[Effect, ...]:
+    def post(self, event: Event, cause: str = "") -> tuple[Effect, ...]:
         """Let the tracker react, and set in motion what it wants done.
+
+        ``cause``: id of what has led to the event, an effect's where it comes of one.
 
         Raises
         ------
@@ -123,7 +125,8 @@ class Engine:
             If it names an unknown reconstructor.
         """
         before = self.state
-        self.state, effects = self._step(before, event, self.policy, self._driver.now_ns())
+        now_ns = self._driver.now_ns()
+        self.state, effects = self._step(before, event, self.policy, now_ns, cause)
         self._driver.stepped(before, event)
         self._follow()
         for effect in effects:

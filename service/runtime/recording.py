@@ -22,6 +22,7 @@ from service.archive import Archive, AuditEntry
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError
+from service.runtime.command_results import Order
 from service.tracking import events as ev
 from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
 from service.tracking.commands import Command
@@ -84,7 +85,14 @@ class Actor:
     """Raises where what the order was decided on has changed."""
 
     def entry(
-        self, name: str, text: str = "", *, by: str = "", why: str = "", answer: str = ""
+        self,
+        name: str,
+        text: str = "",
+        *,
+        by: str = "",
+        why: str = "",
+        answer: str = "",
+        cause: str = "",
     ) -> AuditEntry:
         """Return a line of the audit trail on what they do; ``by``: what they call themselves."""
         return AuditEntry(
@@ -96,6 +104,7 @@ class Actor:
             channel=self.channel,
             why=why,
             answer=answer,
+            cause=cause,
         )
 
 
@@ -164,10 +173,16 @@ class Recorder:
             if entry.level is Level.DEBUG:
                 continue
             self.add(
-                AuditEntry(t_ns_utc=entry.t_ns_utc, who="service", name=entry.name, text=entry.text)
+                AuditEntry(
+                    t_ns_utc=entry.t_ns_utc,
+                    who="service",
+                    name=entry.name,
+                    text=entry.text,
+                    cause=entry.cause,
+                )
             )
 
-    async def ordered(self, command: Command, actor: Actor) -> None:
+    async def ordered(self, order: Order, actor: Actor) -> None:
         """Write down what an operator asks for, before it is done.
 
         Raises
@@ -175,24 +190,26 @@ class Recorder:
         StorageError
             If the disk refuses: it must not be done.
         """
-        self._order(command, actor)
+        self._order(order, actor)
         await self.flush()
 
-    def answered(self, command: Command, actor: Actor, answer: str) -> None:
+    def answered(self, order: Order, actor: Actor, answer: str) -> None:
         """Take down what an order has led to, as its giver was told."""
-        self._order(command, actor, ".answered", answer)
+        self._order(order, actor, ".answered", answer)
 
-    def refused(self, command: Command, actor: Actor, error: Exception) -> None:
+    def refused(self, order: Order, actor: Actor, error: Exception) -> None:
         """Take down why an operator does not get what was asked for."""
-        self._order(command, actor, ".refused", str(error))
+        self._order(order, actor, ".refused", str(error))
 
-    def _order(self, command: Command, actor: Actor, end: str = "", answer: str = "") -> None:
+    def _order(self, order: Order, actor: Actor, end: str = "", answer: str = "") -> None:
+        command = order.command
         entry = actor.entry(
             f"{type(command).__name__}{end}",
             asked_for(command, actor),
             by=command.by,
             why=command.reason,
             answer=answer,
+            cause=order.id,
         )
         self.add(entry)
         said = {key: getattr(entry, key) for key in _LOGGED if getattr(entry, key)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from enum import StrEnum
 
 from service.errors import UnknownIdError
@@ -53,7 +52,6 @@ class Refits:
 
     def __init__(self) -> None:
         self._jobs: dict[str, RefitJob] = {}
-        self._effects: dict[str, Effect] = {}
 
     @property
     def newest(self) -> RefitJob:
@@ -61,24 +59,20 @@ class Refits:
         return next(reversed(self._jobs.values()))
 
     def begin(self, effect: ev.MakeMatrix, now_ns: int) -> None:
-        """Remember a job from the moment its computation begins."""
-        name = f"refit-{datetime.fromtimestamp(now_ns / 1e9, UTC):%Y%m%dT%H%M%S.%f}"
-        self._effects[name] = effect
-        self._jobs[name] = RefitJob(
-            id=name, state=RefitState.RUNNING, n_modes=effect.n_modes, asked_ns_utc=now_ns
+        """Remember a job from the moment its computation begins; its id is the order's."""
+        self._jobs[effect.cause] = RefitJob(
+            id=effect.cause, state=RefitState.RUNNING, n_modes=effect.n_modes, asked_ns_utc=now_ns
         )
         while len(self._jobs) > REFITS_KEPT:
-            oldest = next(iter(self._jobs))
-            del self._jobs[oldest]
-            self._effects.pop(oldest, None)
+            del self._jobs[next(iter(self._jobs))]
 
     def end(self, effect: Effect, event: Event | None) -> None:
         """Note what came of an effect, if a job waits for it."""
-        name = next((name for name, one in self._effects.items() if one is effect), None)
-        if name is None:
+        job = self._jobs.get(effect.cause)
+        if job is None or job.state is not RefitState.RUNNING:
             return
-        del self._effects[name]
-        job = self._jobs[name]
+        if not isinstance(effect, ev.MakeMatrix):
+            return
         match event:
             case ev.MatrixMade(record=record):
                 verdict = record.reason if record.gate is None else record.gate.reason
@@ -90,7 +84,7 @@ class Refits:
                 job = replace(job, state=RefitState.FAILED, reason=text)
             case _:
                 job = replace(job, state=RefitState.FAILED, reason="it was given up")
-        self._jobs[name] = job
+        self._jobs[job.id] = job
 
     def job(self, refit_id: str) -> RefitJob:
         """Return what is known of a job.

@@ -26,7 +26,7 @@ from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
 from service.runtime.clock import ServiceClock
-from service.runtime.command_results import CarriedOut
+from service.runtime.command_results import Order
 from service.runtime.engine import Engine, process_blocks
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Window
@@ -184,41 +184,42 @@ class Supervisor:
         StorageError
             If it cannot be recorded; nothing has been done.
         """
+        now_ns = self._clock.now_ns()
+        order = Order(command, ev.new_id(ev.kebab(type(command)), now_ns))
         told = isinstance(command, cmd.SetValue) and not changes_value(
-            self._engine.state, command, self._clock.now_ns()
+            self._engine.state, command, now_ns
         )
         if told or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
-            return await self._result_of(command)
+            return await self._result_of(order)
         try:
-            await self._recorder.ordered(command, actor)
+            await self._recorder.ordered(order, actor)
         except StorageError as error:
             if not isinstance(command, cmd.StopEverything):  # that one waits for no disk
-                self._recorder.refused(command, actor, error)
+                self._recorder.refused(order, actor, error)
                 raise
         try:
             actor.check()
-            answer = await self._result_of(command)
+            answer = await self._result_of(order)
         except PyrcalError as error:
-            self._recorder.refused(command, actor, error)
+            self._recorder.refused(order, actor, error)
             raise
-        self._recorder.answered(command, actor, answer)
+        self._recorder.answered(order, actor, answer)
         if isinstance(command, cmd.StopEverything | cmd.Resume):
             await self._recorder.keep_orders()
         return answer
 
-    async def _result_of(self, command: Command) -> str:
+    async def _result_of(self, order: Order) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
-        before, running = self._engine.state, set(self._running)
-        for effect in self._post(command):
-            if isinstance(command, cmd.Refit) and isinstance(effect, ev.MakeMatrix):
+        running = set(self._running)
+        for effect in self._post(order.command, order.id):
+            if isinstance(order.command, cmd.Refit) and isinstance(effect, ev.MakeMatrix):
                 self.refits.begin(effect, self._clock.now_ns())
-        given = CarriedOut(command, before, self._engine.state)
         asked = self._running - running
-        if asked and isinstance(command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
+        if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
             await asyncio.wait(asked)
         until_s = time.monotonic() + ANSWERED_WITHIN_S
         while True:
-            answer = given.result(self._engine.state)
+            answer = order.result(self._engine.state)
             if answer.final or time.monotonic() > until_s:
                 return answer.text
             await asyncio.sleep(ASK_AGAIN_S)
@@ -411,8 +412,8 @@ class Supervisor:
             if event is not None:
                 self._post(event)
 
-    def _post(self, event: Event) -> tuple[Effect, ...]:
-        return self._engine.post(event)
+    def _post(self, event: Event, cause: str = "") -> tuple[Effect, ...]:
+        return self._engine.post(event, cause)
 
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
@@ -470,7 +471,7 @@ class Supervisor:
             event = ev.JobFailed(effect=effect, text=f"internal error: {error!r}")
         self.refits.end(effect, event)
         if event is not None:
-            self._post(event)
+            self._post(event, effect.cause)
 
     async def _keep_measured(self, heard: MeasuredMatrix) -> None:
         known = self._engine.state.measurement(heard.manifest.id)

@@ -146,6 +146,9 @@ class Acquisition:
     interruption: Interruption | None = None
     """How it was left by the service before this one, or at a gap in the link; None: it was not."""
 
+    cause: str = ""
+    """Id of the order or event that has begun it; empty: the service before this one did."""
+
     @property
     def uses_wide_capture(self) -> bool:
         """Whether windows are of the open loop, from which α is found."""

@@ -95,7 +95,7 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
 
 def ask_for(context: StepContext, dither: Dither) -> None:
     """Ask for a dither and follow it."""
-    context.dither = dither
+    context.dither = replace(dither, cause=context.cause)
     context.ask(ev.Ask(request=dither.request))
 
 
@@ -155,7 +155,9 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
         return
     context.put_off(dither_s=10.0)
     context.dither = None
-    context.raise_alarm(alarms.NO_DITHER, f"the RTC refused the dither: {reply.reason}")
+    text = f"the RTC refused the dither: {reply.reason}"
+    context.raise_alarm(alarms.NO_DITHER, text)
+    context.fail(text)
 
 
 def on_stop_answer(context: StepContext, reply: Reply) -> None:

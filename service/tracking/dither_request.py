@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -62,6 +62,9 @@ class Dither:
 
     window_s: float | None = None
     """Of telemetry in one estimate, where it was planned with the dither."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order or event that has asked for it; empty: it was adopted."""
 
     @property
     def id(self) -> str:

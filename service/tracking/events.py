@@ -1,8 +1,10 @@
-"""What can happen to the service, and what is to be done about it."""
+"""What can happen to the service, what is to be done about it, and the ids of both."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
@@ -24,8 +26,16 @@ from service.wire import Acknowledgement, Reply, Status
 from service.wire import Command as Request
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Caused:
+    """What is done because of something."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the command or event that has led to it; ``StepContext.ask`` says so."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MakeMatrix:
+class MakeMatrix(Caused):
     """Compute a reconstructor for the current α and judge it."""
 
     n_modes: int
@@ -38,7 +48,7 @@ class MakeMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RepublishMatrix:
+class RepublishMatrix(Caused):
     """Judge an earlier reconstructor at the current α and offer it under a new id."""
 
     source: str
@@ -51,14 +61,14 @@ class RepublishMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JudgeMatrix:
+class JudgeMatrix(Caused):
     """Judge the matrix in use at the current α."""
 
     id: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class JudgeProposal:
+class JudgeProposal(Caused):
     """Judge a reconstructor that is to be sent, at the current α and with these gains."""
 
     id: str
@@ -70,7 +80,7 @@ class JudgeProposal:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SendMatrix:
+class SendMatrix(Caused):
     """Publish a reconstructor; first tell the RTC how many modes it commands."""
 
     id: str
@@ -80,7 +90,7 @@ class SendMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FetchMatrix:
+class FetchMatrix(Caused):
     """Ask the RTC for the matrix it uses."""
 
     id: str | None
@@ -88,7 +98,7 @@ class FetchMatrix:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ask:
+class Ask(Caused):
     """Ask something of the RTC."""
 
     request: Request
@@ -97,7 +107,7 @@ class Ask:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FinishNoisy:
+class FinishNoisy(Caused):
     """Fit and archive what has been summed of a noisy interaction matrix."""
 
     record: MeasurementRecord
@@ -398,3 +408,13 @@ Event = (
     | MatrixMeasured
     | JobFailed
 )
+
+
+def new_id(name: str, now_ns: int) -> str:
+    """Return an id that nothing else of this name has: it says when that was, UTC."""
+    return f"{name}-{datetime.fromtimestamp(now_ns / 1e9, UTC):%Y%m%dT%H%M%S.%f}"
+
+
+def kebab(kind: type) -> str:
+    """Return the name of a kind of command or event, as it stands in ids: ``set-mode``."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()

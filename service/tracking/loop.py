@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -173,3 +173,6 @@ class LoopCommand:
 
     reason: str = ""
     """Why it was refused, or has failed."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order or event that has asked for it."""

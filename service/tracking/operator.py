@@ -355,6 +355,7 @@ def _ask_loop(
         state=CommandState.ASKED,
         asked_ns_utc=context.now_ns,
         lasts_s=lasts_s,
+        cause=context.cause,
     )
     context.loop = replace(context.loop, command=asked)
     context.log("loop.asked", text)

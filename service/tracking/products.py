@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -125,6 +125,9 @@ class ReconstructorRecord:
 
     applied_frame_seq: int | None = None
     """First frame whose slopes it multiplied; None: not applied, or before this service came."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order or event that has made it, or sent it since."""
 
     @property
     def is_rtcs(self) -> bool:
@@ -418,6 +421,9 @@ class MeasurementRecord(MatrixStrokes):
 
     finding: NoisyFinding | None = None
     """What came of random signs; None: not finished, or another pattern."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order that has asked for it."""
 
     @classmethod
     def sent(cls, manifest: MeasuredManifest) -> MeasurementRecord:

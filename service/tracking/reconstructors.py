@@ -173,7 +173,7 @@ def propose(context: StepContext, record: ReconstructorRecord) -> None:
     for older in context.matrices.reconstructors:
         if older.state is MatrixState.PROPOSED:
             change_state(context, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
-    keep(context, record)
+    keep(context, replace(record, cause=context.cause))
     verdict = record.gate.reason if record.gate is not None else record.reason
     if record.state is MatrixState.REFUSED:
         context.warn("reconstructor.refused", f"{record.id}: {verdict}")
@@ -199,6 +199,7 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
     context.log("reconstructor.judged-again", text)
+    change(context, replace(record, cause=context.cause))
     context.ask(ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted))
 
 
@@ -227,6 +228,7 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
         return
     text = f"{record.id} was not sent: while it was judged, {reason}; approve it again"
     context.warn("reconstructor.not-sent", text)
+    context.fail(text)
 
 
 def send(context: StepContext, matrix_id: str, swapped_ns_utc: int | None = None) -> None:
@@ -263,7 +265,11 @@ def _send(
     change(
         context,
         replace(
-            record, state=MatrixState.PUBLISHED, published_ns_utc=context.now_ns, reason=unjudged
+            record,
+            state=MatrixState.PUBLISHED,
+            published_ns_utc=context.now_ns,
+            reason=unjudged,
+            cause=context.cause,
         ),
     )
     text = f"{record.id} sent to the RTC{'; ' if unjudged else ''}{unjudged}"
@@ -278,8 +284,15 @@ def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
         text = f"an acknowledgement for {event.id}, which this service never sent"
         context.warn("acknowledgement.unknown", text)
         return
-    if _is_old(context.state, record, event):
-        return
+    if not _is_old(context.state, record, event):
+        with context.because_of(record.cause):
+            _acknowledged(context, record, event)
+
+
+def _acknowledged(
+    context: StepContext, record: ReconstructorRecord, event: Acknowledgement
+) -> None:
+    """Take a reconstructor further on its way, or note why the RTC holds other numbers."""
     if record.sha256 and event.sha256 not in {None, record.sha256}:
         _distrust(context, record, MatrixState(event.state.value), event.sha256)
         return

@@ -39,7 +39,8 @@ def on_tick(context: StepContext) -> None:
                 "the old one: look at the RTC's log, then publish again"
             )
             reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
-            context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
+            with context.because_of(record.cause):
+                context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
     for alarm in context.alarms.active:
         silent_ns = context.now_ns - alarm.seen_ns_utc
         if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
@@ -188,9 +189,14 @@ def on_failure(context: StepContext, effect: Effect, text: str) -> None:
         case ev.MakeMatrix() | ev.RepublishMatrix():
             context.put_off(make_s=5.0)
             reconstructors.made_none(context)
+            context.fail(text)
         case ev.Ask(request=DitherRequest()):
             context.put_off(dither_s=5.0)
             dither.drop(context)
+            context.fail(text)
+        case ev.JudgeProposal():
+            context.put_off(make_s=5.0)
+            context.fail(text)
         case ev.Ask(request=DitherStop()):
             pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.FetchMatrix():

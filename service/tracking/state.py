@@ -53,6 +53,10 @@ class LogEntry:
     ranges: tuple[tuple[str, str], ...] = ()
     """Of a line that was counted: the smallest and the largest of each number in its text."""
 
+    cause: str = ""
+    """Id of the order or event that has led to it: what else that led to has the same; empty: of
+    before the service began."""
+
     @property
     def line(self) -> tuple[int, str, str]:
         """What makes it this line and no other, however often it has happened."""
@@ -70,6 +74,17 @@ class ObservatoryValue:
 
     by: str
     """Who told it; empty: nobody said."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """Something that was asked for and came to nothing."""
+
+    cause: str
+    """Id of the order or event that has asked for it."""
+
+    text: str
+    """Why."""
 
 
 class Mode(StrEnum):
@@ -96,6 +111,9 @@ class OperatorState:
 
     stopped_because: str = ""
     """Who has stopped everything, and why; empty: nobody, or it was released."""
+
+    failures: tuple[Failure, ...] = ()
+    """What came to nothing, oldest first, bounded: whoever gave the order looks for its cause."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -293,6 +311,11 @@ class TrackerState:
     def reconstructor(self, matrix_id: str) -> ReconstructorRecord | None:
         """Return the record of this id, or None."""
         return next((r for r in reversed(self.matrices.reconstructors) if r.id == matrix_id), None)
+
+    def failure(self, cause: str) -> str:
+        """Return why what this order or event has asked for came to nothing; empty: it did not."""
+        failures = reversed(self.operator.failures)
+        return next((failure.text for failure in failures if failure.cause == cause), "")
 
     def alarm(self, name: str) -> Alarm | None:
         """Return the alarm of this name that lasts, or None."""

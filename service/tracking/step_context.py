@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, Generic, TypeVar
@@ -24,6 +26,7 @@ from service.tracking.state import (
     AlarmStates,
     AlphaState,
     DitherState,
+    Failure,
     Level,
     LogEntry,
     LoopState,
@@ -38,6 +41,7 @@ from service.wire import Status
 T = TypeVar("T")
 
 LOG_LENGTH = 500
+FAILURES_KEPT = 20
 
 BURST_NS = 60 * SECOND_NS
 """A line that comes again within this is counted, not told."""
@@ -94,7 +98,7 @@ class StepContext:
     hold the event: only the table of ``step`` and the operation that runs are given that.
     """
 
-    __slots__ = ("before", "effects", "now_ns", "policy", "state")
+    __slots__ = ("before", "cause", "effects", "now_ns", "policy", "state")
 
     operator = _Part[OperatorState]("operator")
     alpha = _Part[AlphaState]("alpha")
@@ -117,13 +121,16 @@ class StepContext:
     acquisition = _Part[Acquisition]("operations", "acquisition")
     """How far finding α from nothing has come."""
 
-    def __init__(self, state: TrackerState, policy: Policy, now_ns: int) -> None:
+    def __init__(self, state: TrackerState, policy: Policy, now_ns: int, cause: str = "") -> None:
         self.before = state
         """As nobody had seen the event yet."""
 
         self.state = state
         self.policy = policy
         self.now_ns = now_ns
+        self.cause = cause
+        """Id of what has led to the event, or its own: effects, lines and records keep it."""
+
         self.effects: list[Effect] = []
 
     @property
@@ -133,7 +140,22 @@ class StepContext:
 
     def ask(self, effect: Effect) -> None:
         """Have something done."""
-        self.effects.append(effect)
+        self.effects.append(replace(effect, cause=self.cause))
+
+    @contextmanager
+    def because_of(self, cause: str) -> Iterator[None]:
+        """Let what is done within go back to what a record was asked for by; empty: to the event.
+
+        An acknowledgement, a status or a tick does not know what it is about.
+        """
+        own, self.cause = self.cause, cause or self.cause
+        yield
+        self.cause = own
+
+    def fail(self, text: str) -> None:
+        """Note that something asked for came to nothing, and why, for whoever asked for it."""
+        failures = (*self.operator.failures, Failure(cause=self.cause, text=text))
+        self.operator = replace(self.operator, failures=failures[-FAILURES_KEPT:])
 
     def blocking_alarm(self, interlock: Interlock) -> Alarm | None:
         """Return an alarm that forbids this now, or None."""
@@ -159,7 +181,7 @@ class StepContext:
 
     def log(self, name: str, text: str, level: Level = Level.INFO) -> None:
         """Add a line to the log; one that repeats is counted instead."""
-        self.state = logged(self.state, name, text, self.now_ns, level)
+        self.state = logged(self.state, name, text, self.now_ns, level, self.cause)
 
     def warn(self, name: str, text: str) -> None:
         """Add a warning to the log."""
@@ -193,10 +215,15 @@ class StepContext:
 
 
 def logged(
-    state: TrackerState, name: str, text: str, now_ns: int, level: Level = Level.INFO
+    state: TrackerState,
+    name: str,
+    text: str,
+    now_ns: int,
+    level: Level = Level.INFO,
+    cause: str = "",
 ) -> TrackerState:
     """Return the state with one more line in its log; one that repeats is counted instead."""
-    entry = LogEntry(t_ns_utc=now_ns, level=level, name=name, text=text)
+    entry = LogEntry(t_ns_utc=now_ns, level=level, name=name, text=text, cause=cause)
     for back, before in enumerate(reversed(state.log[-LOOKED_BACK:]), start=1):
         # the very last line may be any; what lies between makes a story of two equal ones
         if (back == 1 or name in REPEATING) and _same(before, entry):

@@ -329,7 +329,7 @@ define_view("RaisedView", Alarm, "name since_ns_utc text")
 define_view("MutedView", AlarmRecord, "name muted")
 define_view("OperatingView", Operating)
 define_view("ObservatoryValueView", ObservatoryValue)
-define_view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times")
+define_view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times cause")
 EVENTS = define_view(
     "EventsView", TrackerState, "alarms=alarms.active log", "What happened, and what is wrong now."
 )

@@ -53,18 +53,20 @@ class Teller:
         self._policy = policy
         self._seen: dict[str, Json] = {}
 
-    def tell(self, event: Event, now_ns: int) -> tuple[Effect, ...]:
+    def tell(self, event: Event, now_ns: int, cause: str = "") -> tuple[Effect, ...]:
         """Replace the state and return what is to be done.
+
+        ``cause``: id of what has led to the event; empty: nobody knows, or it stands for itself.
 
         Raises
         ------
         PyrcalError
             What the tracker refuses, noted as well.
         """
-        entry: Entry = {"t": now_ns, "event": encoded(event)}
+        entry: Entry = {"t": now_ns, "event": encoded(event)} | ({"cause": cause} if cause else {})
         before = self.state
         try:
-            self.state, effects = step(before, event, self._policy, now_ns)
+            self.state, effects = step(before, event, self._policy, now_ns, cause)
         except PyrcalError as error:
             self.entries.append(entry | {"refused": f"{type(error).__name__}: {error}"})
             raise
@@ -137,7 +139,8 @@ def retold(night: Sequence[Entry], instrument: Entry) -> list[Entry]:
         else:
             # the refusal is in the entry
             with suppress(PyrcalError):
-                teller.tell(decoded(Event, entry["event"]), entry["t"])
+                cause = entry.get("cause", "")
+                teller.tell(decoded(Event, entry["event"]), entry["t"], cause)
     return [begin, *teller.entries]
 
 

@@ -26,7 +26,8 @@ _PLAIN = frozenset({NoneType, bool, int, float, str})
 """What JSON has as it is."""
 
 LEFT_OUT = frozenset({("Status", "flux")})
-"""Fields that the tracker carries and does not read: class and field."""
+"""Fields that the tracker carries and does not read, besides those that make no record another:
+class and field."""
 
 
 def encoded(value: object) -> Json:
@@ -92,7 +93,7 @@ def decoded(hint: object, value: Json) -> Value:
 
 
 def _left_out(record: object, field: Field[Any]) -> bool:
-    if (type(record).__name__, field.name) in LEFT_OUT:
+    if not field.compare or (type(record).__name__, field.name) in LEFT_OUT:
         return True
     value = getattr(record, field.name)
     if isinstance(value, np.ndarray) or field.default is MISSING:

@@ -228,12 +228,12 @@ class GoldenNight(Observatory):
 
     @override
     def step(
-        self, state: TrackerState, event: Event, policy: Policy, now_ns: int
+        self, state: TrackerState, event: Event, policy: Policy, now_ns: int, cause: str
     ) -> tuple[TrackerState, tuple[Effect, ...]]:
         """Let the tracker decide, and write down what it is told."""
         if self._teller is None:
             self._teller = Teller(state, policy)
-        effects = self._teller.tell(event, now_ns)
+        effects = self._teller.tell(event, now_ns, cause)
         return self._teller.state, effects
 
     @property
@@ -246,7 +246,7 @@ class GoldenNight(Observatory):
     def _do(self, effect: Effect, state: TrackerState) -> None:
         if isinstance(effect, ev.FinishNoisy) and not self.worker.broken:
             event = ev.MatrixMeasured(record=self._finished(effect.record))
-            self._in(self.latencies.make_s, partial(self._post, event))
+            self._in(self.latencies.make_s, partial(self._post, event, effect.cause))
             return
         super()._do(effect, state)
 

@@ -360,18 +360,18 @@ class Observatory:
 
         return 0.0 if event is None else self.latencies.watch_s, done
 
-    def _post(self, event: Event) -> None:
-        self._engine.post(event)
+    def _post(self, event: Event, cause: str = "") -> None:
+        self._engine.post(event, cause)
 
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
         return self.dome.now_ns
 
     def step(
-        self, state: TrackerState, event: Event, policy: Policy, now_ns: int
+        self, state: TrackerState, event: Event, policy: Policy, now_ns: int, cause: str
     ) -> tuple[TrackerState, tuple[Effect, ...]]:
         """Let the tracker decide."""
-        return step(state, event, policy, now_ns)
+        return step(state, event, policy, now_ns, cause)
 
     def stepped(self, before: TrackerState, event: Event) -> None:
         """Keep what the tracker heard."""
@@ -401,7 +401,7 @@ class Observatory:
 
         def begin() -> _Job:
             event = self._performed(effect, state)
-            return lasts_s, lambda: self._done(event)
+            return lasts_s, lambda: self._done(event, effect.cause)
 
         if name:
             self._work(name, begin)
@@ -431,9 +431,9 @@ class Observatory:
         for answer in self._link.deliver(manifest, matrix):
             self._hear(answer)
 
-    def _done(self, event: Event | None) -> None:
+    def _done(self, event: Event | None, cause: str) -> None:
         if event is not None:
-            self._post(event)
+            self._post(event, cause)
 
     def _takes(self, effect: Effect) -> tuple[str, float]:
         """Return the worker's job that an effect asks for, if any, and how long it takes."""

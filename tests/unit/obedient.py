@@ -39,5 +39,6 @@ class Obedient:
             raise self.refusal
         self.commands.append(command)
         if isinstance(command, Refit):
-            self.refits.begin(MakeMatrix(n_modes=command.n_modes or 1, why=""), self.now_ns)
+            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause="refit-1")
+            self.refits.begin(effect, self.now_ns)
         return f"{type(command).__name__}: 1 action(s) under way"

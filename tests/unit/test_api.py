@@ -234,7 +234,8 @@ class FakeService:
         self.commands.append(command)
         self.callers.append(caller)
         if isinstance(command, Refit):
-            self.refits.begin(MakeMatrix(n_modes=command.n_modes or 1, why=""), self.now.now_ns)
+            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause="refit-1")
+            self.refits.begin(effect, self.now.now_ns)
         return f"{type(command).__name__} is on its way"
 
     def audit(self, entry):

@@ -68,6 +68,7 @@ async def test_the_newest_come_without_a_word_oldest_first(client):
         "channel": "",
         "why": "clouds\\u2028",
         "answer": "",
+        "cause": "",
         "id": 1,
     }
 

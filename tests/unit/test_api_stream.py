@@ -139,6 +139,7 @@ async def test_lines_of_the_log_come_one_by_one_as_events_shows_them(service):
         "name": "mode",
         "text": "line 1",
         "n_times": 1,
+        "cause": "",
     }
     assert json.loads(second["data"])["text"] == "line 2"
     assert first["id"] != second["id"]

@@ -80,7 +80,8 @@ def acquire(context: StepContext, event: Event) -> None:
         stages.go_on(context, _cut_off(context.before, "the RTC vanished"))
         _wait(context, NO_RTC)
     else:
-        _advance(context, event)
+        with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
+            _advance(context, event)
 
 
 def left_behind(state: TrackerState) -> Acquisition | None:

@@ -174,6 +174,7 @@ def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> No
         found=found,
         n_modes=min(found.n_controlled, FIRST_CLOSED),
         sent=left is not None and left.sent,
+        cause=context.cause,
     )
     validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget(context)

@@ -56,7 +56,7 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
     rtc = present(context.rtc)
     if context.state.measurement(command.id) is not None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
-    record = _planned(command, rtc, context.policy, context.now_ns)
+    record = replace(_planned(command, rtc, context.policy, context.now_ns), cause=context.cause)
     check_modes(record.modes, rtc)
     keep(context, record)
     context.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
@@ -123,7 +123,9 @@ def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> No
 
 def on_measured(context: StepContext, event: ev.MatrixMeasured) -> None:
     """Take over how far a measurement is, from whoever makes its matrix."""
-    _note(context, event.record)
+    known = context.state.measurement(event.record.id)
+    with context.because_of("" if known is None else known.cause):
+        _note(context, event.record)
 
 
 def _note(context: StepContext, record: MeasurementRecord) -> None:
@@ -139,6 +141,7 @@ def _note(context: StepContext, record: MeasurementRecord) -> None:
             duration_s=known.duration_s,
             asked_ns_utc=known.asked_ns_utc,
             closed_before=known.closed_before,
+            cause=known.cause,
             start_seq=known.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
@@ -166,7 +169,8 @@ def fail(context: StepContext, record: MeasurementRecord | None, text: str) -> N
     known = None if record is None else context.state.measurement(record.id)
     if record is not None and (known is None or known.state is not MeasureState.GIVEN_UP):
         keep(context, replace(record, state=MeasureState.FAILED, reason=text))
-        context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
+        with context.because_of(record.cause):
+            context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
 
 
 def _kind(record: MeasurementRecord) -> str:

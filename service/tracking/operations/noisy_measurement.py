@@ -66,6 +66,7 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
         asked_ns_utc=context.now_ns,
         basis_id=rtc.basis_id,
         config_id=rtc.config_id,
+        cause=context.cause,
     )
     keep(context, record)
     text = (
@@ -77,10 +78,16 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
 
 
 def follow(context: StepContext, event: Event) -> None:
-    """Go on with the one under way: start its dither, note that it plays, or that it is over."""
-    record, rtc = context.state.noisy_measurement, context.rtc
-    if record is None:
-        return
+    """Go on with the one under way, if there is one."""
+    record = context.state.noisy_measurement
+    if record is not None:
+        with context.because_of(record.cause):
+            _go_on(context, record, event)
+
+
+def _go_on(context: StepContext, record: MeasurementRecord, event: Event) -> None:
+    """Start its dither, note that it plays, or that it is over."""
+    rtc = context.rtc
     waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
     match record.state:
         case MeasureState.WAITING if isinstance(event, cmd.StopDither):

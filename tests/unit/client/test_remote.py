@@ -23,7 +23,7 @@ from service.errors import CommandError
 from service.runtime.recording import Channel
 from service.runtime.snapshot import Snapshot
 from service.tracking.acquisition_state import AcquisitionStage
-from service.tracking.events import MatrixMade
+from service.tracking.events import MakeMatrix, MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode
 from service.web.connections import server_config
@@ -322,7 +322,7 @@ def test_a_refit_is_followed_until_there_is_a_reconstructor(
     )
 
     def happens():
-        (effect,) = service.refits._effects.values()
+        effect = MakeMatrix(n_modes=300, why="", cause=service.refits.newest.id)
         service.refits.end(effect, MatrixMade(record=made, wanted=True))
 
     at_the_next_look(monkeypatch, happens)

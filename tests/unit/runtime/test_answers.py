@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, LinkError
-from service.runtime.command_results import CarriedOut
+from service.runtime.command_results import Order
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -24,9 +24,9 @@ from tests.unit.tracking.situations import acknowledged, record, verdict
 
 
 def given(world, command):
-    before = world.state
-    world.tell(command)
-    return CarriedOut(command, before, world.state)
+    order = Order(command, "order-1")
+    world.tell(command, cause=order.id)
+    return order
 
 
 def told(order, world):
@@ -73,7 +73,7 @@ SILENT = "sent, the RTC has not answered yet"
 def test_an_approval_tells_the_frame():
     world = sending()
     name = world.state.matrices.reconstructors[-1].id
-    order = CarriedOut(cmd.Approve(id=name), world.state, world.state)
+    order = Order(cmd.Approve(id=name), "order-1")
     first, last = answered_in_the_end(world, order)
     assert first == (f"{name} {SILENT}", False)
     frame = world.state.reconstructor(name).applied_frame_seq
@@ -111,7 +111,7 @@ def test_a_copy_that_the_gate_refuses_tells_why_and_that_one_can_go_back_anyway(
     order = given(world, cmd.Rollback())
     world.pending.clear()
     back = record("cm-back", MatrixState.REFUSED, reason="the operator goes back to initial")
-    world.tell(ev.MatrixMade(record=back, wanted=True))
+    world.tell(ev.MatrixMade(record=back, wanted=True), cause=order.id)
     words = f"the gate refused cm-back: {back.gate.reason}; ordered with anyway"
     with pytest.raises(CommandError, match=words):
         order.result(world.state)
@@ -122,7 +122,7 @@ def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
     order = given(world, cmd.Rollback())
     world.pending.clear()
     effect = ev.RepublishMatrix(source="initial", why="so")
-    world.tell(ev.JobFailed(effect=effect, text="initial.h5: damaged"))
+    world.tell(ev.JobFailed(effect=effect, text="initial.h5: damaged"), cause=order.id)
     with pytest.raises(CommandError, match=r"initial\.h5: damaged"):
         order.result(world.state)
 
@@ -137,7 +137,7 @@ def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
 def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
     world = sending()
     name = world.state.matrices.reconstructors[-1].id
-    order = CarriedOut(cmd.Approve(id=name), world.state, world.state)
+    order = Order(cmd.Approve(id=name), "order-1")
     world.pending.clear()
     if state is None:
         world.pass_(6.0)
@@ -150,7 +150,7 @@ def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
 def test_what_the_gate_refuses_at_the_last_moment_is_a_refusal():
     world = sending()
     record = world.state.matrices.reconstructors[-1]
-    order = CarriedOut(cmd.Approve(id=record.id), world.state, world.state)
+    order = Order(cmd.Approve(id=record.id), "order-1")
     refused = MatrixState.REFUSED
     reason = verdict(accepted=False).reason
     refused_record = replace(record, state=refused, reason=reason)
@@ -176,7 +176,7 @@ def test_a_dither_the_rtc_will_not_play_is_a_refusal():
     order = given(world, cmd.StartDither())
     request = world.state.dithers.dither.request
     reply = Reply(id=request.id, accepted=False, reason="busy: other", start_seq=None)
-    world.tell(ev.Answered(request=request, reply=reply))
+    world.tell(ev.Answered(request=request, reply=reply), cause=order.id)
     with pytest.raises(CommandError, match="the RTC refused the dither: busy: other"):
         order.result(world.state)
 

@@ -104,6 +104,20 @@ async def test_the_audit_trail_says_who_why_from_where_and_what_was_answered(sup
     assert anonymous.who == "10.0.0.7"
 
 
+async def test_an_order_its_answer_and_what_it_led_to_share_an_id_in_trail_and_log(
+    supervisor, archive
+):
+    async with running(supervisor):
+        await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
+        await until(lambda: len(orders(archive)) == 2)
+    cause = orders(archive)[0].cause
+    assert cause.startswith("set-mode-20")
+    trail = [entry.name for entry in archive.audit_trail() if entry.cause == cause]
+    assert sorted(trail) == ["SetMode", "SetMode.answered", "mode"]
+    (line,) = [line for line in supervisor.snapshot().tracker.log if line.cause == cause]
+    assert (line.name, line.text) == ("mode", "mode is auto")
+
+
 def orders(archive):
     return [entry for entry in archive.audit_trail(Range(limit=1000)) if entry.channel]
 

@@ -203,11 +203,11 @@ class Story:
         self.now_ns = START_NS
         self.effects = []
 
-    def tell(self, event, after_s=0.0):
+    def tell(self, event, after_s=0.0, cause=""):
         """Let time pass, then something happen; return what is to be done about it."""
         self.now_ns += round(after_s * SECOND)
         try:
-            self.state, effects = step(self.state, event, self.policy, self.now_ns)
+            self.state, effects = step(self.state, event, self.policy, self.now_ns, cause)
         except CommandError as refusal:
             first = str(refusal).partition(": ")[0]
             if first in {type(event).__name__, *ORDERS}:
@@ -217,7 +217,7 @@ class Story:
         for effect in effects if self.shows else ():
             known = isinstance(effect, ev.FetchMatrix) and self.state.reconstructor(effect.id or "")
             if known:
-                effects += self.tell(ev.MatrixFetched(record=known))
+                effects += self.tell(ev.MatrixFetched(record=known), cause=effect.cause)
         return effects
 
     def wait(self, seconds, every_s=1.0):

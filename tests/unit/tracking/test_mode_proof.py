@@ -29,10 +29,10 @@ class Shown(World):
         self.answers_of, self.offered, self.sigma_of = answers or {}, offered, {}
         super().__init__(mode, policy, **changes)
 
-    def tell(self, event, after_s=0.0):
+    def tell(self, event, after_s=0.0, cause=""):
         if isinstance(event, ev.SessionStarted):
             self.state = changed(self.state, mode_proof=ModeProof())
-        return super().tell(event, after_s)
+        return super().tell(event, after_s, cause)
 
     def of_matrices(self, effect):
         if isinstance(effect, ev.FetchMatrix) and not self.offered:

@@ -94,8 +94,8 @@ class World(Story):
         }
         return rtc(**(seen | self.changes))
 
-    def tell(self, event, after_s=0.0):
-        effects = super().tell(event, after_s)
+    def tell(self, event, after_s=0.0, cause=""):
+        effects = super().tell(event, after_s, cause)
         self.pending += effects
         return effects
 
@@ -106,7 +106,7 @@ class World(Story):
             waiting, self.pending = self.pending, []
             for effect in waiting:
                 for event in self.answers(effect):
-                    self.tell(event)
+                    self.tell(event, cause=effect.cause)
             self.go_on()
             self.tell(self.status())
             self.tell(ev.Tick())

@@ -13,6 +13,7 @@ FROM ${BASE}
 
 WORKDIR /opt/pyrcal
 COPY pyproject.toml build_backend.py constraints.txt README.md LICENSE ./
+COPY docs/openapi.json docs/openapi.json
 COPY service service
 COPY pyrcal pyrcal
 COPY --from=manual /opt/manual service/web/manual

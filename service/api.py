@@ -7,12 +7,11 @@ import contextlib
 import socket
 from collections.abc import Iterator
 from functools import cache
-from typing import Any
 
 import structlog
 import uvicorn
 from fastapi import APIRouter, FastAPI
-from fastapi.routing import APIRoute, iter_route_contexts
+from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 from typing_extensions import override
 
@@ -32,15 +31,14 @@ from service.web import (
     reading,
     recordings,
     refits,
-    schemas,
     session,
     stream,
     trends,
 )
-from service.web.authentication import OPEN, SCHEMES, Authentication, Hosts, needs, scope_of
+from service.web.authentication import Authentication, Hosts
 from service.web.connections import Idempotency, RequestId, server_config
 from service.web.keys import KeyFile
-from service.web.unchanged import NOT_MODIFIED, Unchanged
+from service.web.unchanged import Unchanged
 
 REQUESTS_WITHIN_S = 2
 """Requests under way when the service is asked to stop may take this long: an upload would take
@@ -108,15 +106,15 @@ def create_app(
     It answers to ``hosts``, loopback alone where they are not given, and to no other name; who asks
     needs one of the ``keys``, if there are any. Streams end when it is ``over``.
 
-    FastAPI's own pages are left out: they load their scripts from the internet. ``/docs`` is there
-    all the same, from the package.
+    FastAPI's own pages are left out: they load their scripts from the internet, and its own
+    document tells less than the records do. ``/docs`` and ``/openapi.json`` are files of the
+    package.
     """
-    app = _Application(
+    app = FastAPI(
         title="pyrcal",
         version=__version__,
         description=_DESCRIPTION,
-        docs_url=None,
-        redoc_url=None,
+        openapi_url=None,
         routes=_routes(with_fits=desk is not None),
     )
     app.add_middleware(Unchanged)
@@ -160,78 +158,6 @@ def _routes(*, with_fits: bool) -> list[BaseRoute]:
     for router in [*routers, fits.router] if with_fits else routers:
         shared.include_router(router)
     return shared.routes
-
-
-class _Application(FastAPI):
-    """Describes what it answers when it is asked to, not when it is made."""
-
-    @override
-    def openapi(self) -> dict[str, Any]:
-        if self.openapi_schema is None:
-            document = super().openapi()
-            described = {"Problem": problems.Problem.model_json_schema()} | schemas.schemas()
-            document["components"]["schemas"] |= described | self._tell_bodies(document)
-            document["components"]["securitySchemes"] = SCHEMES
-            self._tell_scopes(document)
-            for operations in document["paths"].values():
-                for method, operation in operations.items():
-                    _tell_operation(method, operation, document["components"]["schemas"])
-        return super().openapi()
-
-    def _tell_bodies(self, document: dict[str, Any]) -> dict[str, schemas.Schema]:
-        """Say of each operation what it reads, and return the schemas of that."""
-        read = {
-            f"{method.lower()} {route.path_format}": found.call
-            for route in iter_route_contexts(self.routes)
-            if isinstance(route.original_route, APIRoute)
-            for found in route.dependant.dependencies
-            for method in route.methods or ()
-            if isinstance(found.call, commands.Body)
-        }
-        bodies, found = commands.bodies(read)
-        for operation, body in bodies.items():
-            method, _, path = operation.partition(" ")
-            document["paths"][path][method]["requestBody"] = body
-        return found
-
-    def _tell_scopes(self, document: dict[str, Any]) -> None:
-        """Say of each operation which key it needs."""
-        for route in iter_route_contexts(self.routes):
-            for method in route.methods or () if route.path_format in document["paths"] else ():
-                scope = scope_of(route, method)
-                security = OPEN if scope is None else needs(scope)
-                document["paths"][route.path_format][method.lower()] |= security
-
-
-def _tell_operation(method: str, operation: dict[str, Any], known: dict[str, Any]) -> None:
-    """Say in one line what an operation does, what its answers are, and which are not sent again.
-
-    FastAPI's own summary is the name of a function.
-    """
-    first, _, rest = operation["description"].partition("\n\n")
-    operation["summary"] = " ".join(first.split()).rstrip(".")
-    operation["description"] = rest or first
-    answers = operation["responses"]
-    for found in answers.values():
-        contents = found.get("content", {}).values()
-        names = [one["schema"].get("$ref", "").rpartition("/")[2] for one in contents]
-        if found["description"] == "Successful Response":
-            told = known.get(names[0], {}) if names else {}
-            found["description"] = told.get("description", "Done").partition("\n\n")[0]
-        if any(name.endswith("AcceptedView") for name in names):
-            found["headers"] = {"Location": _LOCATION}
-    kept = answers.get("200", {}).get("content", {}).keys()
-    if method == "get" and kept & _HAVE_TAGS:
-        answers["304"] = NOT_MODIFIED
-
-
-_HAVE_TAGS = {"application/json", *numbers.MEDIA_TYPES.values()}
-"""Kinds of answers with an ETag."""
-
-_LOCATION = {
-    "description": "Where to look for what was begun",
-    "schema": {"type": "string", "format": "uri-reference"},
-}
 
 
 def _operation_id(route: APIRoute) -> str:

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from service import wire
 from service.errors import LinkError, UnknownIdError, WireError
 from service.estimation.frames import FrameBlock
-from service.files.last_telemetry import Arrived, LastTelemetry
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind
+from service.files.recording import LastTelemetry, Message, RecordedKind, RecordingWriter
 from service.link import session as link
 from service.link.intake import Intake
 from service.link.leader_election import Standby
@@ -171,12 +169,12 @@ class Bridge:
                 return 0.0
             now_s = time.monotonic()
             past = self._last.since(before_s) if before_s > 0.0 else []
-            since_s = past[0].at_s if past else now_s
+            since_s = past[0].time_s if past else now_s
             if offer is not None:
                 matrix = b"".join(offer.parts)
-                past.insert(0, Arrived(since_s, RecordedKind.MATRIX, matrix, offer.commit))
+                past.insert(0, Message(since_s, RecordedKind.MATRIX, matrix, offer.commit))
             if alive:
-                past.insert(0, Arrived(since_s, RecordedKind.LIVELINESS, b"\x01"))
+                past.insert(0, Message(since_s, RecordedKind.LIVELINESS, b"\x01"))
             recorder.begin_with(past)
             return now_s - since_s
 

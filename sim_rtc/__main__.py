@@ -14,8 +14,7 @@ from threadpoolctl import threadpool_limits
 from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.config import load_instrument
 from service.errors import ConfigurationError
-from service.files.recorder import RecordingWriter
-from service.files.recording import Recording
+from service.files.recording import Recording, RecordingWriter
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead, message_frames
 from sim_rtc.computer.real_time_computer import RealTimeComputer

@@ -10,9 +10,8 @@ import json
 from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-from service.api import create_app
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
@@ -23,6 +22,7 @@ from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from studies import dispatch, reference
 from studies.contract_tables import described, with_tables
+from studies.openapi import document
 
 ROOT = Path(__file__).parents[1]
 
@@ -82,11 +82,9 @@ def rtc() -> str:
 
 def openapi() -> str:
     """Return what REST answers, with the desk for fits."""
-    nobody: Any = object()  # neither is asked anything
-    described = json.dumps(create_app(nobody, nobody).openapi())
     # typing keeps one of two limits that are equal, 0 or 0.0: whichever was written first
-    document = json.loads(described, parse_float=_whole)
-    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+    whole = json.loads(json.dumps(document()), parse_float=_whole)
+    return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 
 def _whole(number: str) -> float:

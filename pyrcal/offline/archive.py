@@ -15,8 +15,8 @@ from typing import Any
 from pyrcal.terminal import show_progress
 from service.archive import Archive
 from service.archive.nights import FOREVER_NS, HOUR_NS, MAX_DOWNSAMPLED
-from service.archive.records import to_json
 from service.archive.retention import Item, due, items, remove, verify
+from service.archive.serialisation import to_json
 from service.config import Settings, load_settings
 from service.config.policy import keeping_of
 from service.errors import ConfigurationError, UnknownIdError, say, shown

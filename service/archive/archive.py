@@ -13,7 +13,7 @@ from service.archive.nights import Nights
 from service.archive.notes import Annotations
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.recordings import Recordings
-from service.archive.records import TrackingFile
+from service.archive.serialisation import TrackingFile
 from service.archive.store import Store
 from service.archive.trends import Trends, TrendSample
 from service.errors import ArchiveError, StorageError, UnknownIdError

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from service.archive import nights, notes, trends
 from service.archive.nights import Values
-from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
+from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError, shown
 from service.tracking.products import MeasurementRecord, ReconstructorRecord

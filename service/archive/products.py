@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.archive.records import from_json, to_json
+from service.archive.serialisation import from_json, to_json
 from service.archive.store import DAMAGE, Provenance, Store
 from service.control.gains import gain_table
 from service.errors import ArchiveError, StorageError

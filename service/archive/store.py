@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
-from service.archive.records import NOT_UNDERSTOOD, from_json, to_json
+from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.wire import checked_id, checksum
 

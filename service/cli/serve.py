@@ -26,12 +26,12 @@ from service.config import Settings
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
-from service.files.last_telemetry import LastTelemetry
+from service.files.recording import LastTelemetry
 from service.model.instrument import Instrument, instrument_sha256
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
+from service.runtime.archiving import taken_up
 from service.runtime.clock import ServiceClock
-from service.runtime.recording import taken_up
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
 from service.runtime.workers import WorkerPool

@@ -1,6 +1,6 @@
-"""A recording of telemetry, read back: the wire's messages, byte for byte, as HDF5.
+"""Recordings of telemetry: the wire's messages, byte for byte, written, held in memory, read back.
 
-Layout (version 1). Everything grows by appending; nothing is ever rewritten::
+Layout (version 1), HDF5. Everything grows by appending; nothing is ever rewritten::
 
     /            attributes: format "pyrcal-telemetry", version, system, created_ns
     /bytes       uint8   payloads and attachments of all messages, one after another
@@ -14,28 +14,56 @@ Layout (version 1). Everything grows by appending; nothing is ever rewritten::
 
 Frames, status and acknowledgements are as the wire contract has them; liveliness is one byte,
 1 when the RTC's token came and 0 when it went; a matrix is a reconstructor from the moment it is
-in use, its payload the float32 matrix, its attachment the manifest. The file is written in HDF5's
-single-writer mode and flushed twice a second: read it with ``h5py.File(path, "r", swmr=True)``,
-also while it is being written.
+in use, its payload the float32 matrix, its attachment the manifest.
+
+The file survives a ``kill -9``: it is written in HDF5's single-writer mode and flushed twice a
+second. Read it with ``h5py.File(path, "r", swmr=True)``, also while it is being written.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import h5py
 import numpy as np
+import structlog
 
 from service.errors import ConfigurationError
+
+_log = structlog.get_logger()
 
 FORMAT: Final = "pyrcal-telemetry"
 VERSION: Final = 1
 
 _SLAB_ROWS = 256
+
+FLUSH_S: Final = 0.5
+"""Most that a killed process loses, beside the time the disk needs."""
+
+BACKLOG_BYTES: Final = 64_000_000
+"""What may wait for the disk; beyond it messages are dropped and counted."""
+
+PART_BYTES: Final = 16_000_000
+"""Of what was there before that is written at once."""
+
+_ROW: Final = np.dtype(
+    [
+        ("time_s", "<f8"),
+        ("kind", "u1"),
+        ("start", "<u8"),
+        ("payload_bytes", "<u4"),
+        ("attachment_bytes", "<u4"),
+    ]
+)
+
+OVERHEAD_BYTES = 200
+"""Of a message in memory, besides what is in it."""
 
 
 class RecordedKind(IntEnum):
@@ -48,16 +76,20 @@ class RecordedKind(IntEnum):
     MATRIX = 4
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Message:
+class Message(NamedTuple):
     """One message as it was sent."""
 
     time_s: float
-    """Seconds since the recording began."""
+    """Seconds since the recording began; of one in memory, monotonic seconds."""
 
     kind: RecordedKind
     payload: bytes
     attachment: bytes = b""
+
+    @property
+    def n_bytes(self) -> int:
+        """Of payload and attachment."""
+        return len(self.payload) + len(self.attachment)
 
 
 class Recording:
@@ -116,3 +148,170 @@ class Recording:
                     payload=chunk[at:middle],
                     attachment=chunk[middle : at + int(length)],
                 )
+
+
+class LastTelemetry:
+    """Holds messages until they are too old, or too many; every method may be called anywhere.
+
+    Messages are held as they came: nothing is copied.
+
+    Parameters
+    ----------
+    seconds
+        Older ones go; 0: none are held.
+    most_bytes
+        Beyond it the oldest go.
+    """
+
+    def __init__(self, seconds: float, max_bytes: int) -> None:
+        self._seconds = seconds
+        self._max_bytes = max_bytes
+        self._held: deque[Message] = deque()
+        self._n_bytes = 0
+        self._lock = threading.Lock()
+
+    def put(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
+        """Take a message that has just come."""
+        if self._seconds <= 0.0:
+            return
+        now = Message(time.monotonic(), kind, payload, attachment)
+        with self._lock:
+            self._held.append(now)
+            self._n_bytes += now.n_bytes + OVERHEAD_BYTES
+            while self._held and (
+                self._n_bytes > self._max_bytes or now.time_s - self._held[0].time_s > self._seconds
+            ):
+                self._n_bytes -= self._held.popleft().n_bytes + OVERHEAD_BYTES
+
+    def since(self, before_s: float) -> list[Message]:
+        """Return those that came at most so many seconds ago, oldest first."""
+        first_s = time.monotonic() - before_s
+        with self._lock:
+            return [one for one in self._held if one.time_s >= first_s]
+
+
+class RecordingWriter:
+    """Writes messages in a thread while its ``with`` block lasts; ``put`` never waits."""
+
+    def __init__(self, path: Path, *, system: str, backlog_bytes: int = BACKLOG_BYTES) -> None:
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._path = path
+        self._system = system
+        self._backlog_bytes = backlog_bytes
+        self._past: deque[Message] = deque()
+        self._waiting: deque[Message] = deque()
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()
+        self._start_s = time.monotonic()
+        self.n_dropped = 0
+        """Messages that were not written."""
+
+        self.n_bytes = 0
+        """Taken so far."""
+
+        self.trouble = ""
+        """Why nothing is written any more; empty: all is."""
+
+    def __enter__(self) -> Self:
+        """Create the file.
+
+        Raises
+        ------
+        ConfigurationError
+            If it exists already, or cannot be created.
+        """
+        try:
+            self._file = h5py.File(self._path, "x", libver="latest")
+        except OSError as error:
+            reason = "it exists already" if self._path.exists() else str(error)
+            raise ConfigurationError(f"{self._path}: cannot be created: {reason}") from error
+        self._file.attrs.update(
+            format=FORMAT, version=VERSION, system=self._system, created_ns=time.time_ns()
+        )
+        self._bytes = _growing(self._file, "bytes", np.dtype("u1"), 1 << 20)
+        self._rows = _growing(self._file, "messages", _ROW, 4096)
+        self._dropped = self._file.create_dataset("dropped", data=np.zeros(1, np.int64))
+        self._file.swmr_mode = True
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Write what waits and close the file."""
+        self._stopped.set()
+        self._thread.join()
+        self._file.close()
+        _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
+
+    def begin_with(self, past: Sequence[Message]) -> None:
+        """Write these first; call it before anything is put. They need no room in the backlog."""
+        with self._lock:
+            self._past.extend(past)
+            self._start_s = min([self._start_s, *(one.time_s for one in past[:1])])
+            self.n_bytes += sum(one.n_bytes for one in past)
+
+    def put(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
+        """Hand over a message that has just been sent, from any thread."""
+        message = Message(time.monotonic(), kind, payload, attachment)
+        size = message.n_bytes
+        with self._lock:
+            if self.trouble or self._waiting_bytes + size > self._backlog_bytes:
+                self.n_dropped += 1
+                return
+            self._waiting.append(message)
+            self._waiting_bytes += size
+            self.n_bytes += size
+
+    def _work(self) -> None:
+        try:
+            while not self._stopped.wait(FLUSH_S):
+                self._write()
+            self._write()
+        except OSError as error:
+            _log.error("record.failed", file=str(self._path), reason=str(error))
+            with self._lock:
+                self.n_dropped += len(self._waiting)
+                self._waiting.clear()
+                self.trouble = str(error)
+
+    def _write(self) -> None:
+        """Append what waits: first of what was there before the recording, bit by bit."""
+        while self._past:
+            part, size = [], 0
+            while self._past and size < PART_BYTES:
+                part.append(self._past.popleft())
+                size += part[-1].n_bytes
+            self._append(part)
+        with self._lock:
+            messages, self._waiting = list(self._waiting), deque()
+            n_dropped = self.n_dropped
+        if n_dropped != self._dropped[0]:
+            self._dropped[0] = n_dropped
+            self._dropped.flush()
+        n_bytes = self._append(messages)
+        with self._lock:
+            self._waiting_bytes -= n_bytes
+
+    def _append(self, messages: list[Message]) -> int:
+        """Write bytes before the rows that point to them, both to the disk; return how many."""
+        if not messages:
+            return 0
+        data = np.frombuffer(b"".join(m.payload + m.attachment for m in messages), dtype="u1")
+        sizes = np.array([(len(m.payload), len(m.attachment)) for m in messages])
+        rows = np.empty(len(messages), dtype=_ROW)
+        rows["time_s"] = [max(0.0, m.time_s - self._start_s) for m in messages]
+        rows["kind"] = [m.kind for m in messages]
+        rows["payload_bytes"], rows["attachment_bytes"] = sizes.T
+        ends = np.cumsum(sizes.sum(axis=1))
+        rows["start"] = len(self._bytes) + ends - sizes.sum(axis=1)
+        for dataset, new in ((self._bytes, data), (self._rows, rows)):
+            before = len(dataset)
+            dataset.resize(before + len(new), axis=0)
+            dataset[before:] = new
+            dataset.flush()
+        return len(data)
+
+
+def _growing(file: Any, name: str, kind: np.dtype[Any], chunk: int) -> Any:  # noqa: ANN401 - h5py
+    """Return a new dataset without rows that may grow for ever."""
+    return file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(chunk,), dtype=kind)

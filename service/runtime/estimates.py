@@ -23,6 +23,7 @@ from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.runtime.worker import OpticsWorker, run_job
+from service.runtime.worker.records import waits
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Interlock, blocking_alarm
 from service.tracking.events import Event
@@ -294,6 +295,7 @@ class NoisySums:
         return ev.MatrixMeasured(record=record)
 
 
+@waits(at_most_s=5.0)
 def work_out(
     bench: OpticsWorker,
     record: MeasurementRecord,

@@ -25,6 +25,7 @@ from service.link.statistics import LinkStatistics
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
+from service.runtime.archiving import Actor, ArchiveWriter, ids_of
 from service.runtime.clock import ServiceClock
 from service.runtime.command_results import Order
 from service.runtime.engine import Engine, process_blocks
@@ -40,7 +41,6 @@ from service.runtime.readiness import (
     state_message,
     waiting_for,
 )
-from service.runtime.recording import Actor, Recorder, ids_of
 from service.runtime.refits import Refits
 from service.runtime.snapshot import Snapshot
 from service.runtime.telemetry_recorder import TelemetryRecorder
@@ -97,7 +97,7 @@ class Supervisor:
         """Products and their history; a call waits for the disk."""
         self.newest_frames: FrameBlock | None = None
         """The last telemetry that came; None: none has."""
-        self._recorder = Recorder(archive, lambda: self._engine.state, self._post)
+        self._writer = ArchiveWriter(archive, lambda: self._engine.state, self._post)
         self._actions = actions
         self._retention = retention
         self.recordings = TelemetryRecorder(
@@ -105,7 +105,7 @@ class Supervisor:
             retention=retention,
             system=state.system,
             tap=bridge.keep,
-            audit=self._recorder.add,
+            audit=self._writer.add,
         )
         """Telemetry kept on request."""
         self.refits = Refits()
@@ -116,7 +116,7 @@ class Supervisor:
             state=lambda: self._engine.state,
             frames=lambda: self.newest_frames,
             matrix=self.matrix,
-            keep=self._recorder.sampled,
+            keep=self._writer.sampled,
         )
         self._telemetry_executor = ThreadPoolExecutor(1, "telemetry")
         self._telemetry_lock = asyncio.Lock()
@@ -152,8 +152,8 @@ class Supervisor:
             or "ready",
             waiting_for=waiting,
             worker_load=self._worker_load.worker_load,
-            archive_failures=self._recorder.failures,
-            archive_waiting=self._recorder.waiting,
+            archive_failures=self._writer.failures,
+            archive_waiting=self._writer.waiting,
         )
 
     def _waiting_for(self, link: LinkStatistics) -> tuple[Prerequisite, ...]:
@@ -168,7 +168,7 @@ class Supervisor:
 
     def audit(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail that is of no command."""
-        self._recorder.add(entry)
+        self._writer.add(entry)
 
     async def submit(self, command: Command, actor: Actor = OPERATOR) -> str:
         """Carry out an operator's command; return one sentence on what came of it.
@@ -192,20 +192,20 @@ class Supervisor:
         if told or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
             return await self._result_of(order)
         try:
-            await self._recorder.ordered(order, actor)
+            await self._writer.ordered(order, actor)
         except StorageError as error:
             if not isinstance(command, cmd.StopEverything):  # that one waits for no disk
-                self._recorder.refused(order, actor, error)
+                self._writer.refused(order, actor, error)
                 raise
         try:
             actor.check()
             answer = await self._result_of(order)
         except PyrcalError as error:
-            self._recorder.refused(order, actor, error)
+            self._writer.refused(order, actor, error)
             raise
-        self._recorder.answered(order, actor, answer)
+        self._writer.answered(order, actor, answer)
         if isinstance(command, cmd.StopEverything | cmd.Resume):
-            await self._recorder.keep_orders()
+            await self._writer.keep_orders()
         return answer
 
     async def _result_of(self, order: Order) -> str:
@@ -238,14 +238,14 @@ class Supervisor:
                 action.cancel()
             await asyncio.gather(*self._running, return_exceptions=True)
             self._telemetry_executor.shutdown(wait=False)
-            self._recorder.close()
+            self._writer.close()
 
     async def _work(self) -> None:
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._recorder.run())
-            group.create_task(self._recorder.save())
+            group.create_task(self._writer.run())
+            group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
-            group.create_task(self._recorder.keep_house(self._retention))
+            group.create_task(self._writer.keep_house(self._retention))
             description = await self._described()
             self._engine.set_description(description)
             text = f"{description.n_slopes} slopes, {description.n_modes} modes"
@@ -392,7 +392,7 @@ class Supervisor:
     async def _fit(self) -> None:
         while True:
             await self._pending_window.some()
-            async with self._workers.turn("fit"):
+            async with self._workers.turn(OpticsWorker.fit):
                 window = self._pending_window.take()
                 if window is None:
                     continue
@@ -405,7 +405,7 @@ class Supervisor:
     async def _fit_passive(self) -> None:
         while True:
             await asyncio.sleep(PASSIVE_INTERVAL_S)
-            async with self._workers.turn("watch"):
+            async with self._workers.turn(OpticsWorker.fit_passive):
                 async with self._telemetry_lock:
                     sums = self._engine.take_sums()
                 event = await fit_passive(sums, self._engine.state, self._workers)
@@ -459,10 +459,10 @@ class Supervisor:
 
     async def _do(self, effect: Effect, state: TrackerState) -> None:
         try:
-            await self._recorder.before(effect)
+            await self._writer.before(effect)
             event = await self._actions.perform(effect, state)
         except StorageError as error:
-            self._recorder.failed(error)
+            self._writer.failed(error)
             event = ev.JobFailed(effect=effect, text=str(error))
         except PyrcalError as error:
             event = ev.JobFailed(effect=effect, text=str(error))
@@ -485,7 +485,7 @@ class Supervisor:
             self._post(await self._actions.keep_measured(heard))
         except PyrcalError as error:
             if isinstance(error, StorageError):
-                self._recorder.failed(error)
+                self._writer.failed(error)
             self._note("measurement.not-kept", str(error), Level.WARNING)
 
     def _note(self, name: str, text: str, level: Level) -> None:
@@ -498,4 +498,4 @@ class Supervisor:
             ids = ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
-        self._recorder.changed(before, self._engine.state, entries)
+        self._writer.changed(before, self._engine.state, entries)

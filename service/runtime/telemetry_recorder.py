@@ -22,7 +22,7 @@ from service.errors import (
     StorageError,
     UnknownIdError,
 )
-from service.files.recorder import RecordingWriter
+from service.files.recording import RecordingWriter
 from service.tracking.commands import Instruction
 
 LONGEST_S = 3600.0

@@ -17,16 +17,13 @@ from service.errors import WorkerError
 from service.runtime.processes import Worker
 from service.runtime.snapshot import WorkerLoad
 from service.runtime.worker import Done, OpticsWorker, run_job
+from service.runtime.worker.records import patience_s
 from service.tracking import events as ev
 from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
 from service.tracking.state import TrackerState
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-PATIENCE_S = {"make": 1.0, "work_out": 5.0, "watch": 6.0, "margin": 10.0}
-"""How long a job may wait for those that are asked for later; all others go first. What waits long
-enough has its turn before anything new, so that nothing waits for ever."""
 
 STILL_S = 5.0
 """A worker that has taken no processor time for so long is named,"""
@@ -48,8 +45,8 @@ LOOK_S = 0.5
 class WorkerPool:
     """Hands jobs to a worker made by ``start``; a dead or hung one costs one job, not the service.
 
-    Belongs to the event loop. What is most urgent goes first, see :data:`PATIENCE_S`. One that
-    has begun ``early`` is the first.
+    Belongs to the event loop. What is most urgent goes first: a job says how long it may wait. One
+    that has begun ``early`` is the first.
     """
 
     def __init__(self, start: Callable[[], Worker], early: Worker | None = None) -> None:
@@ -81,13 +78,13 @@ class WorkerPool:
         return self._busy_s + (0.0 if since_s is None else time.monotonic() - since_s)
 
     @contextlib.asynccontextmanager
-    async def turn(self, name: str) -> AsyncIterator[None]:
-        """Have the worker for jobs of this name: what they are of is then chosen as late as can be.
+    async def turn(self, job: Callable[..., object]) -> AsyncIterator[None]:
+        """Have the worker for this job: what it is of is then chosen as late as can be.
 
         ``call`` waits for its turn by itself; within this block it has it.
         """
         mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        due_s = time.monotonic() + PATIENCE_S.get(name, 0.0)
+        due_s = time.monotonic() + patience_s(job)
         heapq.heappush(self._waiting, (due_s, next(self._numbers), mine))
         self._admit()
         try:
@@ -115,7 +112,7 @@ class WorkerPool:
         if self._owner is asyncio.current_task():
             done = await self._done(job.__name__, work)
         else:
-            async with self.turn(job.__name__):
+            async with self.turn(job):
                 done = await self._done(job.__name__, work)
         return done.result
 

@@ -58,27 +58,28 @@ class Offloading:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Policy:
-    """The settings of the tracker."""
+    """The settings of the tracker; :func:`service.config.policy.policy_of` makes it of the user's.
 
-    dither_enabled: bool = True
-    dither_amplitude_m: float | None = None
+    What users decide has its default there, and no other here.
+    """
+
+    dither_enabled: bool
+    dither_amplitude_m: float | None
     """RMS of each dithered mode, metres OPD; None: as little as serves."""
 
-    dither_budget_m: float = 8e-9
+    dither_budget_m: float
     """Largest RMS of all modes together, metres OPD."""
 
-    dither_sigma: NDArray[np.float64] = field(
-        default_factory=lambda: np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
-    )
+    dither_sigma: NDArray[np.float64]
     """``(4,)`` 1 σ of α to be kept by dithering, numeric units, model error not included."""
 
-    dither_avoid_hz: tuple[float, ...] = ()
+    dither_avoid_hz: tuple[float, ...]
     """Vibrations the dither keeps clear of, besides those that are heard."""
 
-    longest_pause_s: float = 0.0
+    longest_pause_s: float
     """Between two windows, for so long a jump may go unseen; 0: no pause at all."""
 
-    dither_modes: tuple[int, ...] | None = None
+    dither_modes: tuple[int, ...] | None
     """None: the four that tell most among those the loop will not control."""
 
     mode_information: NDArray[np.float64] | None = None
@@ -87,16 +88,16 @@ class Policy:
     start: Misregistration = field(default_factory=Misregistration)
     """Where the fit of a window begins while α is not known: the mirror's nominal rotation."""
 
-    dither_frequencies_hz: tuple[float, ...] | None = None
+    dither_frequencies_hz: tuple[float, ...] | None
     """None: spread over 0.2-0.35 of the frame rate."""
 
     dither_duration_s: float = 120.0
     """Of a request of an operator's who does not say."""
 
-    window_s: float = 2.0
+    window_s: float
     """Shortest window of dithered telemetry."""
 
-    longest_window_s: float = 20.0
+    longest_window_s: float
     """Longest one; faint stars and small budgets need long windows."""
 
     drift_rate: NDArray[np.float64]
@@ -105,49 +106,47 @@ class Policy:
     floor: NDArray[np.float64]
     """``(4,)`` 1 σ model error, numeric units."""
 
-    bias_memory_s: float = 3600.0
+    bias_memory_s: float
     """After so long what was learnt of the passive estimate's bias is worth 1/e."""
 
-    flexure_per_degree: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
+    flexure_per_degree: NDArray[np.float64]
     """``(4,)`` 1 σ of what a degree of elevation does to α, numeric units."""
 
-    slew_limit_deg: float = 5.0
+    slew_limit_deg: float
     """A telescope that has moved further than this makes α invalid until the next window."""
 
-    stale_sigma: NDArray[np.float64] = field(
-        default_factory=lambda: np.array([0.05, 0.05, np.deg2rad(0.1), 0.003])
-    )
+    stale_sigma: NDArray[np.float64]
     """``(4,)`` 1 σ from which on α is stale, numeric units."""
 
-    acquires: bool = False
+    acquires: bool
     """Whether the service finds α from nothing by itself, in mode auto."""
 
-    acquisition_amplitude_m: float = 50e-9
+    acquisition_amplitude_m: float
     """RMS of each mode dithered while the loop is open for it, metres OPD."""
 
-    n_modes_target: int = 500
+    n_modes_target: int
     """Modes to control once the registration is known."""
 
     update_threshold: NDArray[np.float64]
     """``(4,)`` change of α that makes a new reconstructor whatever it wins, numeric units."""
 
-    update_gain_m: float = 0.5e-9
+    update_gain_m: float
     """Expected loss of wavefront error that makes a new reconstructor worthwhile, metres."""
 
-    update_margin: float = 0.08
+    update_margin: float
     """The same of the stability margin: share of a new one's that is lost."""
 
-    minimum_interval_s: float = 5.0
+    minimum_interval_s: float
     """Least time between two reconstructors."""
 
-    rules: tuple[Rule, ...] = ()
+    rules: tuple[Rule, ...]
     """Operators' own."""
 
-    opens_lost_loop: bool | None = None
+    opens_lost_loop: bool | None
     """Whether a loop that is lost with a matrix just applied is asked to open where going back does
     not help; None: where the mode was auto when it was applied."""
 
-    offloading: Offloading | None = None
+    offloading: Offloading | None
     """None: α is corrected by the matrix alone."""
 
     refused_interval_s: float = 30.0

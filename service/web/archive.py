@@ -20,12 +20,11 @@ from pydantic import Field
 from service.archive import Archive, AuditEntry, Pin, Range
 from service.archive.nights import FOREVER_NS
 from service.archive.retention import Item, items
-from service.runtime.recording import needed
+from service.runtime.archiving import needed
 from service.web.commands import AcceptedView, ClientDep, Said
 from service.web.problems import INVALID, UNKNOWN
 from service.web.reading import TimeParameters
-from service.web.schemas import shows
-from service.web.views import ServiceDep, answer, define_view, to_json
+from service.web.views import ServiceDep, answer, define_view, shows, to_json
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
 

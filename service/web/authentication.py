@@ -25,7 +25,7 @@ from typing_extensions import override
 
 from service.archive import AuditEntry
 from service.errors import ConfigurationError
-from service.runtime.recording import Actor, Channel
+from service.runtime.archiving import Actor, Channel
 from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
 from service.web.problems import problem

@@ -18,10 +18,8 @@ from pydantic_core import from_json
 from starlette.datastructures import MutableHeaders
 
 from service.errors import StaleError, UntaggedError
-from service.runtime import telemetry_recorder
-from service.runtime.recording import Actor
+from service.runtime.archiving import Actor
 from service.runtime.supervisor import Supervisor
-from service.tracking import commands as instructions
 from service.tracking.commands import (
     AbortAcquisition,
     AcknowledgeAlarm,
@@ -51,14 +49,12 @@ from service.tracking.state import TrackerState
 from service.web.authentication import actor_of
 from service.web.numbers import MatrixId
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.web.schemas import Schema, explained
 from service.web.views import RECONSTRUCTORS, ServiceDep, found_or_refuse, tagged
 
 # --- what is asked: JSON, read into a record
 
 
 JSON = "application/json"
-_SCHEMAS = "#/components/schemas/{model}"
 
 Asked = TypeVar("Asked", bound=Instruction)
 
@@ -179,31 +175,6 @@ def _is_of_type(fault: Mapping[str, Any]) -> bool:
     """Return whether a fault is that the value is something else altogether."""
     kind: str = fault["type"]
     return kind == "enum" or kind.endswith("_type")
-
-
-def bodies(by_operation: Mapping[str, Body]) -> tuple[dict[str, Schema], dict[str, Schema]]:
-    """Return request bodies by operation, and the schemas of all that they hold by name."""
-    found, document = TypeAdapter.json_schemas(
-        [(name, "validation", body.adapter) for name, body in by_operation.items()],
-        ref_template=_SCHEMAS,
-    )
-    requests = {
-        name: {
-            "content": {JSON: {"schema": found[name, "validation"]}},
-            "required": body.required,
-        }
-        for name, body in by_operation.items()
-    }
-    schemas: dict[str, Schema] = document.get("$defs", {})
-    records = vars(instructions) | vars(telemetry_recorder)
-    for name, schema in schemas.items():
-        texts = explained(records[name]) if "properties" in schema else {}
-        if "action" in schema.get("properties", ()):  # what tells alternatives apart
-            schema["required"] = [*schema.get("required", ()), "action"]
-        for field, text in texts.items():
-            if field in schema["properties"]:
-                schema["properties"][field]["description"] = text
-    return requests, schemas
 
 
 # --- who asks, and for what

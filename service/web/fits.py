@@ -18,8 +18,15 @@ from service.files import parse_alpha, parse_modes
 from service.model.kinds import Method
 from service.runtime.uploads import FitJob, FitQueue, FitState
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.schemas import SCHEMAS, beside_the_four, shows
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse, to_json
+from service.web.views import (
+    SCHEMAS,
+    ServiceDep,
+    answer,
+    define_view,
+    found_or_refuse,
+    shows,
+    to_json,
+)
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 
@@ -114,7 +121,7 @@ class FitParameters(BaseModel):
 class FitDocument(BaseModel):
     """What a fit has found: the object that ``pyrcal fit --json`` prints."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True, json_schema_extra=beside_the_four)
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     sigma: dict[str, float | None]
     """1 σ of the four, by name; noise, disagreement of subsets and model error together."""

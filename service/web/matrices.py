@@ -28,9 +28,8 @@ from service.web import views
 from service.web.commands import AcceptedView, ClientDep, Said, about, body
 from service.web.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.schemas import shows
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
 router = APIRouter(
     prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}

@@ -14,8 +14,7 @@ from service.runtime.telemetry_recorder import AnnotationChoice
 from service.web.commands import AcceptedView, ClientDep, body
 from service.web.problems import COMMAND, INVALID
 from service.web.reading import TimeParameters
-from service.web.schemas import shows
-from service.web.views import ServiceDep, answer, define_view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
 

@@ -23,9 +23,8 @@ from service.model.slopes import as_maps, slopes_of, to_conventions, turned_mask
 from service.runtime.supervisor import Supervisor
 from service.tracking.products import MatrixState
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.schemas import shows
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, define_view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 Numbers = NDArray[np.float32]
 

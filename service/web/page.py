@@ -26,8 +26,7 @@ from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.web.authentication import OPEN
 from service.web.connections import Middleware
-from service.web.schemas import shows
-from service.web.views import ServiceDep, answer, define_view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"])
 
@@ -38,6 +37,9 @@ MANUAL: Final = Path(__file__).parent / "manual"
 
 SWAGGER: Final = Path(__file__).parent / "swagger"
 """Swagger UI, which shows what REST answers and tries it out: no observatory needs the internet."""
+
+OPENAPI: Final = Path(__file__).parent / "openapi.json"
+"""What REST answers: ``python -m studies.pages`` writes it."""
 
 HEADERS: Final = {
     # its own files and its own service: nothing inline, no other host
@@ -74,6 +76,10 @@ def install(app: FastAPI) -> None:
     @app.get("/", include_in_schema=False, openapi_extra=OPEN)
     async def page() -> Response:
         return FileResponse(FILES / "index.html", headers=HEADERS)
+
+    @app.get("/openapi.json", include_in_schema=False, openapi_extra=OPEN)
+    async def openapi() -> Response:
+        return Response(OPENAPI.read_bytes(), media_type="application/json")
 
     @app.get("/docs", include_in_schema=False, openapi_extra=OPEN)
     async def swagger() -> Response:

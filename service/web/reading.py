@@ -28,9 +28,8 @@ from service.web.numbers import (
     numbers_of,
 )
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.web.schemas import shows
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse, tagged
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows, tagged
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 

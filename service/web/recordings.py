@@ -16,9 +16,8 @@ from service.runtime.telemetry_recorder import RecordingChoice
 from service.tracking.commands import Instruction
 from service.web.commands import AcceptedView, Client, ClientDep, Said, body
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.schemas import shows
 from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse
+from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
 T = TypeVar("T")
 

@@ -10,8 +10,7 @@ from service.runtime.refits import RefitJob
 from service.tracking.commands import Refit
 from service.web.commands import AcceptedView, ClientDep, body
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.schemas import shows
-from service.web.views import ServiceDep, answer, define_view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what an operator asks of it"], responses={**INVALID})
 

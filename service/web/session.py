@@ -12,8 +12,7 @@ from service.errors import UnknownIdError
 from service.web.authentication import COOKIE, OPEN, actor_of, needs, shown_key
 from service.web.keys import Key, KeyFile, KeyScope
 from service.web.problems import INVALID, UNKNOWN
-from service.web.schemas import shows
-from service.web.views import answer, define_view
+from service.web.views import answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["who may ask"], responses={**INVALID})
 

@@ -12,8 +12,7 @@ from pydantic import Field
 from service.archive.trends import TREND_S, TrendSample
 from service.web.problems import INVALID
 from service.web.reading import TimeParameters
-from service.web.schemas import shows
-from service.web.views import ServiceDep, answer, define_view
+from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 

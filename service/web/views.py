@@ -2,7 +2,7 @@
 
 Records leave as they are: a view names the fields of one, in boundary units. A registration, or its
 1 σ, leaves as its four parameters; a number that is not finite is null. The OpenAPI document takes
-types and descriptions from the records themselves: ``service.web.schemas``.
+types and descriptions from the records themselves when it is written: ``studies.openapi``.
 """
 
 from __future__ import annotations
@@ -148,6 +148,15 @@ def rfc3339(t_ns: int | None) -> str | None:
         return None
     seconds, rest_ns = divmod(t_ns, 1_000_000_000)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 1000:06d}Z"
+
+
+SCHEMAS = "#/components/schemas/"
+
+
+def shows(of: View) -> dict[str, Any]:
+    """Return the OpenAPI description of an answer that shows a record."""
+    content = {"application/json": {"schema": {"$ref": f"{SCHEMAS}{of.name}"}}}
+    return {"description": of.text.partition("\n\n")[0], "content": content}
 
 
 as_json = msgspec.json.Encoder(enc_hook=methodcaller("item")).encode

@@ -7,16 +7,28 @@ that messages share.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, asdict, dataclass, fields, is_dataclass
+from enum import Enum
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar
+from types import NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Generic,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgpack
 import msgspec
 import numpy as np
-from msgspec import Meta, inspect
+from msgspec import Meta
 
 from service.errors import WireError
 from service.wire.keys import ID_EXPECTED, ID_PATTERN, RESERVED_IDS, checked_id
@@ -310,7 +322,7 @@ def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = 
     try:
         record = msgspec.convert(values, kind, builtin_types=(bytes,))
     except msgspec.ValidationError as error:
-        raise _refused(str(error), values, kind, where) from error
+        raise _refused(values, kind, where) from error
     for name in _opaque(kind):
         if not getattr(record, name).isprintable():
             raise refusal(name, getattr(record, name), expected_of(kind, name), where)
@@ -363,69 +375,72 @@ def expected_of(kind: type[DataclassInstance], key: str) -> str:
     return _words(_types(kind)[key])
 
 
-def _refused(text: str, values: Any, kind: type[DataclassInstance], where: str) -> WireError:  # noqa: ANN401
-    """Return the error of a map that is no such record, from msgspec's account of it.
+def _refused(value: Any, kind: Any, where: str, key: str = "") -> WireError:  # noqa: ANN401
+    """Return the error of a value that is not of a type: of the first part of it that is wrong."""
+    kind, parts = _without_none(kind), []
+    is_record = is_dataclass(kind)
+    if is_record:
+        if not isinstance(value, dict):
+            return WireError(f"range: {key!r} of {where} is {_show(value)}, expected a map")
+        where, types = (f"{key!r} of {where}" if key else where), _types(kind)
+        parts = [(part, types[name], name) for name, part in value.items() if name in types]
+    elif isinstance(value, list):
+        parts = [
+            (part, item, key) for part, item in zip(value, _items(kind, len(value)), strict=False)
+        ]
+    for part, expected, name in parts:
+        if not _is_of(part, expected):
+            return _refused(part, expected, where, name)
+    if is_record:
+        lacking = next(name for name in _types(kind) if name not in value)
+        return WireError(f"missing: key {lacking!r} in {where}")
+    if _words(kind) == ID_EXPECTED:
+        checked_id(value, f"key {key!r} in {where}")
+    return refusal(key, value, _words(kind), where)
 
-    That says what was expected by type, and at which path: found and expected are looked up there.
-    """
-    account, _, path = text.partition(" - at `$")
-    lacking = re.fullmatch(r"Object missing required field `(\w+)`", account)
-    at: inspect.Type = inspect.type_info(kind)
-    key = ""
-    for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
-        at = _below(at, name)
-        values = values[name or int(index)]
-        if name:
-            where, key = (f"{key!r} of {where}" if key else where), name
-    if lacking is not None:
-        return WireError(f"missing: key {lacking[1]!r} in {key!r} of {where}")
-    if isinstance(_core(at), inspect.DataclassType):
-        return WireError(f"range: {key!r} of {where} is {_show(values)}, expected a map")
-    if _words(at) == ID_EXPECTED:
-        checked_id(values, f"key {key!r} in {where}")
-    return refusal(key, values, _words(at), where)
+
+def _is_of(value: object, kind: Any) -> bool:  # noqa: ANN401  a type, annotated
+    try:
+        msgspec.convert(value, kind, builtin_types=(bytes,))
+    except msgspec.ValidationError:
+        return False
+    return True
 
 
 @cache
-def _types(kind: type[DataclassInstance]) -> dict[str, inspect.Type]:
-    info = inspect.type_info(kind)
-    return {field.name: field.type for field in getattr(info, "fields", ())}
+def _types(kind: type[DataclassInstance]) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
 
 
 @cache
 def _opaque(kind: type[DataclassInstance]) -> tuple[str, ...]:
-    printable = Opaque.__metadata__[0].description  # type: ignore[attr-defined]
+    printable = _words(Opaque)
     return tuple(name for name, at in _types(kind).items() if _words(at) == printable)
 
 
-def _core(at: inspect.Type) -> inspect.Type:
+def _without_none(kind: Any) -> Any:  # noqa: ANN401  a type
     """Return a type without the None that it may be as well."""
-    if isinstance(at, inspect.UnionType):
-        return next(t for t in at.types if not isinstance(t, inspect.NoneType))
-    return at
+    is_union = get_origin(kind) in {Union, UnionType}
+    return next(one for one in get_args(kind) if one is not NoneType) if is_union else kind
 
 
-def _below(at: inspect.Type, name: str) -> inspect.Type:
-    """Return the type of a field or, without a name, of the items of a list."""
-    at = _core(at)
-    if isinstance(at, inspect.Metadata):
-        at = at.type
-    if isinstance(at, inspect.DataclassType):
-        return next(field.type for field in at.fields if field.name == name)
-    if isinstance(at, inspect.VarTupleType):
-        return at.item_type
-    return at.item_types[0] if isinstance(at, inspect.TupleType) else at
+def _items(kind: Any, n_items: int) -> tuple[Any, ...]:  # noqa: ANN401  a type
+    """Return the type of each item of a list; none: it is no list, or of another length."""
+    bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    items = get_args(bare) if get_origin(bare) is tuple else ()
+    items = items[:1] * n_items if items[1:] == (...,) else items
+    return items if len(items) == n_items else ()
 
 
-def _words(at: inspect.Type) -> str:
-    at = _core(at)
-    if isinstance(at, inspect.Metadata):
-        return str((at.extra_json_schema or {})["description"])
-    if isinstance(at, inspect.EnumType):
-        return f"one of {', '.join(at.cls)}"
-    if isinstance(at, inspect.VarTupleType):
+def _words(kind: Any) -> str:  # noqa: ANN401  a type
+    kind = _without_none(kind)
+    if get_origin(kind) is Annotated:
+        return str(kind.__metadata__[0].description)
+    if get_origin(kind) is tuple:
         return "a list"
-    return "true or false" if isinstance(at, inspect.BoolType) else "bytes"
+    if issubclass(kind, Enum):
+        return f"one of {', '.join(str(one.value) for one in kind)}"
+    return "true or false" if kind is bool else "bytes"
 
 
 def _show(value: object) -> str:

@@ -18,8 +18,7 @@ import structlog
 import zenoh
 from typing_extensions import override
 
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind
+from service.files.recording import RecordedKind, RecordingWriter
 from service.wire import Keys, encode, split
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.real_time_computer import RealTimeComputer

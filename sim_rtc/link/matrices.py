@@ -12,8 +12,7 @@ import zenoh
 from typing_extensions import override
 
 from service.errors import WireError
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind
+from service.files.recording import RecordedKind, RecordingWriter
 from service.wire import (
     CHUNK_LIMIT,
     Acknowledgement,

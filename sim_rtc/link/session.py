@@ -10,8 +10,7 @@ import structlog
 import zenoh
 import zenoh.ext
 
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind
+from service.files.recording import RecordedKind, RecordingWriter
 from service.wire import Encodings, Keys, Role
 
 _log = structlog.get_logger("sim_rtc")

@@ -27,7 +27,7 @@ from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_o
 from service.runtime.passive_sums import PASSIVE_INTERVAL_S
 from service.runtime.ports import StorePort
 from service.runtime.worker import OpticsWorker
-from service.runtime.workers import PATIENCE_S
+from service.runtime.worker.records import patience_s
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.commands import Command
@@ -261,9 +261,9 @@ class Observatory:
 
         self._in(seconds, again)
 
-    def _work(self, name: str, begin: Callable[[], _Job]) -> None:
+    def _work(self, job: Callable[..., object], begin: Callable[[], _Job]) -> None:
         """Have the worker begin something once it has a hand free, and what is more urgent done."""
-        due_s = self.time_s + PATIENCE_S.get(name, 0.0)
+        due_s = self.time_s + patience_s(job)
         heapq.heappush(self._jobs, (due_s, next(self._numbers), begin))
         self._work_on()
 
@@ -331,7 +331,7 @@ class Observatory:
             self._post(ev.WindowLost(refused=given_up))
         if not self._fitting:
             self._fitting = True
-            self._work("fit", self._fit_next)
+            self._work(OpticsWorker.fit, self._fit_next)
 
     def _fit_next(self) -> _Job:
         window = self._backlog.take()
@@ -342,12 +342,12 @@ class Observatory:
 
         def done() -> None:
             self._post(event)
-            self._work("fit", self._fit_next)
+            self._work(OpticsWorker.fit, self._fit_next)
 
         return self.latencies.fit_s, done
 
     def _watch(self) -> None:
-        self._work("watch", self._look_at_sums)
+        self._work(OpticsWorker.fit_passive, self._look_at_sums)
 
     def _look_at_sums(self) -> _Job:
         sums = self._engine.take_sums()
@@ -397,14 +397,14 @@ class Observatory:
 
     def _do(self, effect: Effect, state: TrackerState) -> None:
         """Carry an effect out; what comes of it is heard when it would be."""
-        name, lasts_s = self._takes(effect)
+        job, lasts_s = self._takes(effect)
 
         def begin() -> _Job:
             event = self._performed(effect, state)
             return lasts_s, lambda: self._done(event, effect.cause)
 
-        if name:
-            self._work(name, begin)
+        if job is not None:
+            self._work(job, begin)
         else:
             _, done = begin()
             self._in(lasts_s, done)
@@ -435,20 +435,20 @@ class Observatory:
         if event is not None:
             self._post(event, cause)
 
-    def _takes(self, effect: Effect) -> tuple[str, float]:
+    def _takes(self, effect: Effect) -> tuple[Callable[..., object] | None, float]:
         """Return the worker's job that an effect asks for, if any, and how long it takes."""
         wait = self.latencies
         match effect:
             case ev.MakeMatrix():
-                return "make", wait.make_s
+                return OpticsWorker.make, wait.make_s
             case ev.JudgeMatrix():
-                return "margin", wait.judge_s
+                return OpticsWorker.margin, wait.judge_s
             case ev.RepublishMatrix(judged=True) | ev.JudgeProposal():
-                return "judge", wait.judge_s
+                return OpticsWorker.judge, wait.judge_s
             case ev.FetchMatrix():
-                return "", wait.fetch_s
+                return None, wait.fetch_s
             case ev.RepublishMatrix() | ev.SendMatrix() | ev.Ask() | ev.FinishNoisy():
-                return "", wait.command_s
+                return None, wait.command_s
             case _:
                 raise TypeError(
                     f"observatory: found {type(effect).__name__}; expected an effect whose "

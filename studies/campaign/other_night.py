@@ -12,7 +12,7 @@ from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.recording import SAVE_INTERVAL_S, is_unsaved, is_urgent, leave, taken_up
+from service.runtime.archiving import SAVE_INTERVAL_S, is_unsaved, is_urgent, leave, taken_up
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.events import Event
 from service.tracking.resume import restored

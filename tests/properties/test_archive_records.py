@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.archive.records import from_json, to_json
+from service.archive.serialisation import from_json, to_json
 from service.control.gate import GateVerdict
 from service.model.misregistration import Misregistration
 from service.tracking.products import MatrixState, ReconstructorRecord

@@ -4,13 +4,15 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import httpx
 import numpy as np
 import pytest
 
-from service.config import load_instrument
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
 from service.estimation.lockin import LockInEstimate
 from service.estimation.windows import ClosedLoop as FitLoop
 from service.files.recording import RecordedKind, Recording
@@ -20,7 +22,6 @@ from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.engine import Engine
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import events as ev
-from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode
 from service.wire import DitherRequest, Manifest, decode
@@ -32,7 +33,10 @@ from tests.unit.tracking.situations import dither_answered
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 
 WINDOW_S = 1.0
-POLICY = Policy(
+POLICY = replace(
+    policy_of(load_settings(None, {})),
+    acquires=False,
+    flexure_per_degree=np.zeros(4),
     window_s=WINDOW_S,
     dither_budget_m=40e-9,
     longest_pause_s=0.0,

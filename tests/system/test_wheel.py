@@ -58,6 +58,7 @@ def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
         *(ROOT / "service" / "instruments").glob("*.toml"),
         *(ROOT / "service" / "web" / "dashboard").iterdir(),
         ROOT / "service" / "tracking" / "alarms.toml",
+        ROOT / "service" / "web" / "openapi.json",
     ]
     names = set(wheel.namelist())
     assert {str(path.relative_to(ROOT)) for path in expected if path.is_file()} <= names

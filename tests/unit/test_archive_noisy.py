@@ -9,7 +9,7 @@ import pytest
 
 from service.archive import Archive
 from service.archive.products import NoisyNumbers
-from service.archive.records import from_json, to_json
+from service.archive.serialisation import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.files.container import read_recorded
 from service.model.misregistration import Misregistration

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.archive import Archive, AuditEntry
-from service.archive.records import TrackingFile
+from service.archive.serialisation import TrackingFile
 from service.control.gains import ModeGain
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.products import MatrixState, MeasureState

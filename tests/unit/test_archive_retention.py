@@ -19,7 +19,7 @@ from service.archive import Archive, Pin, retention
 from service.archive.nights import DAY_NS
 from service.archive.retention import RetentionPolicy, due, items
 from service.errors import UnknownIdError
-from service.runtime import recording
+from service.runtime import archiving
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
 from service.tracking.state import TrackerState
@@ -120,8 +120,8 @@ def test_one_killed_between_index_and_disk_has_lost_nothing(archive):
 @pytest.fixture
 def quick(monkeypatch):
     for name in ("LOOK_S", "REST_S"):
-        monkeypatch.setattr(recording, name, 0.0)
-    monkeypatch.setattr(recording.time, "time_ns", lambda: NOW)
+        monkeypatch.setattr(archiving, name, 0.0)
+    monkeypatch.setattr(archiving.time, "time_ns", lambda: NOW)
 
 
 async def kept_for_a_moment(archive, keeping, state, monkeypatch):
@@ -134,8 +134,8 @@ async def kept_for_a_moment(archive, keeping, state, monkeypatch):
         rounds.append(1)
         return retention.low_on_space(*args, **said)
 
-    monkeypatch.setattr(recording, "low_on_space", low_on_space)
-    recorder = recording.Recorder(archive, lambda: state, told.append)
+    monkeypatch.setattr(archiving, "low_on_space", low_on_space)
+    recorder = archiving.ArchiveWriter(archive, lambda: state, told.append)
     with suppress(asyncio.CancelledError):
         await asyncio.wait_for(recorder.keep_house(keeping), 60.0)
     return told, recorder._entries

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.archive import Archive
-from service.archive.records import TrackingFile
+from service.archive.serialisation import TrackingFile
 from service.errors import ArchiveError
 from service.tracking import commands as cmd
 from service.tracking.loop import loop_numbers

@@ -10,7 +10,7 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.cli.serve import log_to_the_terminal
-from service.runtime.recording import ids_of
+from service.runtime.archiving import ids_of
 from service.tracking.alarms import (
     ALARMS,
     ARCHIVE_FAILED,

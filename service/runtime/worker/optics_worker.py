@@ -40,6 +40,7 @@ from service.runtime.worker.records import (
     actuators_of,
     check_controllable,
     outer_of,
+    waits,
 )
 from service.runtime.worker.sensor import REACH, Sensor, length, near_enough
 
@@ -344,6 +345,7 @@ class OpticsWorker:
                 return None
         return None
 
+    @waits(at_most_s=1.0)
     def make(self, conditions: Conditions, fewer: tuple[int, ...] = ()) -> Made:
         """Compute the reconstructor for α, as many modes as the loop has gains, and judge it.
 
@@ -418,6 +420,7 @@ class OpticsWorker:
         covariance, bound = conditions.covariance, conditions.bound
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 
+    @waits(at_most_s=10.0)
     def margin(
         self,
         in_use: NDArray[np.float32],
@@ -433,6 +436,7 @@ class OpticsWorker:
         loop = replace(conditions.loop, optical_gain=optical_gain)
         return verdict, self.assess(in_use, conditions.alpha, loop, magnitude)
 
+    @waits(at_most_s=6.0)
     def fit_passive(
         self, state: passive.Passive, start: Misregistration | None
     ) -> passive.PassiveEstimate | None:

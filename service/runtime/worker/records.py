@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,27 @@ from service.model.interaction import RtcInteractionModel
 from service.model.kinds import Influence, SignalKind
 from service.model.misregistration import Determination, Misregistration
 from service.model.modes import ModalBasis
+
+_Job = TypeVar("_Job", bound=Callable[..., Any])
+
+
+def waits(at_most_s: float) -> Callable[[_Job], _Job]:
+    """Return what marks a job of the worker that may wait for those that are asked for later.
+
+    All others go first. What has waited for so long has its turn before anything new, so that
+    nothing waits for ever.
+    """
+
+    def marked(job: _Job) -> _Job:
+        job.patience_s = at_most_s  # type: ignore[attr-defined]
+        return job
+
+    return marked
+
+
+def patience_s(job: Callable[..., Any]) -> float:
+    """Return for how long a job may wait for those that are asked for later."""
+    return getattr(job, "patience_s", 0.0)
 
 
 class Sampling(NamedTuple):

@@ -20,7 +20,7 @@ from service.api import create_app
 from service.archive import AuditEntry
 from service.archive.recordings import RecordingRecord
 from service.errors import CommandError
-from service.runtime.recording import Channel
+from service.runtime.archiving import Channel
 from service.runtime.snapshot import Snapshot
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import MakeMatrix, MatrixMade

@@ -4,17 +4,22 @@ import time
 
 import pytest
 
-from service.files import last_telemetry
-from service.files.last_telemetry import OVERHEAD_BYTES, Arrived, LastTelemetry
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind, Recording
+from service.files import recording
+from service.files.recording import (
+    OVERHEAD_BYTES,
+    LastTelemetry,
+    Message,
+    RecordedKind,
+    Recording,
+    RecordingWriter,
+)
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """Give a clock that stands until it is set."""
     at = {"s": 100.0}
-    monkeypatch.setattr(last_telemetry.time, "monotonic", lambda: at["s"])
+    monkeypatch.setattr(recording.time, "monotonic", lambda: at["s"])
     return at
 
 
@@ -50,14 +55,14 @@ def test_with_nothing_to_hold_it_holds_nothing():
 
 def test_a_recording_begins_with_what_came_before_and_drops_none_of_it(tmp_path):
     now_s = time.monotonic()
-    past = [Arrived(now_s - 3.0 + k, RecordedKind.FRAMES, bytes([k]) * 5000) for k in range(3)]
+    past = [Message(now_s - 3.0 + k, RecordedKind.FRAMES, bytes([k]) * 5000) for k in range(3)]
     writer = RecordingWriter(tmp_path / "r.h5", system="small", backlog_bytes=6000)
     with writer:
         writer.begin_with(past)
         writer.put(RecordedKind.STATUS, b"now")
     assert (writer.n_dropped, writer.n_bytes) == (0, 15_003)
-    with Recording(tmp_path / "r.h5") as recording:
-        found = list(recording.messages())
+    with Recording(tmp_path / "r.h5") as read:
+        found = list(read.messages())
     assert [one.payload[:1] for one in found] == [b"\0", b"\1", b"\2", b"n"]
     assert [one.time_s for one in found[:3]] == pytest.approx([0.0, 1.0, 2.0])
     assert found[3].time_s == pytest.approx(3.0, abs=0.5)

@@ -10,8 +10,7 @@ from pyrcal.__main__ import main
 from pyrcal.offline.aot import affine
 from service.archive import Archive
 from service.errors import ConfigurationError
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind, Recording
+from service.files.recording import RecordedKind, Recording, RecordingWriter
 from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration
 from service.model.slopes import Orientation, SlopeOrder, SlopeRecipe, to_conventions

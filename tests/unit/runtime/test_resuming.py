@@ -8,9 +8,9 @@ from threadpoolctl import threadpool_limits
 from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
+from service.runtime.archiving import is_unsaved, is_urgent, leave, taken_up
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow
-from service.runtime.recording import is_unsaved, is_urgent, leave, taken_up
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev

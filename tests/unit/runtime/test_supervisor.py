@@ -14,8 +14,8 @@ import pytest
 from service.archive import AuditEntry, Range
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
+from service.runtime.archiving import Actor, Channel, taken_up
 from service.runtime.engine import follow_state
-from service.runtime.recording import Actor, Channel, taken_up
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -218,7 +218,7 @@ async def test_what_was_restored_is_on_record(supervisor, archive):
 async def test_it_is_saved_while_the_service_runs_and_not_only_at_its_end(
     supervisor, archive, monkeypatch
 ):
-    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 0.01)
+    monkeypatch.setattr("service.runtime.archiving.SAVE_INTERVAL_S", 0.01)
     async with running(supervisor):
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
         know(supervisor, registration=known)
@@ -229,7 +229,7 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
     supervisor, archive, monkeypatch
 ):
     """Five seconds later is too late for a service that is killed."""
-    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 1.0)
+    monkeypatch.setattr("service.runtime.archiving.SAVE_INTERVAL_S", 1.0)
     story = Acquiring()
     story.see(n_windows=3)
     async with running(supervisor):
@@ -245,7 +245,7 @@ async def test_an_acquisition_is_saved_at_once_and_not_when_alpha_next_would_be(
 async def test_an_order_is_on_the_disk_before_a_service_that_is_killed_could_forget_it(
     supervisor, archive, monkeypatch
 ):
-    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 1.0)
+    monkeypatch.setattr("service.runtime.archiving.SAVE_INTERVAL_S", 1.0)
     async with running(supervisor):
         known = told(Story(Mode.HOLD).meet(), n_windows=1)
         know(supervisor, registration=known)
@@ -403,7 +403,7 @@ def alarm_of(supervisor, name):
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr("service.runtime.recording.RETRY_S", 0.05)
+    monkeypatch.setattr("service.runtime.archiving.RETRY_S", 0.05)
 
 
 async def test_an_order_that_cannot_be_recorded_is_not_carried_out(supervisor, archive, impatient):
@@ -540,7 +540,7 @@ async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):
 async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
     supervisor, archive, monkeypatch, impatient
 ):
-    monkeypatch.setattr("service.runtime.recording.SAVE_INTERVAL_S", 0.01)
+    monkeypatch.setattr("service.runtime.archiving.SAVE_INTERVAL_S", 0.01)
     part = archive.directory / "tracking.part"
     async with running(supervisor):
         part.mkdir()

@@ -9,6 +9,7 @@ import pytest
 
 from service.errors import WorkerError
 from service.runtime import workers as crew_module
+from service.runtime.estimates import work_out
 from service.runtime.processes import Worker
 from service.runtime.worker import OpticsWorker, run_job, start_worker
 from service.runtime.workers import WorkerPool
@@ -156,36 +157,37 @@ def test_what_every_worker_must_be_told_is_told_to_one_that_takes_a_dead_ones_pl
 async def test_what_is_urgent_goes_first_and_what_waits_long_has_its_turn(workers, monkeypatch):
     order = []
 
-    async def job(name):
-        async with workers.turn(name):
-            order.append(name)
+    async def turn(job):
+        async with workers.turn(job):
+            order.append(job.__name__)
             await asyncio.sleep(0.05)
 
-    first = asyncio.create_task(job("describe"))
+    of = OpticsWorker
+    first = asyncio.create_task(turn(of.describe))
     await asyncio.sleep(0)
-    rest = [asyncio.create_task(job(name)) for name in ("margin", "watch", "make", "fit", "judge")]
-    await asyncio.gather(first, *rest)
-    assert order == ["describe", "fit", "judge", "make", "watch", "margin"]
+    jobs = (of.margin, of.fit_passive, of.make, work_out, of.fit, of.judge)
+    await asyncio.gather(first, *(asyncio.create_task(turn(job)) for job in jobs))
+    assert order == ["describe", "fit", "judge", "make", "work_out", "fit_passive", "margin"]
 
     order.clear()
-    monkeypatch.setitem(crew_module.PATIENCE_S, "watch", 0.1)
-    tasks = [asyncio.create_task(job("describe")), asyncio.create_task(job("watch"))]
+    monkeypatch.setattr(of.fit_passive, "patience_s", 0.1)
+    tasks = [asyncio.create_task(turn(of.describe)), asyncio.create_task(turn(of.fit_passive))]
     for _ in range(8):  # more windows than a look has patience for
         await asyncio.sleep(0.03)
-        tasks.append(asyncio.create_task(job("fit")))
+        tasks.append(asyncio.create_task(turn(of.fit)))
     await asyncio.gather(*tasks)
-    assert order.index("watch") < 5
+    assert order.index("fit_passive") < 5
 
 
 async def test_within_a_turn_calls_are_done_at_once(shared):
-    async with shared.turn("fit"):
+    async with shared.turn(OpticsWorker.fit):
         assert await shared.call(process_id)
     async with asyncio.timeout(5.0):
         assert await shared.call(process_id)
 
 
 async def test_a_turn_nobody_takes_any_more_is_passed_on(shared):
-    async with shared.turn("fit"):
+    async with shared.turn(OpticsWorker.fit):
         waiting = asyncio.create_task(shared.call(process_id))
         await asyncio.sleep(0)
         waiting.cancel()

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from pyrcal.client.remote import REQUESTS
+from service.config import load_settings
+from service.config.policy import policy_of
 from service.control.gate import GateVerdict
 from service.errors import CommandError
 from service.estimation.lockin import LockInEstimate
@@ -14,7 +16,6 @@ from service.tracking import events as ev
 from service.tracking.dither_request import Dither
 from service.tracking.loop import commanded_gains
 from service.tracking.mode_limits import ModeProof
-from service.tracking.policy import Policy
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.state import Mode
 from service.tracking.step_context import StepContext
@@ -37,7 +38,10 @@ SECOND = 1_000_000_000
 START_NS = 1_800_000_000 * SECOND
 N_MODES = 594
 PRECISE = np.diag([0.002, 0.002, 5e-5, 2e-4]) ** 2
-POLICY = Policy(
+POLICY = replace(
+    policy_of(load_settings(None, {})),
+    acquires=False,
+    flexure_per_degree=np.zeros(4),
     drift_rate=np.array([0.006, 0.006, 1e-4, 6e-5]),
     floor=np.array([0.003, 0.003, 9e-5, 3e-4]),
     update_threshold=np.array([0.01, 0.01, np.deg2rad(0.02), 0.001]),

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.archive.records import TrackingFile
+from service.archive.serialisation import TrackingFile
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.archive.records import TrackingFile
+from service.archive.serialisation import TrackingFile
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.recording import is_urgent
+from service.runtime.archiving import is_urgent
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.policy import Offloading

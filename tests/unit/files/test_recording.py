@@ -7,15 +7,13 @@ import h5py
 import pytest
 
 from service.errors import ConfigurationError
-from service.files.recorder import RecordingWriter
-from service.files.recording import RecordedKind, Recording
+from service.files.recording import RecordedKind, Recording, RecordingWriter
 from tests.system.pace import in_time
 
 WRITER = """
 import sys, time
 from pathlib import Path
-from service.files.recording import RecordedKind
-from service.files.recorder import RecordingWriter
+from service.files.recording import RecordedKind, RecordingWriter
 with RecordingWriter(Path(sys.argv[1]), system="small") as recorder:
     for number in range(10**6):
         recorder.put(RecordedKind.FRAMES, number.to_bytes(8, "little") * 1000, b"header")

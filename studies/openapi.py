@@ -1,4 +1,7 @@
-"""The OpenAPI document's schemas of all views, from the records' own types and descriptions."""
+"""What REST answers, as OpenAPI has it: of the routes, and of what records say of themselves.
+
+The service hands out the file that is written here; it reads none of its own source.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +19,124 @@ from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from fastapi import FastAPI
+from fastapi.routing import APIRoute, iter_route_contexts
+from pydantic import TypeAdapter
 
+from service.api import create_app
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.web.views import NAMED_VIEWS, USUAL_VIEWS, View
+from service.runtime import telemetry_recorder
+from service.tracking import commands
+from service.web import numbers, problems
+from service.web.authentication import OPEN, SCHEMES, needs, scope_of
+from service.web.commands import JSON, Body
+from service.web.unchanged import NOT_MODIFIED
+from service.web.views import NAMED_VIEWS, SCHEMAS, USUAL_VIEWS, View
 
 Schema = dict[str, Any]
 """A JSON schema."""
 
 
-def shows(of: View) -> dict[str, Any]:
-    """Return the OpenAPI description of an answer that shows a record."""
-    schema = {"$ref": f"{SCHEMAS}{of.name}"}
-    content = {"application/json": {"schema": schema}}
-    return {"description": _for_readers(of.text), "content": content}
+def document() -> dict[str, Any]:
+    """Return what REST answers, with the desk for fits."""
+    nobody: Any = object()  # neither is asked anything
+    app = create_app(nobody, nobody)
+    found = app.openapi()
+    known = found["components"]["schemas"]
+    known |= {"Problem": problems.Problem.model_json_schema()} | _views()
+    _put_beside_the_four(known["FitDocument"])
+    _tell_bodies(app, found)
+    found["components"]["securitySchemes"] = SCHEMES
+    _tell_scopes(app, found)
+    for operations in found["paths"].values():
+        for method, operation in operations.items():
+            _tell_operation(method, operation, known)
+    return found
 
 
-def schemas() -> dict[str, Schema]:
+def _tell_bodies(app: FastAPI, document: dict[str, Any]) -> None:
+    """Say of each operation what it reads."""
+    read = {
+        f"{method.lower()} {route.path_format}": found.call
+        for route in iter_route_contexts(app.routes)
+        if isinstance(route.original_route, APIRoute)
+        for found in route.dependant.dependencies
+        for method in route.methods or ()
+        if isinstance(found.call, Body)
+    }
+    bodies, schemas = _bodies(read)
+    for operation, body in bodies.items():
+        method, _, path = operation.partition(" ")
+        document["paths"][path][method]["requestBody"] = body
+    document["components"]["schemas"] |= schemas
+
+
+def _tell_scopes(app: FastAPI, document: dict[str, Any]) -> None:
+    """Say of each operation which key it needs."""
+    for route in iter_route_contexts(app.routes):
+        for method in route.methods or () if route.path_format in document["paths"] else ():
+            scope = scope_of(route, method)
+            security = OPEN if scope is None else needs(scope)
+            document["paths"][route.path_format][method.lower()] |= security
+
+
+def _tell_operation(method: str, operation: dict[str, Any], known: dict[str, Any]) -> None:
+    """Say in one line what an operation does, what its answers are, and which are not sent again.
+
+    FastAPI's own summary is the name of a function.
+    """
+    first, _, rest = operation["description"].partition("\n\n")
+    operation["summary"] = " ".join(first.split()).rstrip(".")
+    operation["description"] = rest or first
+    answers = operation["responses"]
+    for found in answers.values():
+        contents = found.get("content", {}).values()
+        names = [one["schema"].get("$ref", "").rpartition("/")[2] for one in contents]
+        if found["description"] == "Successful Response":
+            told = known.get(names[0], {}) if names else {}
+            found["description"] = told.get("description", "Done").partition("\n\n")[0]
+        if any(name.endswith("AcceptedView") for name in names):
+            found["headers"] = {"Location": _LOCATION}
+    kept = answers.get("200", {}).get("content", {}).keys()
+    if method == "get" and kept & _HAVE_TAGS:
+        answers["304"] = NOT_MODIFIED
+
+
+_HAVE_TAGS = {"application/json", *numbers.MEDIA_TYPES.values()}
+"""Kinds of answers with an ETag."""
+
+_LOCATION = {
+    "description": "Where to look for what was begun",
+    "schema": {"type": "string", "format": "uri-reference"},
+}
+
+
+def _bodies(by_operation: Mapping[str, Body]) -> tuple[dict[str, Schema], dict[str, Schema]]:
+    """Return request bodies by operation, and the schemas of all that they hold by name."""
+    found, document = TypeAdapter.json_schemas(
+        [(name, "validation", body.adapter) for name, body in by_operation.items()],
+        ref_template=f"{SCHEMAS}{{model}}",
+    )
+    requests = {
+        name: {
+            "content": {JSON: {"schema": found[name, "validation"]}},
+            "required": body.required,
+        }
+        for name, body in by_operation.items()
+    }
+    schemas: dict[str, Schema] = document.get("$defs", {})
+    records = vars(commands) | vars(telemetry_recorder)
+    for name, schema in schemas.items():
+        texts = _explained(records[name]) if "properties" in schema else {}
+        if "action" in schema.get("properties", ()):  # what tells alternatives apart
+            schema["required"] = [*schema.get("required", ()), "action"]
+        for field, text in texts.items():
+            if field in schema["properties"]:
+                schema["properties"][field]["description"] = text
+    return requests, schemas
+
+
+def _views() -> dict[str, Schema]:
     """Return the schemas of all views, and of what they hold, by name."""
     found: dict[str, Schema] = {"FourView": _FOUR}
     for of in NAMED_VIEWS.values():
@@ -52,7 +157,6 @@ def schemas() -> dict[str, Schema]:
     return found
 
 
-SCHEMAS = "#/components/schemas/"
 _NUMBER: Schema = {"anyOf": [{"type": "number"}, {"type": "null"}]}
 _CLOCK: Schema = {"anyOf": [{"type": "string", "format": "date-time"}, {"type": "null"}]}
 _OF_KIND: dict[object, Schema] = {
@@ -74,7 +178,7 @@ _FOUR: Schema = {
 }
 
 
-def beside_the_four(schema: Schema) -> None:
+def _put_beside_the_four(schema: Schema) -> None:
     """Add the four parameters of a registration to the keys they lie beside."""
     four = _FOUR["properties"].items()
     titled = {name: {**said, "title": name.replace("_", " ").title()} for name, said in four}
@@ -148,7 +252,7 @@ def _statements(record: type) -> Iterator[ast.stmt]:
         yield from tree.body if isinstance(tree, ast.ClassDef) else ()
 
 
-def explained(record: type) -> dict[str, str]:
+def _explained(record: type) -> dict[str, str]:
     """Return what a record says of its fields, by name."""
     return {name: _for_readers(text) for name, text in _facts(record)[1].items()}
 

@@ -54,7 +54,6 @@ dropped."""
 BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 """What is not done unless why it is done is on the disk. What ends something never waits."""
 
-
 _LOGGED = ("who", "text", "address", "channel", "why", "answer")
 """What the log tells of an order."""
 
@@ -108,7 +107,7 @@ class Actor:
         )
 
 
-class Recorder:
+class ArchiveWriter:
     """Writes reconstructors' records, the audit trail and what the next service needs.
 
     Belongs to the event loop; the disk is waited for in threads. What cannot be written waits and

@@ -6,8 +6,8 @@ import threading
 import pytest
 
 from service.errors import StorageError
-from service.runtime import recording
-from service.runtime.recording import Recorder
+from service.runtime import archiving
+from service.runtime.archiving import ArchiveWriter
 from service.tracking import events as ev
 from service.tracking.registration import OffloadState
 from service.tracking.state import Level, LogEntry, TrackerState
@@ -22,7 +22,7 @@ EMPTY = TrackerState(system="small")
 
 @pytest.fixture
 def recorder(archive):
-    return Recorder(archive, lambda: EMPTY, lambda event: None)
+    return ArchiveWriter(archive, lambda: EMPTY, lambda event: None)
 
 
 def measured(recorder, first, last):
@@ -74,7 +74,7 @@ async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
     def refuse(*_):
         raise StorageError("full")
 
-    monkeypatch.setattr(recording, "MAX_WAITING", 3)
+    monkeypatch.setattr(archiving, "MAX_WAITING", 3)
     with monkeypatch.context() as patch:
         patch.setattr(archive, "record", refuse)
         measured(recorder, 0, 5)
@@ -92,7 +92,7 @@ class TestDemandToMoveTheImage:
 
     async def test_it_is_on_the_disk_before_it_is_asked(self, archive):
         story = a_story()
-        recorder = Recorder(archive, lambda: story.state, lambda event: None)
+        recorder = ArchiveWriter(archive, lambda: story.state, lambda event: None)
         (asked,) = story.asked(OffloadRequest)
         await recorder.before(ev.Ask(request=asked))
         move = archive.tracking.read().offload
@@ -103,7 +103,7 @@ class TestDemandToMoveTheImage:
             raise StorageError("full")
 
         story = a_story()
-        recorder = Recorder(archive, lambda: story.state, lambda event: None)
+        recorder = ArchiveWriter(archive, lambda: story.state, lambda event: None)
         (asked,) = story.asked(OffloadRequest)
         monkeypatch.setattr(archive.tracking, "write", refuse)
         with pytest.raises(StorageError):
@@ -121,8 +121,8 @@ class TestDemandToMoveTheImage:
                 assert go_on.wait(patience(20.0))
             written.append(state.alpha.offload)
 
-        monkeypatch.setattr(recording, "leave", slowly)
-        recorder = Recorder(archive, lambda: states[0], lambda event: None)
+        monkeypatch.setattr(archiving, "leave", slowly)
+        recorder = ArchiveWriter(archive, lambda: states[0], lambda event: None)
         first = asyncio.create_task(recorder.keep_orders())
         await asyncio.to_thread(writing.wait, patience(20.0))
         del states[0]

@@ -22,7 +22,7 @@ from service.archive import Archive, AuditEntry
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError
-from service.runtime.command_results import Order
+from service.runtime.command_results import GivenCommand
 from service.tracking import events as ev
 from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
 from service.tracking.commands import Command
@@ -181,7 +181,7 @@ class ArchiveWriter:
                 )
             )
 
-    async def ordered(self, order: Order, actor: Actor) -> None:
+    async def ordered(self, order: GivenCommand, actor: Actor) -> None:
         """Write down what an operator asks for, before it is done.
 
         Raises
@@ -192,15 +192,15 @@ class ArchiveWriter:
         self._order(order, actor)
         await self.flush()
 
-    def answered(self, order: Order, actor: Actor, answer: str) -> None:
+    def answered(self, order: GivenCommand, actor: Actor, answer: str) -> None:
         """Take down what an order has led to, as its giver was told."""
         self._order(order, actor, ".answered", answer)
 
-    def refused(self, order: Order, actor: Actor, error: Exception) -> None:
+    def refused(self, order: GivenCommand, actor: Actor, error: Exception) -> None:
         """Take down why an operator does not get what was asked for."""
         self._order(order, actor, ".refused", str(error))
 
-    def _order(self, order: Order, actor: Actor, end: str = "", answer: str = "") -> None:
+    def _order(self, order: GivenCommand, actor: Actor, end: str = "", answer: str = "") -> None:
         command = order.command
         entry = actor.entry(
             f"{type(command).__name__}{end}",

@@ -36,7 +36,7 @@ class CommandResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class GivenCommand:
     """A command that was given."""
 
     command: Command
@@ -77,9 +77,9 @@ def _republished(
     copy = copies[-1]
     if copy.state is MatrixState.REFUSED and isinstance(command, cmd.Rollback):
         raise CommandError(f"{_why_not(copy)}; ordered with anyway, it goes out all the same")
-    told = _of_matrix(now, copy.id)
-    text = f"{told.text}; it is {copy.parent} again; mode is {now.operator.mode}"
-    return CommandResult(text, told.final)
+    sent = _of_matrix(now, copy.id)
+    text = f"{sent.text}; it is {copy.parent} again; mode is {now.operator.mode}"
+    return CommandResult(text, sent.final)
 
 
 def _of_matrix(now: TrackerState, name: str) -> CommandResult:
@@ -171,8 +171,8 @@ def _no_dither(_: cmd.StopDither, __: str, now: TrackerState) -> CommandResult:
     off = "no dither is started until one is asked for"
     if playing is None:
         return CommandResult(f"no dither plays; {off}")
-    told = f"the RTC was told to stop {playing}, its status still shows it"
-    return CommandResult(f"{told}; {off}", final=False)
+    asked = f"the RTC was told to stop {playing}, its status still shows it"
+    return CommandResult(f"{asked}; {off}", final=False)
 
 
 _TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]] = {

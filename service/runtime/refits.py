@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -58,10 +59,11 @@ class Refits:
         """The job that began last; there must have been one."""
         return next(reversed(self._jobs.values()))
 
-    def begin(self, effect: ev.MakeMatrix, now_ns: int) -> None:
+    def begin(self, effects: Iterable[Effect], now_ns: int) -> None:
         """Remember a job from the moment its computation begins; its id is the order's."""
-        self._jobs[effect.cause] = RefitJob(
-            id=effect.cause, state=RefitState.RUNNING, n_modes=effect.n_modes, asked_ns_utc=now_ns
+        (made,) = (effect for effect in effects if isinstance(effect, ev.MakeMatrix))
+        self._jobs[made.cause] = RefitJob(
+            id=made.cause, state=RefitState.RUNNING, n_modes=made.n_modes, asked_ns_utc=now_ns
         )
         while len(self._jobs) > REFITS_KEPT:
             del self._jobs[next(iter(self._jobs))]

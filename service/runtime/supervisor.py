@@ -27,7 +27,7 @@ from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
 from service.runtime.archiving import Actor, ArchiveWriter, ids_of
 from service.runtime.clock import ServiceClock
-from service.runtime.command_results import Order
+from service.runtime.command_results import GivenCommand
 from service.runtime.engine import Engine, process_blocks
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Window
@@ -184,12 +184,10 @@ class Supervisor:
         StorageError
             If it cannot be recorded; nothing has been done.
         """
-        now_ns = self._clock.now_ns()
-        order = Order(command, ev.new_id(ev.kebab(type(command)), now_ns))
-        told = isinstance(command, cmd.SetValue) and not changes_value(
-            self._engine.state, command, now_ns
-        )
-        if told or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
+        state, now_ns = self._engine.state, self._clock.now_ns()
+        order = GivenCommand(command, ev.new_id(ev.kebab(type(command)), now_ns))
+        again = isinstance(command, cmd.SetValue) and not changes_value(state, command, now_ns)
+        if again or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
             return await self._result_of(order)
         try:
             await self._writer.ordered(order, actor)
@@ -208,12 +206,12 @@ class Supervisor:
             await self._writer.keep_orders()
         return answer
 
-    async def _result_of(self, order: Order) -> str:
+    async def _result_of(self, order: GivenCommand) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
-        for effect in self._post(order.command, order.id):
-            if isinstance(order.command, cmd.Refit) and isinstance(effect, ev.MakeMatrix):
-                self.refits.begin(effect, self._clock.now_ns())
+        effects = self._post(order.command, order.id)
+        if isinstance(order.command, cmd.Refit):
+            self.refits.begin(effects, self._clock.now_ns())
         asked = self._running - running
         if asked and isinstance(order.command, cmd.Measure | cmd.SetLoop | cmd.Ramp):
             await asyncio.wait(asked)

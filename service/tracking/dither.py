@@ -454,8 +454,7 @@ def _lose(context: StepContext, dither: Dither, text: str) -> None:
     context.raise_alarm(alarms.DITHER_LOST, text)
     context.warn("dither.lost", text)
     context.dither = None
-    losses = context.dithers.losses + 1
-    context.dithers = replace(context.dithers, lost=dither.id, losses=losses)
+    context.dithers = replace(context.dithers, lost=dither.id, losses=context.dithers.losses + 1)
 
 
 def _patience_s(state: TrackerState) -> float:
@@ -493,8 +492,7 @@ def _blame(context: StepContext, running: str, loud: str) -> None:
 def _forgive(context: StepContext, rtc: Status) -> None:
     """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
     own = context.dither
-    by_frames = bool(context.dither_policy.loud_text)
-    fine = not by_frames and own is not None and rtc.dither_id == own.id
+    fine = own is not None and rtc.dither_id == own.id and not context.dither_policy.loud_text
     given_up = context.dithers.stopped or not context.policy.dither_enabled
     if given_up:
         context.clear_alarm(alarms.NOT_AS_ASKED)

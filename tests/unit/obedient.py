@@ -40,5 +40,5 @@ class Obedient:
         self.commands.append(command)
         if isinstance(command, Refit):
             effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause="refit-1")
-            self.refits.begin(effect, self.now_ns)
+            self.refits.begin([effect], self.now_ns)
         return f"{type(command).__name__}: 1 action(s) under way"

@@ -235,7 +235,7 @@ class FakeService:
         self.callers.append(caller)
         if isinstance(command, Refit):
             effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause="refit-1")
-            self.refits.begin(effect, self.now.now_ns)
+            self.refits.begin([effect], self.now.now_ns)
         return f"{type(command).__name__} is on its way"
 
     def audit(self, entry):

@@ -126,7 +126,7 @@ MADE = ReconstructorRecord(
 )
 async def test_how_a_refit_ends_is_kept(client, service, event, state, made, reason):
     effect = ev.MakeMatrix(n_modes=300, why="", cause="refit-1")
-    service.refits.begin(effect, SECOND)
+    service.refits.begin([effect], SECOND)
     service.refits.end(ev.MakeMatrix(n_modes=300, why="", cause="refit-2"), None)
     service.refits.end(ev.JudgeMatrix(id="cm-1", cause="refit-1"), None)  # what else it led to
     service.refits.end(effect, event)

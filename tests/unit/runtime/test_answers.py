@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError, LinkError
-from service.runtime.command_results import Order
+from service.runtime.command_results import GivenCommand
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import MatrixState
@@ -24,7 +24,7 @@ from tests.unit.tracking.situations import acknowledged, record, verdict
 
 
 def given(world, command):
-    order = Order(command, "order-1")
+    order = GivenCommand(command, "order-1")
     world.tell(command, cause=order.id)
     return order
 
@@ -73,7 +73,7 @@ SILENT = "sent, the RTC has not answered yet"
 def test_an_approval_tells_the_frame():
     world = sending()
     name = world.state.matrices.reconstructors[-1].id
-    order = Order(cmd.Approve(id=name), "order-1")
+    order = GivenCommand(cmd.Approve(id=name), "order-1")
     first, last = answered_in_the_end(world, order)
     assert first == (f"{name} {SILENT}", False)
     frame = world.state.reconstructor(name).applied_frame_seq
@@ -137,7 +137,7 @@ def test_a_copy_that_cannot_be_made_is_refused_with_the_reason():
 def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
     world = sending()
     name = world.state.matrices.reconstructors[-1].id
-    order = Order(cmd.Approve(id=name), "order-1")
+    order = GivenCommand(cmd.Approve(id=name), "order-1")
     world.pending.clear()
     if state is None:
         world.pass_(6.0)
@@ -150,7 +150,7 @@ def test_what_the_rtc_does_not_apply_is_a_refusal(state, kind, words):
 def test_what_the_gate_refuses_at_the_last_moment_is_a_refusal():
     world = sending()
     record = world.state.matrices.reconstructors[-1]
-    order = Order(cmd.Approve(id=record.id), "order-1")
+    order = GivenCommand(cmd.Approve(id=record.id), "order-1")
     refused = MatrixState.REFUSED
     reason = verdict(accepted=False).reason
     refused_record = replace(record, state=refused, reason=reason)

@@ -27,6 +27,7 @@ from service.tracking import events as ev
 from service.tracking.alarms import ARCHIVE_FAILED, DISK_LOW
 from service.tracking.commands import Command
 from service.tracking.events import Effect
+from service.tracking.mode_proof import proof_to_keep
 from service.tracking.policy import Policy
 from service.tracking.products import ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -474,9 +475,12 @@ def is_urgent(before: TrackerState, after: TrackerState) -> bool:
     """Return whether what is not saved yet cannot wait: whose the RTC's open loop is, and orders.
 
     A service killed a second later would leave its own loop open to one that cannot know, or one
-    that undoes what an operator has ordered; or would not know where the mirror's image was moved.
+    that undoes what an operator has ordered; or would not know where the mirror's image was moved,
+    or which modes have answered otherwise than they should.
     """
     if before.alpha.offload is not after.alpha.offload:
+        return True
+    if proof_to_keep(before) != proof_to_keep(after):
         return True
     return orders_of(before) != orders_of(after) or _course(before) != _course(after)
 

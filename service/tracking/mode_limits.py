@@ -72,6 +72,9 @@ class ModeProof:
     n_tries: int = 0
     """How often in a row that has told nothing of any of them."""
 
+    session: str = ""
+    """Session of the RTC in which the service before this one has seen it; empty: this one has."""
+
     own_response_ratio: float | None = None
     """Median over its modes of the response that the RTC's own matrix tells, over the drawing's;
     None: no matrix has told."""

@@ -265,6 +265,46 @@ def recognise(context: StepContext, event: ev.ModesRecognised) -> None:
     _tell_uneven(context, before)
 
 
+def proof_to_keep(state: TrackerState) -> ModeProof | None:
+    """Return what the next service should know of modes; None: nothing has been seen.
+
+    Whom the matrix in use disproves is accused no more: the next service does not know that matrix
+    at first.
+    """
+    proof, known = state.matrices.mode_proof, proven_modes(state)
+    kept = replace(
+        proof,
+        contrary=shunned_modes(state),
+        suspected=proof.suspected - known,
+        shown=frozenset(),
+        shown_ns_utc=0,
+        n_tries=0,
+    )
+    return None if kept == ModeProof() else kept
+
+
+def restore(context: StepContext, proof: ModeProof, session: str) -> None:
+    """Hold what the service before this one has seen of modes, until the RTC says who it is."""
+    restored = replace(proof, session=session)
+    context.matrices = replace(context.matrices, mode_proof=restored)
+
+
+def take_over(context: StepContext, rtc: Status) -> None:
+    """Believe what the service before has seen of this RTC in this session; forget it of others."""
+    proof = context.matrices.mode_proof
+    if not proof.session:
+        return
+    same = proof.session == rtc.session and context.registration is not None
+    now = replace(proof, session="") if same else ModeProof()
+    context.matrices = replace(context.matrices, mode_proof=now)
+    if not same:
+        context.log("modes.not-restored", "the RTC is not the one whose modes were seen")
+        return
+    context.log("modes.restored", f"{now.n_proven} modes were seen before the restart")
+    _report_answers(context, rtc, now.contrary)
+    _tell_uneven(context, ModeProof())
+
+
 def _classify(
     gains: NDArray[np.float64], size: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

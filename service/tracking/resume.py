@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.tracking import commands as cmd
-from service.tracking import dither, offload
+from service.tracking import dither, mode_proof, offload
 from service.tracking.alarm_records import take_over
 from service.tracking.alarms import STOPPED, Interlock
 from service.tracking.operations.acquisition import inherit, left_behind
@@ -147,6 +147,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         acquisition=acquisition,
         orders=None if orders == Orders() else orders,
         offload=state.alpha.offload,
+        mode_proof=None if registration is None else mode_proof.proof_to_keep(state),
     )
 
 
@@ -193,6 +194,8 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
         context.log("registration.restored", text)
         age(context)
+    if saved.mode_proof is not None and saved.session is not None:
+        mode_proof.restore(context, saved.mode_proof, saved.session)
 
 
 def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:

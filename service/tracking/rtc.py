@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.tracking import alarms, dither, reconstructors, validity
+from service.tracking import alarms, dither, mode_proof, reconstructors, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import Effect
@@ -72,6 +72,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
     )
     validity.point(context, rtc.pointing)
     _drop_other_basis(context)
+    mode_proof.take_over(context, rtc)
     _tell_of_gains(context, before, rtc)
     if rtc.cm_id is not None:
         reconstructors.use_named(context, rtc.cm_id)

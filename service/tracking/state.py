@@ -417,6 +417,9 @@ class Saved:
     offload: Offload | None = None
     """The last demand to move the mirror's image, with all before it; None: there was none."""
 
+    mode_proof: ModeProof | None = None
+    """Which modes have shown how they answer, in ``session``; None: none has."""
+
     @property
     def tells_of_alpha(self) -> bool:
         """Whether it says what α was, or why it is not known."""

@@ -12,6 +12,7 @@ from service.archive.serialisation import TrackingFile
 from service.errors import ArchiveError
 from service.tracking import commands as cmd
 from service.tracking.loop import loop_numbers
+from service.tracking.mode_limits import ModeAnswer, ModeProof
 from service.tracking.registration import Registration
 from service.tracking.resume import saved_of
 from service.tracking.state import Mode, Orders
@@ -89,6 +90,18 @@ def test_what_is_read_is_what_was_written_but_for_what_depends_on_the_time(file,
     assert same(found, expected)
     assert found.registration.bias is not None
     assert len(found.registration.optical_gains) == 4
+
+
+def test_what_modes_have_shown_is_read_as_it_was_written(file, saved):
+    proof = ModeProof(
+        proven=frozenset(range(400)),
+        suspected=frozenset({430}),
+        answers=(ModeAnswer(mode=430, gain=-0.6, like=77),),
+        own_uneven="by the RTC's own matrix mode 3 2.1 times as strongly as its neighbours",
+        own_response_ratio=0.7,
+    )
+    file.write(replace(saved, mode_proof=proof))
+    assert file.read().mode_proof == proof
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition_state import AcquisitionStage
+from service.tracking.mode_limits import ModeProof
 from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
 from studies.campaign.acquisition import Start
@@ -59,6 +60,15 @@ class TestWhatCannotWait:
         story.see()
         assert is_unsaved(before, story.state)
         assert not is_urgent(before, story.state)
+
+    def test_what_a_mode_has_shown(self):
+        story = Acquiring()
+        story.see()
+        before = changed(story.state, mode_proof=ModeProof())
+        shown = changed(before, mode_proof=ModeProof(suspected=frozenset({430})))
+        assert is_urgent(before, shown)
+        asked = changed(before, mode_proof=ModeProof(shown=frozenset({430})))
+        assert not is_urgent(before, asked)
 
     def test_nothing_new_is_no_news(self):
         story = Acquiring()

@@ -13,10 +13,11 @@ from service.tracking.dither_modes import PROVING_RANGE
 from service.tracking.mode_limits import ModeProof
 from service.tracking.mode_proof import TRIES, n_proven_modes, proven_modes
 from service.tracking.products import MatrixState
+from service.tracking.resume import restored, resumed, saved_of
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from tests.states import changed
-from tests.unit.tracking.situations import N_MODES, POLICY, estimate, foreign, of_kind
+from tests.states import changed, tracker_state
+from tests.unit.tracking.situations import N_MODES, POLICY, SECOND, estimate, foreign, of_kind
 from tests.unit.tracking.world import STEP_S, WINDOW_S, World
 
 TARGET = replace(POLICY, n_modes_target=450)
@@ -310,3 +311,61 @@ def test_a_mode_that_answers_otherwise_is_dithered_no_more_and_its_window_tells_
     assert any("mode 470 has not answered" in text for text in refused)
     assert alarms.WINDOWS_REFUSED not in world.alarms
     assert alarms.SUSPECTED not in world.alarms
+
+
+def killed(world, session=None):
+    """The service is killed and begun again three seconds later; the RTC goes on, or is another."""
+    saved = saved_of(world.state, world.now_ns)
+    world.now_ns += 3 * SECOND
+    records = restored(world.state.matrices.reconstructors)
+    fresh = tracker_state(system="flao", mode=Mode.AUTO, reconstructors=records)
+    world.state = resumed(fresh, saved, world.policy, world.now_ns)
+    world.session = session or world.session
+    World.tell(world, ev.SessionStarted(session=f"s{world.session}"))
+    world.tell(world.status())
+    return world
+
+
+def test_what_modes_have_shown_outlives_the_service():
+    world = Shown().pass_(8.0)
+    for _ in range(2):
+        told(world, [0.6] * 5 + [1.1] + [0.6] * 5 + [-0.6])
+    before = world.state.matrices.mode_proof
+    assert 415 in before.proven
+    killed(world)
+    assert world.state.matrices.mode_proof.proven == before.proven
+    text = world.state.alarm(alarms.MODES_CONTRARY).text
+    assert text.startswith("mode 421 has not answered")
+    assert "(-0.60 times the model)" in text
+    assert "mode 415 answers" in world.state.alarm(alarms.MODES_UNEVEN).text
+    assert world.state.matrices.mode_limit.n_modes == 421
+
+
+def test_of_another_session_nothing_is_taken_over():
+    """The RTC has begun anew meanwhile: its modes may be others."""
+    world = killed(Shown({430: -0.6}).pass_(60.0), session=2)
+    assert world.state.matrices.mode_proof == ModeProof()
+    assert alarms.MODES_CONTRARY not in world.alarms
+
+
+def test_of_another_basis_nothing_is_taken_over():
+    world = Shown({430: -0.6}).pass_(60.0)
+    world.changes = {"basis_id": "kl-300"}
+    assert killed(world).state.matrices.mode_proof == ModeProof()
+
+
+def test_a_window_before_a_restart_and_one_after_it_are_two():
+    world = Shown().pass_(8.0)
+    told(world, [-0.6] + [0.6] * 11)
+    assert not world.state.matrices.mode_proof.contrary
+    told(killed(world), [-0.6] + [0.6] * 11)
+    assert world.state.matrices.mode_proof.contrary == {410}
+
+
+def test_a_mode_that_the_loop_runs_with_is_not_accused_after_a_restart():
+    world = Shown().pass_(60.0)
+    for _ in range(2):
+        told(world, [-0.6] + [0.6] * 11)
+    assert world.state.loop.rtc.n_controlled == 450
+    assert alarms.MODES_CONTRARY not in killed(world).alarms
+    assert alarms.MODES_CONTRARY not in world.pass_(2.0).alarms

@@ -3,49 +3,38 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import socket
-from collections.abc import Iterator
 from functools import cache
 
 import structlog
-import uvicorn
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
-from typing_extensions import override
 
 from service import __version__
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 from service.web import (
     archive,
+    authentication,
     commands,
     fits,
     health,
+    history,
     matrices,
-    notes,
     numbers,
     page,
     problems,
     reading,
-    recordings,
-    refits,
-    session,
     stream,
-    trends,
 )
 from service.web.authentication import Authentication, Hosts
-from service.web.connections import Idempotency, RequestId, server_config
+from service.web.connections import Idempotency, RequestId, Server, Unchanged
 from service.web.keys import KeyFile
-from service.web.unchanged import Unchanged
 
 REQUESTS_WITHIN_S = 2
 """Requests under way when the service is asked to stop may take this long: an upload would take
 longer."""
-
-TICK_S = 0.9
-"""From one look of the server's whether it is over to the next, besides uvicorn's own 0.1 s."""
 
 _DESCRIPTION = """
 Calibration service of an adaptive telescope with a pyramid wavefront sensor.
@@ -68,29 +57,9 @@ async def answer(
     """Answer requests under these ``names`` until it is ``over``."""
     host, port = listener.getsockname()[:2]
     app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names), keys=keys, over=over)
-    server = _Server(server_config(app, timeout_graceful_shutdown=REQUESTS_WITHIN_S))
-    server.over = over
+    server = Server(app, over, within_s=REQUESTS_WITHIN_S)
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
     await server.serve(sockets=[listener])
-
-
-class _Server(uvicorn.Server):
-    """A uvicorn that leaves signals alone: it would raise them again before all is closed."""
-
-    over: asyncio.Event
-
-    @override
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
-
-    @override
-    async def on_tick(self, counter: int) -> bool:
-        over = await super().on_tick(0)  # the date of answers is told anew
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(TICK_S):
-                await self.over.wait()
-        return over or self.over.is_set()
 
 
 def create_app(
@@ -125,6 +94,7 @@ def create_app(
     app.add_middleware(RequestId)
     app.state.service = service
     app.state.keys = keys
+    app.state.bodies = set()
     app.state.slopes = numbers.SlopesCache()
     app.state.stream = stream.Stream(service, over or asyncio.Event())
     problems.install(app)
@@ -142,18 +112,17 @@ def _routes(*, with_fits: bool) -> list[BaseRoute]:
         reading.router,
         numbers.router,
         archive.router,
-        recordings.router,
-        trends.router,
-        notes.router,
+        history.router,
+        history.notes,
         stream.router,
         page.router,
-        refits.router,
+        matrices.refits,
         commands.router,
         commands.observatory,
         matrices.router,
         matrices.noisy,
         health.router,
-        session.router,
+        authentication.router,
     ]
     for router in [*routers, fits.router] if with_fits else routers:
         shared.include_router(router)

@@ -30,7 +30,7 @@ from service.tracking import commands
 from service.web import numbers, problems
 from service.web.authentication import OPEN, SCHEMES, needs, scope_of
 from service.web.commands import JSON, Body
-from service.web.unchanged import NOT_MODIFIED
+from service.web.connections import NOT_MODIFIED
 from service.web.views import NAMED_VIEWS, SCHEMAS, USUAL_VIEWS, View
 
 Schema = dict[str, Any]

@@ -7,40 +7,34 @@ asked needs a key of the scope its route has, once there are keys.
 
 from __future__ import annotations
 
-import asyncio
-import math
 import re
 import time
-from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from ipaddress import ip_address, ip_network
+from ipaddress import ip_address
+from typing import Annotated
 
 import structlog
-from fastapi import Request
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from typing_extensions import override
 
 from service.archive import AuditEntry
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, UnknownIdError
 from service.runtime.archiving import Actor, Channel
 from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
-from service.web.problems import problem
+from service.web.problems import INVALID, UNKNOWN, problem
+from service.web.views import answer, define_view, shows
 
 COOKIE = "pyrcal_key"
 """Under which a browser keeps the key."""
 
-MOST_FAILURES, FAILURES_WITHIN_S = 10, 60.0
-"""Wrong keys that an address may show within so many seconds: the next are answered 429."""
-
-MAX_ADDRESSES = 1000
-"""Whose failures are remembered; the oldest go first."""
-
 MOST_TOLD, TOLD_WITHIN_S = 20, 60.0
-"""Refusals that are told one by one within so many seconds; the others are counted."""
+"""Refusals that are told one by one within so many seconds; the others are only counted."""
 
 _READS = {"GET", "HEAD", "OPTIONS"}
 
@@ -130,40 +124,8 @@ class Refusal:
     """Name of the key that was shown, where there is such a key."""
 
 
-class Failures:
-    """Wrong keys by the address that has shown them.
-
-    A right one is never refused for what others at its address do: what has 256 bits cannot be
-    guessed, and an operator must not be locked out by a forgotten program.
-    """
-
-    def __init__(self) -> None:
-        self._of: OrderedDict[str, tuple[float, int]] = OrderedDict()
-
-    def count(self, address: str) -> int:
-        """Count one more; return after how many seconds the address may try again, 0: at once."""
-        now_s, house = time.monotonic(), _house(address)
-        since_s, n_before = self._of.pop(house, (now_s, 0))
-        if now_s - since_s >= FAILURES_WITHIN_S:
-            since_s, n_before = now_s, 0
-        self._of[house] = (since_s, n_before + 1)
-        if len(self._of) > MAX_ADDRESSES:
-            self._of.popitem(last=False)
-        left_s = since_s + FAILURES_WITHIN_S - now_s
-        return 0 if n_before < MOST_FAILURES else math.ceil(left_s)
-
-
-def _house(address: str) -> str:
-    """Return what one client can have all addresses of."""
-    try:
-        six = ip_address(address).version == 6
-    except ValueError:
-        return address
-    return str(ip_network(f"{address}/64", strict=False)) if six else address
-
-
 class Refusals:
-    """Tells the audit trail of what was refused: one by one, of a flood how many a minute.
+    """Tells the audit trail of what was refused: of a flood the first ones, and how many more.
 
     Parameters
     ----------
@@ -173,45 +135,30 @@ class Refusals:
 
     def __init__(self, audit: Callable[[AuditEntry], object]) -> None:
         self._audit = audit
-        self._left = MOST_TOLD
-        self._untold: Counter[str] = Counter()
-        self._next: asyncio.TimerHandle | None = None
+        self._since_s = -TOLD_WITHIN_S
+        self._left = self._untold = 0
 
     def tell(self, request: Request, refusal: Refusal) -> None:
-        """Take down a refusal."""
-        if self._next is None:
-            self._next = asyncio.get_running_loop().call_later(TOLD_WITHIN_S, self._look_again)
+        """Take down a refusal, unless as many were within the last minute."""
+        now_s = time.monotonic()
+        if now_s - self._since_s >= TOLD_WITHIN_S:
+            self._since_s, self._left = now_s, MOST_TOLD
         if self._left == 0:
-            self._untold[refusal.kind] += 1
+            self._untold += 1
             return
         self._left -= 1
+        more = f"; {self._untold} more were refused meanwhile" if self._untold else ""
+        self._untold = 0
         address = address_of(request)
-        self._write(
-            AuditEntry(
-                t_ns_utc=time.time_ns(),
-                who=refusal.who or address or "somebody",
-                name=f"request.{refusal.kind}",
-                text=f"{request.method} {request.url.path:.200}",
-                address=address,
-                channel=channel_of(request),
-                answer=f"{refusal.status}: {refusal.detail}",
-            )
+        entry = AuditEntry(
+            t_ns_utc=time.time_ns(),
+            who=refusal.who or address or "somebody",
+            name=f"request.{refusal.kind}",
+            text=f"{request.method} {request.url.path:.200}",
+            address=address,
+            channel=channel_of(request),
+            answer=f"{refusal.status}: {refusal.detail}{more}",
         )
-
-    def _look_again(self) -> None:
-        """Tell how many were not told; while they keep coming, nothing but that."""
-        self._next = None
-        self._left = 0 if self._untold else MOST_TOLD
-        if self._untold:
-            kinds = ", ".join(f"{n} {kind}" for kind, n in self._untold.most_common())
-            text = f"{self._untold.total()} more within {TOLD_WITHIN_S:g} s: {kinds}"
-            self._untold.clear()
-            self._next = asyncio.get_running_loop().call_later(TOLD_WITHIN_S, self._look_again)
-            self._write(
-                AuditEntry(t_ns_utc=time.time_ns(), who="service", name="request.flood", text=text)
-            )
-
-    def _write(self, entry: AuditEntry) -> None:
         structlog.get_logger().warning(
             "api.refused", kind=entry.name, who=entry.who, asked=entry.text, answer=entry.answer
         )
@@ -270,7 +217,6 @@ class Authentication(Middleware):
         super().__init__(app)
         self._hosts = hosts
         self._keys = keys
-        self._failures = Failures()
         self._refusals = Refusals(audit)
         self._routes: tuple[RouteContext, ...] = ()
         self._trouble = ""
@@ -323,7 +269,7 @@ class Authentication(Middleware):
             later = {"Retry-After": str(RETRY_S)}
             return None, Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "keys", detail, later)
         if key is None:
-            return None, self._check_no_key(request, needed, shown=secret is not None)
+            return None, _without_key(needed, shown=secret is not None)
         if not key.scope.covers(needed):
             detail = f"key {key.name} is of scope {key.scope}, this needs one of scope {needed}"
             told = _challenge(f', error="insufficient_scope", scope="{needed}"')
@@ -332,21 +278,6 @@ class Authentication(Middleware):
             detail = "found a browser's cookie and no Origin, expected both: is it this page's?"
             return key, Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail, who=key.name)
         return key, None
-
-    def _check_no_key(self, request: Request, needed: KeyScope, *, shown: bool) -> Refusal:
-        """Return the refusal of a request without a key, or with one that is none."""
-        expected = f"expected a key of scope {needed}"
-        if not shown:
-            detail = f"found no key, {expected}: Authorization: Bearer KEY, or log in at the page"
-            return Refusal(HTTPStatus.UNAUTHORIZED, "no-key", detail, _challenge())
-        wait_s = self._failures.count(address_of(request))
-        if wait_s:
-            detail = f"found more than {MOST_FAILURES} wrong keys from here, {expected}"
-            later = {"Retry-After": str(wait_s)}
-            return Refusal(HTTPStatus.TOO_MANY_REQUESTS, "too-many", detail, later)
-        detail = f"found a key that is none, or no longer, {expected}"
-        told = _challenge(', error="invalid_token"')
-        return Refusal(HTTPStatus.UNAUTHORIZED, "wrong-key", detail, told)
 
     def _scope_of(self, request: Request) -> KeyScope | None:
         """Return the scope a request needs; None: no key."""
@@ -391,6 +322,17 @@ class Authentication(Middleware):
         return key in keys
 
 
+def _without_key(needed: KeyScope, *, shown: bool) -> Refusal:
+    """Return the refusal of a request without a key, or with one that is none."""
+    expected = f"expected a key of scope {needed}"
+    if not shown:
+        detail = f"found no key, {expected}: Authorization: Bearer KEY, or log in at the page"
+        return Refusal(HTTPStatus.UNAUTHORIZED, "no-key", detail, _challenge())
+    detail = f"found a key that is none, or no longer, {expected}"
+    told = _challenge(', error="invalid_token"')
+    return Refusal(HTTPStatus.UNAUTHORIZED, "wrong-key", detail, told)
+
+
 def shown_key(request: Request) -> tuple[str | None, bool]:
     """Return the key that a request shows, and whether it is a browser's cookie."""
     scheme, _, secret = request.headers.get("authorization", "").partition(" ")
@@ -408,3 +350,87 @@ def _same(origin: str, host: str) -> bool:
     scheme, _, authority = origin.partition("://")
     port = _PORTS.get(scheme)
     return port is not None and authority.removesuffix(port) == host.removesuffix(port)
+
+
+# --- who asks, a browser that keeps a key, and whose keys there are
+
+
+router = APIRouter(prefix="/v1", tags=["who may ask"], responses={**INVALID})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Session:
+    """Whoever asks."""
+
+    name: str | None
+    """Of the key that was shown; null: there are no keys, and none is needed."""
+
+    scope: KeyScope
+    """What may be asked with it; "admin" where none is needed."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Holders:
+    """Who may ask."""
+
+    keys: tuple[Key, ...]
+
+
+SESSION = define_view("SessionView", Session)
+define_view(
+    "KeyView", Key, "name scope created_ns_utc", "A key, but for what only its owner knows."
+)
+KEYS = define_view("KeysView", Holders)
+
+
+@router.get("/session", responses={200: shows(SESSION)})
+async def session(request: Request) -> Response:
+    """Return whose key was shown, and what may be asked with it."""
+    key: Key | None = request.user
+    if key is None:
+        return answer(Session(name=None, scope=KeyScope.ADMIN))
+    return answer(Session(name=key.name, scope=key.scope))
+
+
+@router.post("/session", openapi_extra=needs(KeyScope.READ), responses={200: shows(SESSION)})
+async def log_in(request: Request) -> Response:
+    """Have the browser that shows a key in ``Authorization`` keep it, out of reach of scripts.
+
+    The cookie goes to this host alone, with nothing that another site's page asks for, and lasts
+    until the browser is closed.
+    """
+    answered = await session(request)
+    secret, _ = shown_key(request)
+    if request.user is not None and secret is not None:
+        safe = request.headers.get("origin", "").startswith("https:")
+        answered.set_cookie(COOKIE, secret, secure=safe, httponly=True, samesite="strict")
+        request.app.state.service.audit(actor_of(request).entry("session.begun"))
+    return answered
+
+
+@router.delete("/session", status_code=204, openapi_extra=OPEN)
+async def log_out(response: Response) -> None:
+    """Have the browser forget the key."""
+    response.delete_cookie(COOKIE, httponly=True, samesite="strict")
+
+
+@router.get("/keys", openapi_extra=needs(KeyScope.ADMIN), responses={200: shows(KEYS)})
+async def keys(request: Request) -> Response:
+    """Return who may ask; ``pyrcal key add`` makes a key."""
+    return answer(Holders(keys=_file(request).all() if request.user is not None else ()))
+
+
+@router.delete(
+    "/keys/{name}", status_code=204, openapi_extra=needs(KeyScope.ADMIN), responses=UNKNOWN
+)
+async def revoke(request: Request, name: Annotated[str, Path(description="Of the key")]) -> None:
+    """Make a key worthless from this moment on, also where it has a stream open."""
+    if request.user is None:
+        raise UnknownIdError(f"key {name!r:.80}: no such key; there are none at all")
+    await run_in_threadpool(_file(request).revoke, name)
+    request.app.state.service.audit(actor_of(request).entry("key.revoked", name))
+
+
+def _file(request: Request) -> KeyFile:
+    file: KeyFile = request.app.state.keys
+    return file

@@ -1,31 +1,32 @@
 """Requests over HTTP, whatever they ask: how much time and memory one may take, its id, done once.
 
-The same POST sent twice, by a double click or a lost answer, is carried out once.
+The same POST sent twice, by a double click or a lost answer, is carried out once; what a client has
+already is not sent again.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
-import json
 import re
+import time
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
 from uuid import uuid4
 
 import uvicorn
-from fastapi import Request
+from fastapi import Request, Response
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars
 from typing_extensions import override
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.errors import PyrcalError, TooLargeError, TooSlowError
-from service.web.problems import Problem, known_problem, problem
-from service.web.stream import ABORT
+from service.errors import BusyError, PyrcalError, TooLargeError, TooSlowError
+from service.web.problems import known_problem, problem
 
 MAX_BODY_BYTES = 1_000_000
 """Of a request; uploads to be fitted have a limit of their own."""
@@ -33,11 +34,17 @@ MAX_BODY_BYTES = 1_000_000
 BODY_S = 20.0
 """Longest time the body of a request may take to come, seconds."""
 
-HALF_OPEN_S = 10.0
-"""Longest time a request's head may take, seconds; also for what still comes after the answer."""
+MAX_BODIES = 50
+"""Bodies that may be on their way at once, but for those that come in one piece, as orders do."""
 
-MAX_CONNECTIONS = 100
-"""Beyond it the one that has waited longest, with no request at work, gives way."""
+IDLE_S = 10.0
+"""Longest time a request's head may take, seconds, or nothing be taken of an answer."""
+
+MAX_IDLE = 100
+"""Connections that may wait so; beyond it those that have waited longest give way."""
+
+TICK_S = 0.9
+"""From one look of the server's at what is idle to the next, besides uvicorn's own 0.1 s."""
 
 RETRY_S = 5
 """When a client that finds no place should come again, seconds."""
@@ -105,13 +112,14 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
 
     Raises
     ------
-    TooLargeError, TooSlowError
-        If it is beyond the limit, or has not come in time.
+    TooLargeError, TooSlowError, BusyError
+        If it is beyond the limit, has not come in time, or too many others are on their way.
     """
     told = request.headers.get("content-length", "")
     if told.isdecimal() and int(told) > MAX_BODY_BYTES:
         raise _too_large(f"{int(told) / 1e6:.1f} MB")
-    body = bytearray()
+    body, place = bytearray(), None
+    on_their_way: set[object] = request.app.state.bodies
     try:
         async with asyncio.timeout(BODY_S):
             while True:
@@ -123,8 +131,13 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
                     raise _too_large("more")
                 if not message.get("more_body", False):
                     return bytes(body)
+                if place is None and len(on_their_way) >= MAX_BODIES:
+                    raise BusyError(f"{MAX_BODIES} bodies are on their way, the most there may be")
+                on_their_way.add(place := place or object())
     except TimeoutError as error:
         raise TooSlowError(f"body: {len(body)} bytes came within {BODY_S:g} s, not all") from error
+    finally:
+        on_their_way.discard(place)
 
 
 def _too_large(found: str) -> TooLargeError:
@@ -145,117 +158,65 @@ def again(body: bytes, receive: Receive) -> Receive:
     return replayed
 
 
-def server_config(app: ASGIApp, **options: Any) -> uvicorn.Config:  # noqa: ANN401 - uvicorn's own
-    """Return how the application is served: with limits, and nothing logged for each request."""
-    return uvicorn.Config(
-        app, http=_Connection, ws="none", log_config=None, access_log=False, **options
-    )
+class Server(uvicorn.Server):
+    """uvicorn, with an end of its own, and connections that nobody uses ended.
 
+    uvicorn limits the time between two requests, not that of a request's head, and not how long
+    it waits for somebody who takes nothing of an answer.
 
-async def _busy(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer instead of the application."""
-    detail = f"{MAX_CONNECTIONS} requests are at work, the most there may be: try later"
-    headers = {"Retry-After": str(RETRY_S), "Connection": "close"}
-    status = HTTPStatus.SERVICE_UNAVAILABLE
-    answer = problem(Request(scope), status, "busy", detail, headers)
-    await answer(scope, receive, send)
-
-
-def _abortable(app: Any, transport: asyncio.Transport) -> Any:  # noqa: ANN401 - uvicorn's own
-    """Let the application end the connection itself, where nobody takes what it sends."""
-
-    async def abortable(scope: Scope, receive: Receive, send: Send) -> None:
-        scope["extensions"] = {ABORT: transport.abort}
-        await app(scope, receive, send)
-
-    return abortable
-
-
-class _Connection(H11Protocol):
-    """A connection that does not wait for ever, and gives way to others while it does.
-
-    uvicorn limits the time between two requests, not that of a request's head.
+    Parameters
+    ----------
+    app
+        The application.
+    over
+        Set when the service ends.
+    within_s
+        For requests that are under way then.
     """
 
-    _since_s = 0.0
-    _ending: asyncio.TimerHandle | None = None
+    def __init__(self, app: ASGIApp, over: asyncio.Event, *, within_s: int) -> None:
+        config = uvicorn.Config(
+            app,
+            http="h11",
+            ws="none",
+            log_config=None,
+            access_log=False,
+            timeout_graceful_shutdown=within_s,
+        )
+        super().__init__(config)
+        self._over = over
+        self._since_s: dict[object, float] = {}
 
     @override
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self._since_s = self.loop.time()
-        others = [c for c in self.connections if isinstance(c, _Connection) and c.stands]
-        if len(others) > MAX_CONNECTIONS:
-            resting = [c for c in others if c.rests and c is not self]
-            if resting:
-                min(resting, key=lambda c: c._since_s).transport.abort()  # noqa: SLF001 - its own
-            else:
-                self.app = _busy
-        self.app = _abortable(self.app, transport)
-        self._watch()
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield  # uvicorn would raise them again before all is closed
 
     @override
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
-        self._watch()
+    async def on_tick(self, counter: int) -> bool:
+        over = await super().on_tick(0)  # the date of answers is told anew
+        self._end_idle()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(TICK_S):
+                await self._over.wait()
+        return over or self._over.is_set()
 
-    @override
-    def on_response_complete(self) -> None:
-        super().on_response_complete()
-        self._since_s = self.loop.time()
-        self._watch()
+    def _end_idle(self) -> None:
+        """End what has stood still for too long; of too much, what has done so the longest."""
+        now_s = time.monotonic()
+        idle = {still: one for one in self.server_state.connections if (still := _stands(one))}
+        self._since_s = {still: self._since_s.get(still, now_s) for still in idle}
+        by_age = sorted(idle, key=self._since_s.__getitem__)
+        late = [still for still in by_age if now_s - self._since_s[still] > IDLE_S]
+        for still in {*late, *by_age[: max(len(by_age) - MAX_IDLE, 0)]}:
+            idle[still].transport.abort()
 
-    @override
-    def connection_lost(self, exc: Exception | None) -> None:
-        super().connection_lost(exc)
-        self._unwatch()
 
-    @override
-    def send_400_response(self, msg: str) -> None:
-        self._answer(HTTPStatus.BAD_REQUEST, "http", msg)
-
-    @property
-    def stands(self) -> bool:
-        """Whether it has not been ended yet; one that has is gone a moment later."""
-        return not self.transport.is_closing()
-
-    @property
-    def rests(self) -> bool:
-        """Whether no request is at work."""
-        begun = self.cycle is not None  # though its type says that it always is
-        return not begun or self.cycle.response_complete
-
-    def _watch(self) -> None:
-        """Start the clock when something is awaited that no request needs, else stop it."""
-        if not self.rests or self.transport.is_closing():
-            self._unwatch()
-        elif self._ending is None:
-            self._ending = self.loop.call_later(HALF_OPEN_S, self._end)
-
-    def _unwatch(self) -> None:
-        if self._ending is not None:
-            self._ending.cancel()
-            self._ending = None
-
-    def _end(self) -> None:
-        head_came_half = self.conn.trailing_data[0] and self.cycle is None
-        if head_came_half:
-            detail = f"the head of the request did not come within {HALF_OPEN_S:g} s"
-            self._answer(HTTPStatus.REQUEST_TIMEOUT, "too-slow", detail)
-        else:
-            self.transport.abort()
-
-    def _answer(self, status: HTTPStatus, kind: str, detail: str) -> None:
-        """Answer without the application, which has not heard of a request, and close."""
-        if self.rests:
-            told = Problem.of(status, kind, detail, instance="")
-            body = json.dumps(told.model_dump()).encode()
-            head = (
-                f"HTTP/1.1 {status} {status.phrase}\r\nContent-Type: application/problem+json\r\n"
-                f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
-            )
-            self.transport.write(head.encode() + body)
-        self.transport.close()
+def _stands(connection: Any) -> tuple[object, ...]:  # noqa: ANN401 - uvicorn's own
+    """Return where a connection stands still, until it does something; empty: it is at work."""
+    n_unsent, cycle = connection.transport.get_write_buffer_size(), connection.cycle
+    at_work = cycle is not None and not cycle.response_complete
+    return () if at_work and not n_unsent else (connection, cycle, n_unsent)
 
 
 # --- the same POST is carried out once
@@ -394,3 +355,73 @@ class RequestId(Middleware):
 
         with bound_contextvars(request_id=name):
             await self._app(scope, receive, named)
+
+
+# --- what a client has already is not sent again: an ETag on each answer, 304 where it is the same
+
+
+NOT_MODIFIED: dict[str, Any] = {
+    "description": "It is what `If-None-Match` names: the client has it already",
+    "headers": {"ETag": {"description": "Of the answer", "schema": {"type": "string"}}},
+}
+"""The OpenAPI description of an answer without a body."""
+
+_KEPT = "private, no-cache"
+"""A browser keeps an answer and asks each time whether it still holds; nobody between does."""
+
+
+def tag_of(*parts: object) -> str:
+    """Return a weak ETag that differs when one of the parts does."""
+    return f'W/"{hashlib.blake2b(repr(parts).encode(), digest_size=12).hexdigest()}"'
+
+
+def has_already(headers: Headers, tag: str) -> bool:
+    """Return whether a request says that the client has what carries this ETag."""
+    sent = {one.strip().removeprefix("W/") for one in headers.get("if-none-match", "").split(",")}
+    return "*" in sent or tag.removeprefix("W/") in sent
+
+
+def not_modified(request: Request, tag: str) -> Response | None:
+    """Return the answer that nothing has changed, None: what it asks for has to be made."""
+    if not has_already(request.headers, tag):
+        return None
+    headers = {"ETag": tag, "Cache-Control": _KEPT}
+    return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+
+
+class Unchanged(Middleware):
+    """Gives every JSON document an ETag, and sends it only to a client that has another one.
+
+    What comes bit by bit passes as it is, and so does what has an ETag of its own and is no JSON.
+    """
+
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        asked, head = Headers(scope=scope), None
+
+        async def sent(message: Message) -> None:
+            nonlocal head
+            if message["type"] == "http.response.start" and _can_be_kept(scope, message):
+                head = message
+                return None
+            if head is None:
+                return await send(message)
+            begun, head = head, None
+            if message.get("more_body", False):
+                await send(begun)
+                return await send(message)
+            headers = MutableHeaders(scope=begun)
+            tag = headers.setdefault("ETag", tag_of(message["body"]))
+            headers.setdefault("Cache-Control", _KEPT)
+            if has_already(asked, tag):
+                begun["status"], message["body"] = HTTPStatus.NOT_MODIFIED.value, b""
+                del headers["content-length"], headers["content-type"]
+            await send(begun)
+            return await send(message)
+
+        await self._app(scope, receive, sent)
+
+
+def _can_be_kept(scope: Scope, start: Message) -> bool:
+    is_json = Headers(raw=start["headers"]).get("content-type", "") == "application/json"
+    return scope["method"] == "GET" and start["status"] == HTTPStatus.OK and is_json

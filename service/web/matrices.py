@@ -1,7 +1,8 @@
-"""Interaction matrices that are measured for the service: ask for one, see it, take it away.
+"""Matrices that are made or measured on request: ask for one, see how far it is, take it away.
 
-The RTC measures one, or the service sums a noisy one on sky from a random dither. A noisy one can
-never become a reconstructor: no route, and nothing behind one, publishes it.
+A reconstructor for the registration of now is a job that can be followed to its end. The RTC
+measures an interaction matrix, or the service sums a noisy one on sky from a random dither. A noisy
+one can never become a reconstructor: no route, and nothing behind one, publishes it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
+from service.runtime.refits import RefitJob
 from service.runtime.snapshot import Snapshot
 from service.tracking.commands import (
     GiveUp,
@@ -20,15 +22,16 @@ from service.tracking.commands import (
     MeasureChoice,
     MeasureNoisy,
     NoisyChoice,
+    Refit,
 )
 from service.tracking.dither_request import NOISY_DITHER
 from service.tracking.products import MeasurementRecord, NoisyFinding
 from service.tracking.state import TrackerState
 from service.web import views
 from service.web.commands import AcceptedView, ClientDep, Said, about, body
+from service.web.connections import not_modified, tag_of
 from service.web.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.unchanged import not_modified, tag_of
 from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
 router = APIRouter(
@@ -200,3 +203,38 @@ async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, instruction: Said)
 async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return the archived HDF5 file of a noisy matrix; ``pyrcal fit`` reads it."""
     return await _file(request, service.archive.noisy.file, noisy_id)
+
+
+# --- reconstructors that an operator has computed
+
+
+refits = APIRouter(prefix="/v1", tags=["what an operator asks of it"], responses={**INVALID})
+
+RefitId = Annotated[str, Path(alias="id", max_length=128, description="Id of a refit")]
+
+REFIT = define_view("RefitView", RefitJob)
+
+
+class RefitAcceptedView(AcceptedView):
+    """A reconstructor that is being computed."""
+
+    id: str
+    """Of the job: ``GET /v1/refits/{id}`` says what came of it."""
+
+
+@refits.post("/refit", status_code=202, responses={**COMMAND})
+async def refit(client: ClientDep, command: Annotated[Refit, body(Refit)]) -> RefitAcceptedView:
+    """Compute a reconstructor for the current registration; gate and mode apply as always.
+
+    The answer has the id of a job, which tells which reconstructor came of it.
+    """
+    answered = await client.orders(command, reconstructors="/v1/reconstructors")
+    job = client.service.refits.newest.id  # nothing has run since: no other can have begun
+    links = client.accepted(answered.text, refit=f"/v1/refits/{job}").links | answered.links
+    return RefitAcceptedView(id=job, text=answered.text, links=links)
+
+
+@refits.get("/refits/{id}", responses={200: shows(REFIT), **UNKNOWN})
+async def refit_job(service: ServiceDep, refit_id: RefitId) -> Response:
+    """Return how far a refit is: which reconstructor it has made, or why none."""
+    return answer(service.refits.job(refit_id))

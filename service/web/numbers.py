@@ -22,8 +22,8 @@ from service.model.interaction import rtc_valid_subapertures
 from service.model.slopes import as_maps, slopes_of, to_conventions, turned_mask
 from service.runtime.supervisor import Supervisor
 from service.tracking.products import MatrixState
+from service.web.connections import not_modified, tag_of
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.unchanged import not_modified, tag_of
 from service.web.views import ServiceDep, answer, define_view, shows
 
 Numbers = NDArray[np.float32]

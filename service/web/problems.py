@@ -99,7 +99,6 @@ EVERYWHERE: Responses = {
     408: problem_response("The request did not come in time"),
     413: problem_response("The body is larger than this service takes"),
     421: problem_response("Asked for under a name this service does not know"),
-    429: problem_response("Too many wrong keys from there"),
 }
 UNKNOWN: Responses = {404: problem_response("No such thing")}
 DECISION: Responses = {

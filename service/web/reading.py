@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from dataclasses import replace
 from http import HTTPStatus
-from typing import Annotated, Self
+from typing import Annotated
 
-import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.concurrency import run_in_threadpool
-from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
+from pydantic import Field
 
-from service.archive import Archive, Mark, Night
-from service.archive.nights import FOREVER_NS
 from service.control.gains import ModeGain, gain_table
 from service.errors import CommandError
 from service.runtime.snapshot import ModeGainTable
-from service.runtime.supervisor import Supervisor
-from service.tracking.registration import HistoryEntry
 from service.web import views
 from service.web.numbers import (
     MatrixId,
@@ -28,8 +21,7 @@ from service.web.numbers import (
     numbers_of,
 )
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
-from service.web.unchanged import not_modified, tag_of
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows, tagged
+from service.web.views import ServiceDep, answer, found_or_refuse, shows, tagged
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
@@ -39,74 +31,6 @@ class LimitParameters(Parameters):
 
     limit: int = Field(default=200, ge=1, le=100_000)
     """At most so many entries, the newest ones."""
-
-
-Points = Annotated[int, Field(ge=8, le=2000)]
-Nanoseconds = Annotated[int, Field(ge=0, le=(1 << 63) - 1)]
-
-
-def _said_as_a_clock_does(value: object) -> object:
-    if isinstance(value, str) and "T" not in value.upper():  # "2026" would be seconds since 1970
-        raise ValueError(f"found {value!r:.40}, expected a time such as 2026-03-01T21:14:03Z")
-    return value
-
-
-Clock = Annotated[AwareDatetime, BeforeValidator(_said_as_a_clock_does)]
-
-
-class TimeParameters(Parameters):
-    """A time, from its beginning to its end."""
-
-    since_ns: Nanoseconds | None = None
-    """From this time on, nanoseconds since the Unix epoch, UTC."""
-
-    until_ns: Nanoseconds | None = None
-    """Up to this time, which belongs to it."""
-
-    since: Clock | None = None
-    """``since_ns`` as RFC 3339 says it, such as 2026-03-01T21:14:03Z."""
-
-    until: Clock | None = None
-    """``until_ns`` as RFC 3339 says it."""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        both = {self.since_ns, self.since}, {self.until_ns, self.until}
-        if any(None not in pair for pair in both):
-            raise ValueError("a time in nanoseconds or as RFC 3339, not both")
-        first, last = self.between
-        if first > last:
-            raise ValueError(f"since <= until: since {first} ns, until {last} ns")
-        return self
-
-    @property
-    def between(self) -> tuple[int, int]:
-        """First and last time, nanoseconds."""
-        first = _nanoseconds(self.since) if self.since_ns is None else self.since_ns
-        last = _nanoseconds(self.until) if self.until_ns is None else self.until_ns
-        return first or 0, FOREVER_NS if last is None else last
-
-
-class RangeParameters(TimeParameters):
-    """Which part of a history to return."""
-
-    limit: int = Field(default=200, ge=1, le=5000)
-    """At most so many entries, the newest ones."""
-
-    after: Nanoseconds | None = None
-    """``t_ns_utc`` of the last entry of the page before: the ``limit`` entries that follow it,
-    instead of the newest ones; one more where two are of the same time."""
-
-    points: Points | None = None
-    """At most so many entries of the whole range, whatever the limit: the lowest and the highest of
-    each parameter in each part of it."""
-
-
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-def _nanoseconds(time: datetime | None) -> int | None:
-    return None if time is None else (time - _EPOCH) // timedelta(microseconds=1) * 1000
 
 
 @router.get("/state", responses={200: shows(views.STATE)})
@@ -134,130 +58,6 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
         )
         return problem(request, HTTPStatus.NOT_FOUND, "no-estimate", detail)
     return answer(current)
-
-
-@router.get("/alpha/history", responses={200: shows(views.HISTORY)})
-async def alpha_history(
-    request: Request, service: ServiceDep, parameters: Annotated[RangeParameters, Query()]
-) -> Response:
-    """Return the last estimates, or those of a time, oldest first.
-
-    Those of the last hours are in memory; what is older, or of the run before, is in the archive.
-    """
-    # a night takes a quarter of a second, in which telemetry is taken in
-    return await run_in_threadpool(_history, request, service, parameters)
-
-
-def _history(request: Request, service: Supervisor, asked: RangeParameters) -> Response:
-    """Return a part of the history, unless nothing of it has come since the client asked last."""
-    tracker = service.snapshot().tracker
-    first_ns, last_ns = asked.between
-    first_ns = first_ns if asked.after is None else max(first_ns, asked.after + 1)
-    found = tuple(entry for entry in tracker.alpha.history if first_ns <= entry.t_ns_utc <= last_ns)
-    n_older = service.archive.nights.n_estimates(first_ns, last_ns)
-    ends = [entry.t_ns_utc for entry in (*found[:1], *found[-1:])]
-    tag = tag_of(asked, n_older, len(found), *ends)
-    if (same := not_modified(request, tag)) is not None:
-        return same
-    if asked.points or asked.after is not None or len(found) < asked.limit:
-        last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.alpha.history)])
-        found = (*_older(service.archive, first_ns, last_ns, asked), *found)
-    told = answer(
-        replace(tracker, alpha=replace(tracker.alpha, history=_cut(found, asked))), views.HISTORY
-    )
-    told.headers["ETag"] = tag
-    return told
-
-
-History = tuple[HistoryEntry, ...]
-
-OF_ONE_TIME = 10
-"""Estimates of one time in which a page may end."""
-
-
-def _older(archive: Archive, first_ns: int, last_ns: int, asked: RangeParameters) -> History:
-    """Return what the archive has of a time before all that is in memory."""
-    if first_ns > last_ns:
-        return ()
-    if asked.points is not None:
-        return archive.nights.downsampled(first_ns, last_ns, asked.points)
-    n_most = asked.limit + OF_ONE_TIME
-    return archive.nights.estimates(first_ns, last_ns, n_most, newest=asked.after is None)
-
-
-def _cut(found: History, asked: RangeParameters) -> History:
-    """Return as much of what was found as was asked for."""
-    if asked.points is not None:
-        return downsample(found, asked.points)
-    if asked.after is None:
-        return found[-asked.limit :]
-    page = found[: asked.limit]
-    rest = found[asked.limit :]
-    return (*page, *(entry for entry in rest if entry.t_ns_utc == page[-1].t_ns_utc))
-
-
-def downsample(history: History, n_points: int) -> History:
-    """Return at most so many entries, with the extremes of each parameter in equal parts of time.
-
-    A line drawn through them looks like one through all, however short a jump was.
-    """
-    if len(history) <= n_points:
-        return history
-    values = np.array([entry.filtered.vector for entry in history])
-    times_s = np.array([entry.t_ns_utc - history[0].t_ns_utc for entry in history]) * 1e-9
-    n_parts = n_points // (2 * values.shape[1])
-    part = (times_s / (np.ptp(times_s) or 1.0) * n_parts).clip(0, n_parts - 1).astype(int)
-    kept: set[int] = set()
-    for members in (np.flatnonzero(part == k) for k in range(n_parts)):
-        if members.size:
-            kept.update(members[values[members].argmin(axis=0)].tolist())
-            kept.update(members[values[members].argmax(axis=0)].tolist())
-    return tuple(history[k] for k in sorted(kept))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NightList:
-    """The nights of which something is in the archive."""
-
-    nights: tuple[Night, ...]
-    """Oldest first."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MarkList:
-    """What belongs into a chart of α besides α."""
-
-    marks: tuple[Mark, ...]
-    """Oldest first."""
-
-
-class MarkParameters(TimeParameters):
-    """Which marks to return."""
-
-    limit: int = Field(default=500, ge=1, le=2000)
-    """At most so many, the newest ones."""
-
-
-define_view("NightView", Night)
-define_view("MarkView", Mark)
-NIGHTS = define_view("NightsView", NightList)
-MARKS = define_view("MarksView", MarkList)
-
-
-@router.get("/nights", responses={200: shows(NIGHTS)})
-async def nights(service: ServiceDep, parameters: Annotated[TimeParameters, Query()]) -> Response:
-    """Return the nights of a time, from noon to noon, and what there is of each."""
-    found = await run_in_threadpool(service.archive.nights.between, *parameters.between)
-    return answer(NightList(nights=found))
-
-
-@router.get("/marks", responses={200: shows(MARKS)})
-async def marks(service: ServiceDep, parameters: Annotated[MarkParameters, Query()]) -> Response:
-    """Return swaps, jumps, alarms and starts of a time, for a chart of it."""
-    found = await run_in_threadpool(
-        service.archive.nights.marks, *parameters.between, parameters.limit
-    )
-    return answer(MarkList(marks=found))
 
 
 @router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Request
 from fastapi.responses import StreamingResponse
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import Receive, Scope, Send
 from typing_extensions import override
 
 from service.errors import BusyError
@@ -29,17 +29,11 @@ LOOK_S = 0.5
 HEARTBEAT_S = 10.0
 """Longest silence, seconds: then comes a comment, and the state as it is."""
 
-TAKEN_WITHIN_S = 10.0
-"""A listener that has not taken a message for so long is dropped: it comes back where it was."""
-
 MAX_LISTENERS = 60
 """Fewer than there may be connections: others want to ask something, too."""
 
 RETRY_MS = 1000
 """When a listener that was cut off should come back, milliseconds."""
-
-ABORT = "pyrcal.abort"
-"""Extension of a request's scope: ends its connection at once, with all that was not taken."""
 
 _CLOCKS = {"now_ns", "now_utc", "uptime_s", "age_s", "window_age_s", "frame_age_s"}
 """What changes in the state while nothing happens."""
@@ -152,7 +146,7 @@ def _event(name: str, data: bytes, identity: str = "") -> bytes:
 
 
 class _EventStream(StreamingResponse):
-    """One listener's stream, which is dropped when nobody takes it."""
+    """One listener's stream."""
 
     media_type = "text/event-stream"
 
@@ -163,17 +157,9 @@ class _EventStream(StreamingResponse):
 
     @override
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def in_time(message: Message) -> None:
-            try:
-                async with asyncio.timeout(TAKEN_WITHIN_S):
-                    await send(message)
-            except TimeoutError:
-                scope["extensions"][ABORT]()
-                await asyncio.Event().wait()  # until the disconnect is heard, which ends this
-
         self._stream.n_listeners += 1
         try:
-            await super().__call__(scope, receive, in_time)
+            await super().__call__(scope, receive, send)
         finally:
             self._stream.n_listeners -= 1
 

@@ -22,7 +22,6 @@ from service.files.fit_folder import FitRequest
 from service.runtime.actions import Actions, Publishing
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitLimits, FitQueue
-from service.web import authentication
 from service.web.authentication import Hosts
 from service.web.keys import KeyFile, KeyScope
 from tests.unit.runtime.handmade import STATE, Clock, HandmadeBridge
@@ -99,8 +98,6 @@ def app(tmp_path, monkeypatch):
         desk = FitQueue(
             folder=tmp_path, program=("false",), request=request, limits=limits, clock_ns=Clock()
         )
-        # it sends hundreds of wrong keys, and expects 401 for each: 429 has a test of its own
-        monkeypatch.setattr(authentication, "MOST_FAILURES", 100_000)
         hosts = Hosts(allowed=("testserver",))
         yield create_app(supervisor, desk, hosts=hosts, keys=KeyFile(tmp_path))
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 
 import httpx
 import pytest
-import uvicorn
 
 from service.api import create_app
 from service.tracking.state import Level, LogEntry
 from service.tracking.step_context import LOG_LENGTH
-from service.web import stream
-from service.web.connections import server_config
+from service.web import connections, stream
+from service.web.connections import Server
 from tests.system.pace import patience
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot
 from tests.unit.tracking.situations import POLICY
@@ -74,8 +73,7 @@ async def serving(service):
     over = asyncio.Event()
     listener = socket.create_server(("127.0.0.1", 0))
     app = create_app(service, over=over)
-    server = uvicorn.Server(server_config(app, timeout_graceful_shutdown=5))
-    server.capture_signals = contextlib.nullcontext
+    server = Server(app, over, within_s=5)
     task = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
         await asyncio.sleep(0.01)
@@ -203,7 +201,7 @@ async def test_a_stream_ends_at_once_with_the_service(service):
 
 
 async def test_one_that_takes_nothing_is_dropped_and_leaves_no_place_taken(service, monkeypatch):
-    monkeypatch.setattr(stream, "TAKEN_WITHIN_S", 0.3)
+    monkeypatch.setattr(connections, "IDLE_S", 0.3)
     service.change(passive_unavailable_reason="long " * 100_000)
     async with serving(service) as listening:
         reader, writer = await asyncio.open_connection("127.0.0.1", listening.port, limit=1000)

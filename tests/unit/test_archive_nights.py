@@ -16,7 +16,7 @@ from service.archive.nights import DAY_NS, HOUR_NS, MarkKind
 from service.errors import ArchiveError, StorageError, TooLargeError
 from service.model.misregistration import Misregistration
 from service.tracking.registration import HistoryEntry, Source
-from service.web.reading import downsample
+from service.web.history import downsample
 from tests.states import tracker_state
 
 SECOND = 1_000_000_000

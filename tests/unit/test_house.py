@@ -25,7 +25,6 @@ CALLED_FROM_ELSEWHERE = {
     "__getattr__",  # Python
     "capture_signals",  # uvicorn
     "collect",  # prometheus_client
-    "send_400_response",  # uvicorn
 }
 
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}

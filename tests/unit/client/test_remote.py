@@ -1,5 +1,6 @@
 """The command line over REST, beside the service's own application on a real socket."""
 
+import asyncio
 import contextlib
 import csv
 import itertools
@@ -11,7 +12,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import uvicorn
 
 from pyrcal.__main__ import main
 from pyrcal.client import orders
@@ -26,7 +26,7 @@ from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import MakeMatrix, MatrixMade
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode
-from service.web.connections import server_config
+from service.web.connections import Server
 from tests.states import changed
 from tests.unit.test_api import LINK, MATRIX, SECOND, STATE, FakeService
 from tests.unit.tracking.situations import ALL_SHOWN, POLICY
@@ -52,8 +52,7 @@ class Listening(FakeService):
 def serving(app):
     """Serve in a thread; yield the address."""
     listener = socket.create_server(("127.0.0.1", 0))
-    server = uvicorn.Server(server_config(app, timeout_graceful_shutdown=1))
-    server.capture_signals = contextlib.nullcontext
+    server = Server(app, asyncio.Event(), within_s=1)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     thread.start()
     try:

@@ -21,14 +21,12 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
 from service.estimation import demodulation, loopcheck, passive
+from service.estimation.description import Actuators, EdgeWatch, edge_watch
 from service.estimation.frames import FrameBlock
 from service.estimation.health import (
-    Actuators,
     EdgeHealth,
-    EdgeWatch,
     LoopHealth,
     VibrationMonitor,
-    edge_watch,
     observe,
     observe_edge,
 )

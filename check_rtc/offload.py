@@ -16,9 +16,9 @@ from service.errors import LinkError, WireError
 from service.estimation.estimate import Estimate
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.loop import closed_loop
 from service.estimation.windows import ClosedLoop, WindowRefused
 from service.model.misregistration import BOUNDARY_SCALE
-from service.tracking.loop import closed_loop
 from service.wire import (
     CommandKind,
     DitherKind,

@@ -15,11 +15,11 @@ from service.errors import WireError
 from service.estimation import control_law, loopcheck
 from service.estimation.control_law import ControlLawCheck, IdentifiedLaw
 from service.estimation.frames import FrameBlock
+from service.estimation.loop import closed_loop, last_seq, same_loop
 from service.estimation.loopcheck import CommandResidual, LoopCheck
 from service.estimation.windows import ClosedLoop
 from service.link.intake import Intake
 from service.link.session import Endpoint
-from service.tracking.loop import closed_loop, last_seq, same_loop
 from service.wire import (
     Acknowledgement,
     FrameBatch,

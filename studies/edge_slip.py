@@ -22,8 +22,9 @@ from service.config import load_instrument
 from service.control.gate import edge_motion_m
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
+from service.estimation.description import Actuators, edge_watch
 from service.estimation.frames import FrameBlock
-from service.estimation.health import Actuators, EdgeHealth, edge_watch, observe_edge
+from service.estimation.health import EdgeHealth, observe_edge
 from service.files import parse_alpha
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel

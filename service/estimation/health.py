@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from service.estimation.description import EdgeWatch
 from service.estimation.frames import FrameBlock
 from service.model.kinds import SignalKind
 from service.model.misregistration import unit_like
@@ -110,46 +111,11 @@ is back."""
 
 SUSPECT_FOR_S = 0.5
 
-LOW_MODES = 30
-"""Left out: tip, tilt and their like move the whole mirror by more than any slip."""
-
 LOOK_FRAMES = 50
 """One of so many frames is looked at, however long a block is."""
 
 _EDGE_MEMORY_S = 0.25
 """Turbulence of higher modes has forgotten itself after this; a slip has not."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Actuators:
-    """Where the actuators are, and how far each mode moves them."""
-
-    positions: NDArray[np.float64]
-    """``(n_actuators, 2)`` in any unit."""
-
-    strokes: NDArray[np.float64]
-    """``(n_actuators, n_modes)`` position for a unit command of each mode."""
-
-    @property
-    def outer(self) -> NDArray[np.bool_]:
-        """``(n_actuators,)`` within 4 % of the largest radius: one ring of FLAO's fourteen."""
-        radius = np.hypot(*self.positions.T)
-        return np.asarray(radius > 0.96 * radius.max())
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EdgeWatch:
-    """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
-
-    modes: NDArray[np.intp]
-    """``(n_watched,)`` those of the loop that are not left out."""
-
-    outer: NDArray[np.float32]
-    """``(n_outer, n_watched)`` of the outermost ring."""
-
-    inner: NDArray[np.float32]
-    """``(n_watched, n_watched)`` mean products of all others: a form of the command, their
-    mean square, which tells how strong the turbulence is tonight."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -169,25 +135,6 @@ class EdgeHealth:
     """For how long the ratio has been above ``SUSPECT_RATIO``."""
 
     slipped: bool = False
-
-
-def edge_watch(
-    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
-) -> EdgeWatch | None:
-    """Return what to watch in a loop of these modes; None when they are too few to say.
-
-    The same when nothing is known of the turbulence in the modes.
-    """
-    high, outer = in_loop[in_loop >= LOW_MODES], actuators.outer
-    strokes = actuators.strokes[:, high]
-    expected = np.sqrt(strokes**2 @ mode_variance_m2[high])
-    if len(high) <= LOW_MODES or expected.min() <= 0.0:
-        return None
-    shapes = strokes / expected[:, None]
-    inner = shapes[~outer].T @ shapes[~outer] / np.count_nonzero(~outer)
-    return EdgeWatch(
-        modes=high, outer=shapes[outer].astype(np.float32), inner=inner.astype(np.float32)
-    )
 
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:

@@ -32,8 +32,8 @@ from service.estimation.comparison import (
     compared,
     not_compared,
 )
+from service.estimation.description import EdgeWatch
 from service.estimation.frames import FrameBlock
-from service.estimation.health import EdgeWatch
 from service.estimation.residual import Reader
 
 Array = NDArray[np.float64]

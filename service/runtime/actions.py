@@ -16,6 +16,7 @@ from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
+from service.estimation.loop import same_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.runtime.estimates import NoisySums
@@ -24,7 +25,7 @@ from service.runtime.worker import Conditions, OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.events import Effect, Event
-from service.tracking.loop import commanded_gains, extended_gains, same_gains
+from service.tracking.loop import commanded_gains, extended_gains
 from service.tracking.products import (
     Judged,
     MatrixState,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.estimation.description import Description
 from service.estimation.dither_monitor import LOUDER, DitherMeasurement
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra
@@ -30,7 +31,6 @@ from service.runtime.estimator_bank import (
     with_rtc,
 )
 from service.runtime.passive_sums import take_passive_sums
-from service.runtime.worker import Description
 from service.tracker import step
 from service.tracking import alarms
 from service.tracking import events as ev

@@ -14,6 +14,7 @@ from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
 from service.estimation import lockin, random_dither
 from service.estimation.lockin import LockInEstimate, Spectra
+from service.estimation.loop import loop_numbers
 from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.orientation import setting_written
 from service.estimation.passive import Passive
@@ -27,7 +28,6 @@ from service.runtime.worker.records import waits
 from service.tracking import events as ev
 from service.tracking.alarms import WRONG_MATRIX, Interlock, blocking_alarm
 from service.tracking.events import Event
-from service.tracking.loop import loop_numbers
 from service.tracking.products import (
     MeasurementRecord,
     MeasureState,

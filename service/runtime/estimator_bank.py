@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.estimation import control_law, loopcheck, passive, probation
 from service.estimation.control_law import ControlLawCheck
+from service.estimation.description import Description, EdgeWatch, edge_watch
 from service.estimation.dither_monitor import (
     DitherMeasurement,
     DitherMonitor,
@@ -19,14 +20,13 @@ from service.estimation.dither_monitor import (
 from service.estimation.frames import FrameBlock
 from service.estimation.health import (
     EdgeHealth,
-    EdgeWatch,
     LoopHealth,
     VibrationMonitor,
-    edge_watch,
     observe,
     observe_edge,
 )
 from service.estimation.lockin import LockIn, Spectra
+from service.estimation.loop import closed_loop, last_seq, same_but_for_modes, same_loop, same_rate
 from service.estimation.loopcheck import ENOUGH_SAMPLES, SAMPLES_PER_S, CommandResidual, LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.probation import Comparison
@@ -34,20 +34,12 @@ from service.estimation.random_dither import Correlated, RandomDither
 from service.estimation.rejection import Rejection
 from service.estimation.standstill import Standstill
 from service.estimation.windows import ClosedLoop, Telemetry, WindowRefused
-from service.runtime.worker import Description
 from service.tracking.dither_request import (
     SETTLING_S,
     Dither,
     expected_dither,
     lock_in_plan,
     random_plan,
-)
-from service.tracking.loop import (
-    closed_loop,
-    last_seq,
-    same_but_for_modes,
-    same_loop,
-    same_rate,
 )
 from service.wire import DitherKind, Status
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation import passive
+from service.estimation.loop import why_open
 from service.estimation.passive import Passive
 from service.runtime.estimator_bank import EstimatorBank
-from service.tracking.loop import why_open
 
 PASSIVE_INTERVAL_S = 4.0
 """Between two looks of the passive watchdog, and of telemetry in each: a jump is to be seen within

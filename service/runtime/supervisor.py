@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from service.archive import Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
+from service.estimation.description import Description
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra
 from service.estimation.random_dither import Correlated
@@ -45,7 +46,7 @@ from service.runtime.refits import Refits
 from service.runtime.snapshot import Snapshot
 from service.runtime.telemetry_recorder import TelemetryRecorder
 from service.runtime.trends import TrendSampler
-from service.runtime.worker import Description, OpticsWorker
+from service.runtime.worker import OpticsWorker
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
 from service.tracking import commands as cmd
 from service.tracking import events as ev

@@ -14,6 +14,7 @@ from service.control.dither import (
     schedule,
     tabulated,
 )
+from service.estimation.loop import why_open
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
 from service.tracking.dither_modes import (
@@ -36,7 +37,6 @@ from service.tracking.dither_request import (
     proves,
     total_m,
 )
-from service.tracking.loop import why_open
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState

@@ -230,7 +230,7 @@ class PassiveFitted:
     """Begin of it, the RTC's clock; 0: not told."""
 
     loop: tuple[float, ...] = ()
-    """``tracking.loop.loop_numbers`` of the loop it is of; empty: not known."""
+    """``estimation.loop.loop_numbers`` of the loop it is of; empty: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -110,7 +110,7 @@ class PassiveBias:
     """How much more passive estimates scatter than they say, in variance, one beside the other."""
 
     loop: tuple[float, ...] = ()
-    """``tracking.loop.loop_numbers`` of the loop it is the bias of; empty: not known."""
+    """``estimation.loop.loop_numbers`` of the loop it is the bias of; empty: not known."""
 
     previous_estimate: PreviousEstimate | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""

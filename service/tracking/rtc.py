@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from service.estimation.loop import loop_numbers, same_loop, same_numbers, why_open
 from service.tracking import alarms, dither, mode_proof, reconstructors, validity
 from service.tracking import events as ev
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import Effect
-from service.tracking.loop import loop_numbers, same_loop, same_numbers, why_open
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.expected_gain import explained_by_noise
+from service.estimation.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.model.misregistration import Misregistration, step_text
-from service.tracking.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.tracking.mode_limits import ModeLimit
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import Assessment, Judged, MatrixState, ReconstructorRecord

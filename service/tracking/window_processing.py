@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.estimation import kalman
 from service.estimation.kalman import Joint
+from service.estimation.loop import loop_numbers, same_numbers
 from service.estimation.passive import PassiveEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind
@@ -26,7 +27,6 @@ from service.tracking.dither import found_again
 from service.tracking.dither_plan import why_none as why_no_dither
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
-from service.tracking.loop import loop_numbers, same_numbers
 from service.tracking.operations.acquisition_stages import count_miss
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (

@@ -10,8 +10,8 @@ import pytest
 from service.archive import Archive
 from service.archive.serialisation import TrackingFile
 from service.errors import ArchiveError
+from service.estimation.loop import loop_numbers
 from service.tracking import commands as cmd
-from service.tracking.loop import loop_numbers
 from service.tracking.mode_limits import ModeAnswer, ModeProof
 from service.tracking.registration import Registration
 from service.tracking.resume import saved_of

@@ -6,12 +6,11 @@ alone.
 
 from service.runtime.worker.optics_worker import OpticsWorker
 from service.runtime.worker.process import Done, run_job, start_worker
-from service.runtime.worker.records import Compute, Conditions, Description, Made, Sampling
+from service.runtime.worker.records import Compute, Conditions, Made, Sampling
 
 __all__ = [
     "Compute",
     "Conditions",
-    "Description",
     "Done",
     "Made",
     "OpticsWorker",

@@ -18,6 +18,7 @@ from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.estimation import passive
+from service.estimation.description import Description
 from service.estimation.estimate import DitheredEstimate
 from service.estimation.light import far_starts
 from service.estimation.lockin import LockInEstimate, Spectra, fit_window
@@ -35,7 +36,6 @@ from service.model.turbulence import Halo
 from service.runtime.worker.records import (
     Compute,
     Conditions,
-    Description,
     Made,
     actuators_of,
     check_controllable,

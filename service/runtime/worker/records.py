@@ -14,11 +14,11 @@ from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
-from service.estimation.health import Actuators
+from service.estimation.description import Actuators
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
-from service.model.kinds import Influence, SignalKind
-from service.model.misregistration import Determination, Misregistration
+from service.model.kinds import Influence
+from service.model.misregistration import Determination
 from service.model.modes import ModalBasis
 
 _Job = TypeVar("_Job", bound=Callable[..., Any])
@@ -82,31 +82,6 @@ class Compute:
 
     cache: Path | None = None
     """Folder of what is prepared once; None: it is computed every time."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Description:
-    """What the service must know of the model to check telemetry against it."""
-
-    n_slopes: int
-    n_modes: int
-    mode_variance_m2: NDArray[np.float64]
-    """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
-
-    actuators: Actuators | None = None
-    """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
-
-    mode_information: NDArray[np.float64] | None = None
-    """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
-
-    products: NDArray[np.float32] | None = None
-    """``(n_modes, n_modes)`` DᵀD at ``start``, slope² per metre²; None: not worked out."""
-
-    kind: SignalKind = SignalKind.XY
-    """What the signals are."""
-
-    start: Misregistration = field(default_factory=Misregistration)
-    """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

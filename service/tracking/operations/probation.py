@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation.comparison import Verdict
+from service.estimation.loop import same_but_for_modes, why_open
 from service.estimation.probation import WITHIN_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -23,7 +24,7 @@ from service.tracking.alarms import (
     alarm_blocks,
 )
 from service.tracking.events import Event
-from service.tracking.loop import CommandState, same_but_for_modes, why_open
+from service.tracking.loop import CommandState
 from service.tracking.operator import enter_hold, set_loop
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import (

@@ -9,15 +9,8 @@ import pytest
 import scipy
 
 from service.config.mirrors import rings
-from service.estimation.health import (
-    SLIPPED_RATIO,
-    SUSPECT_RATIO,
-    Actuators,
-    EdgeHealth,
-    EdgeWatch,
-    edge_watch,
-    observe_edge,
-)
+from service.estimation.description import Actuators, EdgeWatch, edge_watch
+from service.estimation.health import SLIPPED_RATIO, SUSPECT_RATIO, EdgeHealth, observe_edge
 from service.model.described import KarhunenLoeve
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from tests.numerics import block_of, small_instrument

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from service.estimation import passive
+from service.estimation.loop import loop_numbers
 from service.runtime.estimates import PendingWindow, fit_passive
 from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
-from service.tracking.loop import loop_numbers
 from service.tracking.state import Mode
 from tests.numerics import block_of
 from tests.unit.estimation.test_lockin import run, telemetry

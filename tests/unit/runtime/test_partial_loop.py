@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from service.config import load_settings
 from service.config.policy import policy_of
-from service.estimation.health import LOW_MODES
+from service.estimation.description import LOW_MODES
 from service.runtime.engine import shape_mismatch
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_rtc
 from service.runtime.passive_sums import take_passive_sums

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError, ModelError
+from service.estimation.description import Description
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn
 from service.estimation.random_dither import Correlated
 from service.estimation.windows import WindowRefused
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
-from service.runtime.worker import Description
 from service.tracking.dither_request import Dither, plan_random
 from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
+from service.estimation.description import LOW_MODES, Actuators, Description
 from service.estimation.frames import FrameBlock
-from service.estimation.health import LOW_MODES, Actuators
 from service.estimation.lockin import Spectra
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.runtime.engine import (
@@ -23,7 +23,6 @@ from service.runtime.estimator_bank import (
     with_rtc,
 )
 from service.runtime.passive_sums import take_passive_sums
-from service.runtime.worker import Description
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.dither_request import Dither

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation.loop import loop_numbers
 from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.loop import loop_numbers
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.window_processing import fit_begins_at

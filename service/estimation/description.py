@@ -1,0 +1,90 @@
+"""What the model says of the telescope that telemetry is held against: modes, actuators, ring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.kinds import SignalKind
+from service.model.misregistration import Misregistration
+
+LOW_MODES = 30
+"""Left out: tip, tilt and their like move the whole mirror by more than any slip."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Actuators:
+    """Where the actuators are, and how far each mode moves them."""
+
+    positions: NDArray[np.float64]
+    """``(n_actuators, 2)`` in any unit."""
+
+    strokes: NDArray[np.float64]
+    """``(n_actuators, n_modes)`` position for a unit command of each mode."""
+
+    @property
+    def outer(self) -> NDArray[np.bool_]:
+        """``(n_actuators,)`` within 4 % of the largest radius: one ring of FLAO's fourteen."""
+        radius = np.hypot(*self.positions.T)
+        return np.asarray(radius > 0.96 * radius.max())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Description:
+    """What the service must know of the model to check telemetry against it."""
+
+    n_slopes: int
+    n_modes: int
+    mode_variance_m2: NDArray[np.float64]
+    """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
+
+    actuators: Actuators | None = None
+    """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
+
+    mode_information: NDArray[np.float64] | None = None
+    """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
+
+    products: NDArray[np.float32] | None = None
+    """``(n_modes, n_modes)`` DᵀD at ``start``, slope² per metre²; None: not worked out."""
+
+    kind: SignalKind = SignalKind.XY
+    """What the signals are."""
+
+    start: Misregistration = field(default_factory=Misregistration)
+    """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EdgeWatch:
+    """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
+
+    modes: NDArray[np.intp]
+    """``(n_watched,)`` those of the loop that are not left out."""
+
+    outer: NDArray[np.float32]
+    """``(n_outer, n_watched)`` of the outermost ring."""
+
+    inner: NDArray[np.float32]
+    """``(n_watched, n_watched)`` mean products of all others: a form of the command, their
+    mean square, which tells how strong the turbulence is tonight."""
+
+
+def edge_watch(
+    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
+) -> EdgeWatch | None:
+    """Return what to watch in a loop of these modes; None when they are too few to say.
+
+    The same when nothing is known of the turbulence in the modes.
+    """
+    high, outer = in_loop[in_loop >= LOW_MODES], actuators.outer
+    strokes = actuators.strokes[:, high]
+    expected = np.sqrt(strokes**2 @ mode_variance_m2[high])
+    if len(high) <= LOW_MODES or expected.min() <= 0.0:
+        return None
+    shapes = strokes / expected[:, None]
+    inner = shapes[~outer].T @ shapes[~outer] / np.count_nonzero(~outer)
+    return EdgeWatch(
+        modes=high, outer=shapes[outer].astype(np.float32), inner=inner.astype(np.float32)
+    )

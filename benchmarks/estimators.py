@@ -168,9 +168,9 @@ def _watchers() -> Iterator[Part]:
         begin=LoopCheck(),
         feed=lambda state, block: loopcheck.observe(state, block, terms),
     )
-    monitor = VibrationMonitor.begin(N_SLOPES)
+    monitor = VibrationMonitor.of(N_SLOPES)
     yield Part(
-        name="vibrations", begin=monitor, feed=lambda state, block: state.update(block, LINES_HZ)
+        name="vibrations", begin=monitor, feed=lambda state, block: state.follow(block, LINES_HZ)
     )
 
 

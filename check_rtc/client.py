@@ -15,13 +15,9 @@ from check_rtc.connection import ANSWER_S, RtcConnection
 from check_rtc.requirements import Checked, fine, seen, skipped, wrong
 from check_rtc.watch import TelemetryObserver
 from service.errors import LinkError, WireError
-from service.estimation.dither_monitor import (
-    DitherMeasurement,
-    DitherMonitor,
-    ExpectedDither,
-    measure_block,
-)
+from service.estimation.dither_monitor import DitherMeasurement, DitherMonitor, measure_block
 from service.estimation.frames import FrameBlock
+from service.estimation.windows import ExpectedDither
 from service.wire import (
     CommandKind,
     DitherKind,

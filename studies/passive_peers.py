@@ -21,6 +21,7 @@ from OOPAO.Atmosphere import Atmosphere
 
 from service.config import load_instrument
 from service.estimation import passive
+from service.estimation.estimate import PassiveEstimate
 from service.estimation.frames import FrameBlock
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.kinds import Stop
@@ -169,7 +170,7 @@ def telemetry(
 
 def looks(
     sky: Sky, near: Linearisation, slopes: Array, commands: Array, dither: Array | None
-) -> list[passive.PassiveEstimate]:
+) -> list[PassiveEstimate]:
     """Return what looks of ``LOOK`` frames each say."""
     found, step_ns = [], round(1e9 / RATE_HZ)
     for begin in range(0, len(slopes) - LOOK + 1, LOOK):

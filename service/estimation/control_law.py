@@ -14,9 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
+from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
-from service.estimation.loopcheck import SIGNIFICANCE
+from service.estimation.loop import last_seq
+from service.estimation.loopcheck import AT_EASE_S, SIGNIFICANCE
 from service.estimation.windows import ClosedLoop
 from service.model.misregistration import unit_like
 
@@ -33,6 +36,9 @@ ENOUGH_FRAMES = 240
 
 JUDGED_EVERY = 200
 """Frames between two verdicts."""
+
+VERDICTS = 2
+"""That must agree that something is otherwise than told."""
 
 MORE_TAPS = 4
 """Frames looked back beyond the delay told: it may be longer, or the mirror lag."""
@@ -52,8 +58,11 @@ _STILL_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControlLawCheck:
-    """Frames of a loop that has not changed: feed it blocks with ``follow``."""
+class ControlLawCheck(Detector):
+    """Frames of a loop that has not changed, but for gains that follow the seeing."""
+
+    resets = Change.GONE | Change.STATUS | Change.STANDSTILL
+    unless = Mark.STANDS
 
     from_seq: int = 0
     """Frames before this may have been made by another loop."""
@@ -75,6 +84,47 @@ class ControlLawCheck:
 
     judged_seq: int = -JUDGED_EVERY
     """Up to here a verdict has been given."""
+
+    errors: tuple[str, ...] = ()
+    """What the last verdicts found to be otherwise than told, without a break."""
+
+    @classmethod
+    @override
+    def begin(cls, loop: LoopContext) -> ControlLawCheck:
+        """Return one that has seen nothing."""
+        return cls(from_seq=loop.from_seq)
+
+    @override
+    def update(self, frames: FrameContext) -> ControlLawCheck:
+        """Return it after one more block."""
+        return self if frames.terms is None else follow(self, frames.block, frames.terms)
+
+    @override
+    def on_status(self, loop: LoopContext) -> ControlLawCheck:
+        """Judge the frames up to a status."""
+        rtc = loop.rtc
+        if rtc is None or self.cm_id != rtc.cm_id:
+            return self
+        terms = loop.terms(rtc.cm_id)
+        if terms is None:
+            return self
+        law, found = judged(self, terms, last_seq(rtc))
+        if found is None:
+            return law
+        if found.wrong:
+            return replace(law, errors=(*law.errors, found.wrong)[-VERDICTS:])
+        rests = round(AT_EASE_S * rtc.frame_rate_hz)
+        return replace(law, judged_seq=law.judged_seq + rests, errors=())
+
+    @property
+    @override
+    def conditions(self) -> tuple[str | None, ...]:
+        """Whether the loop is another than told."""
+        wrong = (
+            f"the RTC's loop is not what its status tells: {'; '.join(self.errors[-1:])}; mend "
+            "its status, or its loop"
+        )
+        return (wrong if len(self.errors) >= VERDICTS else None,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,5 +264,10 @@ def _begun(law: ControlLawCheck, cm_id: str | None, loop: ClosedLoop) -> Control
     modes = in_loop[chosen] if len(in_loop) else in_loop
     none = np.zeros((0, len(modes)), np.float32)
     return ControlLawCheck(
-        from_seq=law.from_seq, cm_id=cm_id, modes=modes, commands_m=none, seen_m=none
+        from_seq=law.from_seq,
+        cm_id=cm_id,
+        modes=modes,
+        commands_m=none,
+        seen_m=none,
+        errors=law.errors,
     )

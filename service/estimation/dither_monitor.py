@@ -14,9 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.estimation.demodulation import cosines_and_sines
+from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
+from service.estimation.loop import last_seq
+from service.estimation.windows import ExpectedDither
 
 Array = NDArray[Any]
 
@@ -43,9 +47,6 @@ _GLANCED = 8
 SIDES_HZ = (-11, -7, -3, 3, 7, 11)
 """Where the noise of the slopes is measured, relative to a line; whole periods of a second."""
 
-HEARD_LINES = 4
-"""Lines on which the slopes are looked at: those that should show most."""
-
 UNANSWERED = 0.03
 """Share of the power expected below which, by 3 σ, nothing has moved: an optical gain of 0.17."""
 
@@ -53,40 +54,6 @@ REPEATED = 0.02
 """Share of frames with the very slopes of the frame before: these are frozen, and tell nothing."""
 
 _nothing = partial(np.zeros, (), np.float32)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ExpectedDither:
-    """A dither as the service asked for it."""
-
-    modes: tuple[int, ...]
-    """0-based basis indices."""
-
-    amplitude_m: tuple[float, ...]
-    """RMS of each, metres OPD."""
-
-    frequency_hz: tuple[float, ...]
-    """One for each mode of a sine; random signs have none."""
-
-    frame_rate_hz: float
-    first_seq: int
-    stop_seq: int
-    """First frame that holds it, and the first that holds it no more."""
-
-    own: tuple[bool, ...]
-    """Whether a mode is outside the loop: all that its command does is the dither. In the loop it
-    is amplified, and its column alone tells how strong it is."""
-
-    response: tuple[float, ...] = ()
-    """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
-
-    @property
-    def audible(self) -> list[int]:
-        """Which of the modes asked for are looked for in the slopes."""
-        if not self.frequency_hz or not self.response:
-            return []
-        expected = np.square(self.amplitude_m) * self.response
-        return [int(k) for k in np.argsort(expected)[::-1][:HEARD_LINES]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +104,60 @@ class DitherMonitor:
     powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of the slopes on the lines, its variance, and what is expected, summed until it can be told
     whether they answer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherWatch(Detector):
+    """Whether the dither that should be there is in the frames, as strong as it was asked for."""
+
+    resets = Change.GONE | Change.RATE | Change.LOOP | Change.DITHER
+
+    monitor: DitherMonitor | None = None
+    """Of how strong it is on the mirror; None: there is none, or none that can be read."""
+
+    measurement: DitherMeasurement | None = None
+    """What the last second of frames held of it; None: too few have come."""
+
+    seen_seq: int = 0
+    """Up to here the frames held it, or it need not have been there."""
+
+    silent_s: float = 0.0
+    """For how long the last frames should have held it and did not."""
+
+    @classmethod
+    @override
+    def begin(cls, loop: LoopContext) -> DitherWatch:
+        """Return one of the dither that plays; a status may announce one that began long ago."""
+        dither, rtc = loop.dither, loop.rtc
+        if dither is None or rtc is None:
+            return cls()
+        monitor = None if dither.plan is None else DitherMonitor(asked=dither)
+        return cls(monitor=monitor, seen_seq=max(dither.first_seq, last_seq(rtc)))
+
+    @override
+    def begun_anew(self, loop: LoopContext, why: Change) -> DitherWatch:
+        """Return it for another dither, or for modes that have come into the loop, or left it."""
+        if why != Change.LOOP:
+            return self.begin(loop)
+        if loop.dither is None or self.monitor is None:
+            return self
+        return replace(self, monitor=with_expected(self.monitor, loop.dither))
+
+    @override
+    def update(self, frames: FrameContext) -> DitherWatch:
+        """Return it after one more block; what stands answers nothing."""
+        block, dither, watch = frames.block, frames.loop.dither, self
+        if watch.monitor is not None:
+            monitor, found = measure_block(watch.monitor, block)
+            watch = replace(watch, monitor=monitor, measurement=found or watch.measurement)
+        if Mark.STANDS in frames.marks:
+            watch = replace(watch, measurement=None)
+        if block.is_dithered:
+            return replace(watch, seen_seq=block.next_seq, silent_s=0.0)
+        if dither is None:
+            return watch
+        silent = max(min(block.next_seq, dither.stop_seq) - watch.seen_seq, 0)
+        return replace(watch, silent_s=silent / frames.rtc.frame_rate_hz)
 
 
 def measure_block(

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.model.misregistration import Determination
 
@@ -19,6 +20,15 @@ MODEL_ERROR = 15.0
 """Variance of α per unit of misfit above 1, over that of its scatter: what the model leaves over is
 smooth across the pupil and pulls at α more than noise of the same power. From campaigns on the
 diffractive telescope, two truths and two models (docs/results/night.md)."""
+
+
+BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
+"""1 σ nobody may go below without a dither: the wind's bias, and the model's own error."""
+
+BIAS_OVER_SCATTER = np.array([10.0, 10.0, 2.0, 0.0])
+"""Where the loop's own noise hardly shows (a bright star in 25 m/s) the scatter grows, and the bias
+with it: a quarter of a subaperture was seen at a scatter of 0.014. On 12 subapertures a bright star
+turns it, too: by up to 1 deg at a scatter of 0.4, in OOPAO's loops."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,6 +46,26 @@ class Estimate(Determination):
 
     step: NDArray[np.float64]
     """``(4,)`` distance from the linearisation to the estimate, numeric units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PassiveEstimate(Estimate):
+    """What ordinary telemetry says of the registration.
+
+    The covariance is of the scatter alone: the bias is not in it. A misfit of NaN: too young to
+    tell.
+    """
+
+    @property
+    def bias_excess(self) -> NDArray[np.float64]:
+        """``(4,)`` variance that the scatter tells the bias to have beyond ``BIAS_FLOOR``."""
+        return np.asarray(np.diag(self.covariance) * BIAS_OVER_SCATTER**2)
+
+    @property
+    @override
+    def sigma(self) -> NDArray[np.float64]:
+        """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
+        return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2 + self.bias_excess))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -21,8 +21,10 @@ from typing import Any
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.estimation.description import EdgeWatch
+from service.estimation.estimator import UNMARKED, Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
 from service.model.kinds import SignalKind
 from service.model.misregistration import unit_like
@@ -47,8 +49,12 @@ holds again shows it within a second, not after seven memories."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopHealth:
+class LoopHealth(Detector):
     """Forgetting mean of how far the high modes are beyond what turbulence asks of them."""
+
+    resets = Change.SESSION | Change.OPEN | Change.MATRIX
+    unless = Mark.STANDS
+    only_closed = True
 
     ratio: float = 0.0
     """RMS of the command in the upper half of the controlled modes over its expectation."""
@@ -56,6 +62,37 @@ class LoopHealth:
     diverging: bool = False
     absurd: bool = False
     """Whether commands are beyond any mirror and came there at once, as no loop does."""
+
+    @override
+    def begun_anew(self, loop: LoopContext, why: Change) -> LoopHealth:
+        """Return it with nothing; what another matrix made of the loop says nothing of this one."""
+        return replace(self, ratio=0.0) if why == Change.MATRIX else LoopHealth()
+
+    @override
+    def update(self, frames: FrameContext) -> LoopHealth:
+        """Return it after one more block."""
+        loop = frames.loop
+        return observe(self, frames.block, loop.description.mode_variance_m2, loop.in_loop)
+
+    @property
+    @override
+    def marks(self) -> Mark:
+        """Whether commands are those of no mirror."""
+        return Mark.ABSURD if self.absurd else UNMARKED
+
+    @property
+    @override
+    def conditions(self) -> tuple[str | None, ...]:
+        """Whether commands are in another unit, and whether the loop runs away."""
+        absurd = (
+            f"commands are {self.ratio:.3g} times what turbulence asks: {self.unit}; nothing is "
+            "measured, made or sent until the RTC sends metres"
+        )
+        diverging = (
+            f"the loop is diverging: its high modes carry {self.ratio:.0f} times what turbulence "
+            "asks of them; open the loop, lower the gain or control fewer modes"
+        )
+        return absurd if self.absurd else None, diverging if self.diverging else None
 
     @property
     def unit(self) -> str:
@@ -119,8 +156,12 @@ _EDGE_MEMORY_S = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EdgeHealth:
+class EdgeHealth(Detector):
     """Forgetting means of what the two parts of the mirror do."""
+
+    resets = Change.LOOP
+    unless = Mark.STANDS | Mark.ABSURD
+    only_closed = True
 
     position: NDArray[np.float32] | None = None
     """``(n_outer,)`` averaged position, in σ of the turbulence the basis was made for."""
@@ -135,6 +176,28 @@ class EdgeHealth:
     """For how long the ratio has been above ``SUSPECT_RATIO``."""
 
     slipped: bool = False
+
+    @override
+    def begun_anew(self, loop: LoopContext, why: Change) -> EdgeHealth:
+        """Return it with nothing where the loop is open; a ring nobody watches has not slipped."""
+        return EdgeHealth() if loop.edge is None else self
+
+    @override
+    def update(self, frames: FrameContext) -> EdgeHealth:
+        """Return it after one more block."""
+        watch = frames.loop.edge
+        return self if watch is None else observe_edge(self, frames.block, watch)
+
+    @property
+    @override
+    def conditions(self) -> tuple[str | None, ...]:
+        """Whether the edge has slipped."""
+        slipped = (
+            f"an outer actuator stands {self.ratio:.0f} sigma from where turbulence would have it: "
+            "the edge has slipped, whatever the slopes say; open the loop and close it again with "
+            "fewer modes or a leak of 0.99"
+        )
+        return (slipped if self.slipped else None,)
 
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
@@ -252,11 +315,15 @@ class SlopeSpectra:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class VibrationMonitor:
-    """What vibrates while no dither plays, and under one: feed it blocks with ``update``.
+class VibrationMonitor(Detector):
+    """What vibrates while no dither plays, and under one.
 
     Apart, because only a pause tells a vibration from a dither that plays on it.
     """
+
+    resets = Change.GONE | Change.RATE
+    unless = Mark.STANDS
+    only_closed = True
 
     quiet: SlopeSpectra
     dithered: SlopeSpectra
@@ -267,7 +334,19 @@ class VibrationMonitor:
     """Vibration lines as of the last look, lowest first."""
 
     @classmethod
-    def begin(cls, n_slopes: int, kind: SignalKind = SignalKind.XY) -> VibrationMonitor:
+    @override
+    def begin(cls, loop: LoopContext) -> VibrationMonitor:
+        """Return one that has seen nothing of this RTC."""
+        known = loop.description
+        return cls.of(known.n_slopes if loop.rtc is None else loop.rtc.n_slopes, known.kind)
+
+    @override
+    def update(self, frames: FrameContext) -> VibrationMonitor:
+        """Return it after one more block."""
+        return self.follow(frames.block, frames.lines_hz)
+
+    @classmethod
+    def of(cls, n_slopes: int, kind: SignalKind = SignalKind.XY) -> VibrationMonitor:
         """Return the monitor of signals of which nothing has been seen yet.
 
         It looks at the mean x and y slopes, and at fixed patterns of random signs.
@@ -279,7 +358,7 @@ class VibrationMonitor:
         views[2:] = signs / np.sqrt(n_slopes)
         return cls(quiet=SlopeSpectra(views=views), dithered=SlopeSpectra(views=views))
 
-    def update(self, block: FrameBlock, dither_hz: tuple[float, ...]) -> VibrationMonitor:
+    def follow(self, block: FrameBlock, dither_hz: tuple[float, ...]) -> VibrationMonitor:
         """Return it after a block played under these dither lines; lines are sought now and then.
 
         Another dither's spectra begin anew.

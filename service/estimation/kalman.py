@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.passive import BIAS_FLOOR
+from service.estimation.estimate import BIAS_FLOOR
 
 Array = NDArray[np.float64]
 

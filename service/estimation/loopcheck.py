@@ -19,9 +19,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
+from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock, joined_frames
-from service.estimation.windows import ClosedLoop
+from service.estimation.loop import last_seq
+from service.estimation.windows import ClosedLoop, Telemetry
 
 Array = NDArray[Any]
 
@@ -36,6 +39,12 @@ KEPT_SAMPLES = 512
 
 ENOUGH_SAMPLES = 20
 """Fewer judge nothing."""
+
+WINDOW_SAMPLES = 5
+"""Frames of a window that must have been looked at before it can be said to be off the loop."""
+
+AT_EASE_S = 1.3
+"""A loop that was just found to do as it is told to is not asked again before."""
 
 TOLERANCE = 0.2
 """A mode that takes less than 0.8 or more than 1.2 of its steps does not obey."""
@@ -64,8 +73,11 @@ _SPANS_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopCheck:
-    """Samples of a loop that has not changed: feed it blocks with ``observe``."""
+class LoopCheck(Detector):
+    """Samples of a loop that has not changed, and what the last of them told."""
+
+    resets = Change.GONE | Change.LOOP | Change.STANDSTILL
+    unless = Mark.STANDS
 
     from_seq: int = 0
     """Frames before this may have been made by another loop."""
@@ -81,6 +93,63 @@ class LoopCheck:
 
     batches: tuple[_Batch, ...] = ()
     """Oldest first, bounded."""
+
+    obeyed_seq: int = 0
+    """Up to here the commands were found to obey the loop."""
+
+    residual: CommandResidual | None = None
+    """How the commands fail to obey the loop; None: they obey, or nobody knows."""
+
+    @classmethod
+    @override
+    def begin(cls, loop: LoopContext) -> LoopCheck:
+        """Return one that has seen nothing: frames on their way may be of the loop as it was."""
+        return cls(from_seq=loop.from_seq)
+
+    @override
+    def update(self, frames: FrameContext) -> LoopCheck:
+        """Return it after one more block."""
+        return self if frames.terms is None else observe(self, frames.block, frames.terms)
+
+    @override
+    def on_status(self, loop: LoopContext) -> LoopCheck:
+        """Judge the frames up to a status that shows the same loop as the one before."""
+        rtc = loop.rtc
+        if rtc is None:
+            return self
+        seq, terms = last_seq(rtc), loop.terms(rtc.cm_id)
+        if self.residual is None and seq < self.obeyed_seq + AT_EASE_S * rtc.frame_rate_hz:
+            return self
+        span = last_samples(self, seq)
+        if span is None or terms is None:
+            return self
+        check, found = command_residual(self, terms, *span)
+        if found is None or found.holds:
+            return replace(check, residual=None, obeyed_seq=seq)
+        return replace(check, residual=found)
+
+    @override
+    def vet(self, window: Telemetry, loop: LoopContext) -> tuple[LoopCheck, str | None]:
+        """Return why the commands of a window are not what the loop makes of its slopes."""
+        terms = loop.terms(window.cm_id)
+        if terms is None:
+            return self, None
+        last, n_frames = window.first_seq + window.plan.n_frames - 1, window.plan.n_frames
+        check, found = command_residual(self, terms, window.first_seq, last, WINDOW_SAMPLES)
+        if found is None:
+            return check, None
+        if not found.holds:
+            return check, found.text
+        if n_frames / terms.frame_rate_hz >= ENOUGH_SAMPLES / SAMPLES_PER_S:
+            # what a long window shows need not be asked again
+            check = replace(check, obeyed_seq=max(last, check.obeyed_seq))
+        return check, None
+
+    @property
+    @override
+    def conditions(self) -> tuple[str | None, ...]:
+        """Whether the commands fail to obey."""
+        return (None if self.residual is None else self.residual.text,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -156,7 +225,7 @@ def observe(check: LoopCheck, block: FrameBlock, loop: ClosedLoop) -> LoopCheck:
     if n_delay > LARGEST_DELAY_FRAMES or block.cm_id != loop.cm_id:
         return replace(check, tail=None)
     if check.cm_id != loop.cm_id:  # frames of another matrix come before the status that tells it
-        check = LoopCheck(from_seq=check.from_seq, cm_id=loop.cm_id)
+        check = replace(check, cm_id=loop.cm_id, tail=None, waiting=(), batches=())
     depth = n_delay + _STEPS + _TAPS - 1
     tail = check.tail
     if tail is not None and not _goes_on(tail, block):

@@ -23,14 +23,18 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.estimation.estimate import Estimate
+from service.estimation.estimate import PassiveEstimate
+from service.estimation.estimator import FrameContext, LoopContext
 from service.estimation.frames import FrameBlock, joined_frames
+from service.estimation.passive_sums import MIN_FRAMES_PER_MODE, PassiveSums
 from service.estimation.solver import Columns
 from service.estimation.windows import CHUNK_FRAMES
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
 Array = NDArray[Any]
+
+PASSIVE_MEMORY_S = 10.0
 
 N_TAPS = 11
 """Longer filters know turbulence from noise no better, and lose more frames at every gap."""
@@ -69,21 +73,10 @@ SAMPLES_KEPT = 64
 SAMPLE_FRAMES = 128
 """One sample in as many frames."""
 
-BIAS_FLOOR = np.array([0.10, 0.10, np.deg2rad(0.05), 0.001])
-"""1 σ nobody may go below without a dither: the wind's bias, and the model's own error."""
-
-BIAS_OVER_SCATTER = np.array([10.0, 10.0, 2.0, 0.0])
-"""Where the loop's own noise hardly shows (a bright star in 25 m/s) the scatter grows, and the bias
-with it: a quarter of a subaperture was seen at a scatter of 0.014. On 12 subapertures a bright star
-turns it, too: by up to 1 deg at a scatter of 0.4, in OOPAO's loops."""
-
 SHRUNK = 0.2
 """Share of the correlations between parameters that is not believed. They are estimated from the
 few errors of columns that are independent of one another, and what seems known best of all is what
 chance has made small: one look in 60 lay five of its own σ away in such a direction."""
-
-MIN_FRAMES_PER_MODE = 5
-"""Fewer effective frames leave the command covariance too noisy to invert."""
 
 MIN_SAMPLES = 8
 """Fewer filtered frames do not tell how noisy the slopes are."""
@@ -164,31 +157,8 @@ def high_pass(delay_frames: float) -> HighPass:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PassiveEstimate(Estimate):
-    """What ordinary telemetry says of the registration.
-
-    The covariance is of the scatter alone: the bias is not in it. A misfit of NaN: too young to
-    tell.
-    """
-
-    @property
-    def bias_excess(self) -> NDArray[np.float64]:
-        """``(4,)`` variance that the scatter tells the bias to have beyond ``BIAS_FLOOR``."""
-        return np.asarray(np.diag(self.covariance) * BIAS_OVER_SCATTER**2)
-
-    @property
-    @override
-    def sigma(self) -> NDArray[np.float64]:
-        """``(4,)`` 1 σ in numeric units where nothing is known of the bias."""
-        return np.asarray(np.sqrt(np.diag(self.covariance) + BIAS_FLOOR**2 + self.bias_excess))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Passive:
-    """Forgetting sums over filtered commands: feed it blocks with ``accumulate``."""
-
-    n_modes: int
-    """Controlled modes: the only ones that move by themselves."""
+class Passive(PassiveSums):
+    """Forgetting sums over filtered commands."""
 
     memory_frames: float
     """Frames after which a sample's weight has fallen to 1/e."""
@@ -200,14 +170,8 @@ class Passive:
     """Of s z^T ``(n_slopes, n_modes)``, metres, of c z^T and z z^T ``(n_modes, n_modes)``, metres²;
     z are the filtered commands. Empty: of no frame."""
 
-    n_effective: float = 0.0
-    """Frames in the sums, forgetting included."""
-
     samples: tuple[tuple[Array, Array], ...] = ()
     """Filtered slopes ``(n_slopes,)`` and commands ``(n_modes,)`` of single frames."""
-
-    tail: FrameBlock | None = None
-    """The last frames, as many as the filter reaches back."""
 
     waiting: tuple[FrameBlock, ...] = ()
     """Frames that are not multiplied yet and, before them, those that the filter reaches back to;
@@ -219,18 +183,47 @@ class Passive:
     begun: bool = False
     """Whether frames of this run have been multiplied."""
 
-    from_seq: int = 0
-    """Frames before this one are left out."""
+    @classmethod
+    @override
+    def begin(cls, loop: LoopContext) -> Passive:
+        """Return sums of the loop that have begun with nothing."""
+        rtc = loop.rtc
+        if rtc is None:
+            return cls(n_modes=0, memory_frames=1.0)
+        return cls(
+            n_modes=rtc.n_controlled,
+            memory_frames=PASSIVE_MEMORY_S * rtc.frame_rate_hz,
+            delay_frames=rtc.delay_frames,
+        )
 
-    since_ns_utc: int = 0
-    """No frame in the sums is older, by the RTC's clock; 0: not known."""
+    @override
+    def update(self, frames: FrameContext) -> Passive:
+        """Return them with one more block."""
+        return accumulate(self, frames.moving)
+
+    @override
+    def emptied(self) -> Passive:
+        """Return them with nothing multiplied."""
+        return replace(self, sums=(), n_effective=0.0)
+
+    @override
+    def resting(self) -> Passive:
+        """Return them with nothing at all."""
+        return replace(self.emptied(), waiting=(), begun=False)
+
+    @override
+    def fit(self, linearisation: Linearisation) -> PassiveEstimate | None:
+        """Estimate α about a linearisation; None: too few frames have come."""
+        return fit(self, linearisation)
 
     @property
+    @override
     def n_waiting(self) -> int:
         """Frames that the filter reaches both ends of and that are not multiplied yet."""
         return max(sum(block.n_frames for block in self.waiting) - _REACH, 0)
 
     @property
+    @override
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""
         if self.delay_frames >= MIN_DELAY_FRAMES:

@@ -20,6 +20,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.estimation.comparison import (
     INNER,
@@ -33,8 +34,11 @@ from service.estimation.comparison import (
     not_compared,
 )
 from service.estimation.description import EdgeWatch
+from service.estimation.estimator import Change, Detector, FrameContext, LoopContext, Mark
 from service.estimation.frames import FrameBlock
+from service.estimation.loop import same_but_for_modes
 from service.estimation.residual import Reader
+from service.wire import Status
 
 Array = NDArray[np.float64]
 
@@ -83,8 +87,12 @@ rate may be 0 in all of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Comparison:
-    """Telemetry with the matrix in use and with the one before: feed it blocks with ``observe``."""
+class Comparison(Detector):
+    """Telemetry with the matrix in use and with the one before."""
+
+    resets = Change.GONE
+    unless = Mark.STANDS | Mark.ABSURD
+    only_closed = True
 
     cm_id: str | None = None
     """Of the last block."""
@@ -121,6 +129,25 @@ class Comparison:
 
     found: ProbationFinding | None = None
     """Of the last swap; None: it is being looked at, or there was none."""
+
+    of_loop: Status | None = None
+    """The loop that both must be of, but for how many modes are controlled."""
+
+    @override
+    def on_status(self, loop: LoopContext) -> Comparison:
+        """Compare only what one loop does, under two matrices; gains may follow the seeing."""
+        before, rtc = self.of_loop, loop.rtc
+        if rtc is None or before is None or not same_but_for_modes(before, rtc):
+            begun = begun_anew(self, "the loop was changed after the swap")
+            return replace(begun, of_loop=rtc)
+        return self if self.before is not None else replace(self, of_loop=rtc)
+
+    @override
+    def update(self, frames: FrameContext) -> Comparison:
+        """Return it after one more block."""
+        loop, terms = frames.loop, frames.terms
+        matrix = None if terms is None else terms.reconstructor
+        return observe(self, frames.block, loop.in_loop, frames.lines_hz, loop.edge, matrix)
 
 
 def begun_anew(state: Comparison, why: str) -> Comparison:
@@ -224,7 +251,7 @@ def _observed(
 def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
     """Return what is compared from now on: what there is of the matrix until now is the before."""
     same_session = state.tail is not None and state.tail.session == block.session
-    fresh = Comparison(cm_id=block.cm_id, dithered=state.dithered)
+    fresh = Comparison(cm_id=block.cm_id, dithered=state.dithered, of_loop=state.of_loop)
     if state.healthy is not None and block.cm_id is not None and same_session:
         return replace(fresh, before=state.healthy, reader=state.reader, returned=True)
     if state.cm_id is None or block.cm_id is None or state.modes is None or not same_session:

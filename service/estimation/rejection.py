@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
+from service.estimation.estimator import Change, Detector, FrameContext, Mark
 from service.estimation.frames import FrameBlock
 
 Array = NDArray[np.float64]
@@ -22,8 +24,12 @@ LEFT_IN_MEDIAN = 0.35
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rejection:
-    """Forgetting sums over frames of one loop: feed it blocks with ``follow``."""
+class Rejection(Detector):
+    """Forgetting sums over frames of one loop."""
+
+    resets = Change.OPEN
+    unless = Mark.STANDS
+    only_closed = True
 
     lasts_s: float = 0.0
     """Telemetry that has entered."""
@@ -33,6 +39,12 @@ class Rejection:
 
     commanded: Array | None = None
     """``(n_modes,)`` of the commands."""
+
+    @override
+    def update(self, frames: FrameContext) -> Rejection:
+        """Return it after one more block."""
+        rtc, in_loop = frames.rtc, frames.loop.in_loop
+        return self.follow(frames.block, in_loop, np.array(rtc.gains)[in_loop], rtc.leak)
 
     def follow(
         self, block: FrameBlock, in_loop: NDArray[np.intp], gains: Array, leak: float

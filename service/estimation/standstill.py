@@ -7,7 +7,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
+from service.estimation.estimator import UNMARKED, Change, Detector, FrameContext, Mark
 from service.estimation.frames import FrameBlock
 
 STRIDE = 8
@@ -22,8 +24,11 @@ ALARM_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Standstill:
-    """The last slopes, and for how long they have been the same: feed it blocks with ``follow``."""
+class Standstill(Detector):
+    """The last slopes, and for how long they have been the same."""
+
+    resets = Change.OPEN
+    only_closed = True
 
     session: str = ""
     slopes: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -37,6 +42,23 @@ class Standstill:
 
     lasts_s: float = 0.0
     """Until the last frame looked at."""
+
+    @override
+    def update(self, frames: FrameContext) -> Standstill:
+        """Return it after one more block."""
+        return self.follow(frames.block)
+
+    @property
+    @override
+    def marks(self) -> Mark:
+        """Whether nothing can be measured with these slopes."""
+        return Mark.STANDS if self.stands else UNMARKED
+
+    @property
+    @override
+    def conditions(self) -> tuple[str | None, ...]:
+        """What is the matter if that lasts."""
+        return (self.text,)
 
     @property
     def stands(self) -> bool:

@@ -24,6 +24,9 @@ class ClosedLoop(ControlLoop):
     """Of the reconstructor; None: the RTC does not know."""
 
 
+SETTLING_S = 0.3
+"""Of the loop, after a dither has begun, before the first window."""
+
 CHUNK_FRAMES = 512
 """Frames multiplied at once: the sums, some MB, are read from memory once for all of them."""
 
@@ -69,6 +72,51 @@ class WindowPlan:
             f"mode {self.modes[worst]} carries {applied_m[worst] * 1e9:.2f} nm of dither{place}, "
             f"{self.amplitude_m[worst] * 1e9:.2f} nm were asked for: {see}"
         )
+
+
+HEARD_LINES = 4
+"""Lines on which the slopes are looked at: those that should show most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ExpectedDither:
+    """A dither as the service asked for it."""
+
+    modes: tuple[int, ...]
+    """0-based basis indices."""
+
+    amplitude_m: tuple[float, ...]
+    """RMS of each, metres OPD."""
+
+    frequency_hz: tuple[float, ...]
+    """One for each mode of a sine; random signs have none."""
+
+    frame_rate_hz: float
+    first_seq: int
+    stop_seq: int
+    """First frame that holds it, and the first that holds it no more."""
+
+    own: tuple[bool, ...]
+    """Whether a mode is outside the loop: all that its command does is the dither. In the loop it
+    is amplified, and its column alone tells how strong it is."""
+
+    response: tuple[float, ...] = ()
+    """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
+
+    id: str = ""
+    plan: WindowPlan | None = None
+    """How its windows are cut; None: they cannot be."""
+
+    why_unreadable: str = ""
+    """Why."""
+
+    @property
+    def audible(self) -> list[int]:
+        """Which of the modes asked for are looked for in the slopes."""
+        if not self.frequency_hz or not self.response:
+            return []
+        expected = np.square(self.amplitude_m) * self.response
+        return [int(k) for k in np.argsort(expected)[::-1][:HEARD_LINES]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

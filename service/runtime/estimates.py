@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
 from service.estimation import lockin, random_dither
+from service.estimation.dither_windows import EndedWindow
 from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.loop import loop_numbers
 from service.estimation.openloop import WideCaptureEstimate
 from service.estimation.orientation import setting_written
-from service.estimation.passive import Passive
+from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
 from service.estimation.windows import ClosedLoop, Telemetry, WindowRefused
 from service.model.instrument import Instrument
@@ -52,7 +53,7 @@ class PendingWindow:
     """
 
     def __init__(self) -> None:
-        self._window: Spectra | Correlated | None = None
+        self._window: EndedWindow | None = None
         self._first_end_ns = 0
         self._new = asyncio.Event()
 
@@ -61,7 +62,7 @@ class PendingWindow:
         """Whether a window waits."""
         return self._window is not None
 
-    def put(self, window: Spectra | Correlated) -> WindowRefused | None:
+    def put(self, window: EndedWindow) -> WindowRefused | None:
         """Add a window; return why the one that waited is given up, where it has to be."""
         waiting = self._window
         late = window.t_end_ns_utc - self._first_end_ns > LONGEST_S * 1e9
@@ -83,14 +84,14 @@ class PendingWindow:
         """Wait until a window is there."""
         await self._new.wait()
 
-    def take(self) -> Spectra | Correlated | None:
+    def take(self) -> EndedWindow | None:
         """Return the window that waits."""
         self._new.clear()
         window, self._window = self._window, None
         return window
 
 
-def _joined(one: Spectra | Correlated, other: Spectra | Correlated) -> Spectra | Correlated | None:
+def _joined(one: EndedWindow, other: EndedWindow) -> EndedWindow | None:
     if isinstance(one, Spectra) and isinstance(other, Spectra):
         return lockin.joined(one, other)
     if isinstance(one, Correlated) and isinstance(other, Correlated) and one.is_like(other):
@@ -99,7 +100,7 @@ def _joined(one: Spectra | Correlated, other: Spectra | Correlated) -> Spectra |
 
 
 async def fitted(
-    window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
+    window: EndedWindow, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> Event:
     """Return what becomes of one window: an estimate, or why there is none."""
     try:
@@ -118,7 +119,7 @@ async def fitted(
 
 
 async def _outcome(
-    window: Spectra | Correlated, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
+    window: EndedWindow, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> LockInEstimate | RandomEstimate | WideCaptureEstimate | WindowRefused:
     rtc, registration = state.loop.rtc, state.alpha.registration
     start = None if registration is None else registration.alpha
@@ -157,36 +158,35 @@ def _reconstructor(
 
 
 async def fit_passive(
-    sums: Passive | str | None, state: TrackerState, workers: WorkerPort
-) -> ev.PassiveFitted | ev.PassiveUnavailable | ev.LogEvent | None:
-    """Return what the watchdog makes of ordinary telemetry, or why it can make nothing of it.
+    every: Sequence[PassiveSums | str | None], state: TrackerState, workers: WorkerPort
+) -> list[Event]:
+    """Return what estimators make of ordinary telemetry, or why none can make anything of it.
 
-    None: there is no more to tell than before.
+    Empty: there is no more to tell than before.
     """
-    if sums is None:
-        return None
-    if isinstance(sums, str):
-        return (
-            None
-            if sums == state.alpha.passive_unavailable_reason
-            else ev.PassiveUnavailable(text=sums)
-        )
-    last = sums.tail
-    if last is None:
-        return None
-    end_ns = last.t0_ns_utc + (last.n_frames - 1) * last.dt_ns
-    try:
-        estimate = await workers.call(OpticsWorker.fit_passive, sums, fit_begins_at(state))
-    except PyrcalError as error:
-        return ev.LogEvent(name="watchdog.failed", text=str(error), level=Level.WARNING)
-    if estimate is None:
-        return None
-    return ev.PassiveFitted(
-        estimate=estimate,
-        t_ns_utc=end_ns,
-        began_ns_utc=sums.since_ns_utc,
-        loop=loop_numbers(state.loop.rtc),
-    )
+    reasons = [sums for sums in every if isinstance(sums, str)]
+    if len(reasons) == len(every):
+        known = state.alpha.passive_unavailable_reason
+        return [ev.PassiveUnavailable(text=why) for why in reasons[:1] if why != known]
+    events: list[Event] = []
+    for sums in every:
+        if not isinstance(sums, PassiveSums) or sums.tail is None:
+            continue
+        try:
+            estimate = await workers.call(OpticsWorker.fit_passive, sums, fit_begins_at(state))
+        except PyrcalError as error:
+            text = str(error)
+            events.append(ev.LogEvent(name="watchdog.failed", text=text, level=Level.WARNING))
+            continue
+        if estimate is not None:
+            found = ev.PassiveFitted(
+                estimate=estimate,
+                t_ns_utc=sums.end_ns_utc,
+                began_ns_utc=sums.since_ns_utc,
+                loop=loop_numbers(state.loop.rtc),
+            )
+            events.append(found)
+    return events
 
 
 async def read_own_matrix(

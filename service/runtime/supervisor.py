@@ -18,8 +18,10 @@ from service.archive import Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.estimation.description import Description
+from service.estimation.dither_windows import EndedWindow
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import Spectra
+from service.estimation.passive_sums import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
 from service.link.matrices import MeasuredMatrix
 from service.link.statistics import LinkStatistics
@@ -29,10 +31,9 @@ from service.runtime.actions import Actions
 from service.runtime.archiving import Actor, ArchiveWriter, ids_of
 from service.runtime.clock import ServiceClock
 from service.runtime.command_results import GivenCommand
-from service.runtime.engine import Engine, process_blocks
+from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
-from service.runtime.estimator_bank import EstimatorBank, Window
-from service.runtime.passive_sums import PASSIVE_INTERVAL_S
+from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
 from service.runtime.readiness import (
     Losses,
     ReadinessInputs,
@@ -255,7 +256,7 @@ class Supervisor:
     @property
     def description(self) -> Description | None:
         """What the model expects of telemetry; None: it is being prepared."""
-        return None if self._engine.bank is None else self._engine.bank.description
+        return None if self._engine.bank is None else self._engine.bank.loop.description
 
     async def _described(self) -> Description:
         """Return what the model expects of telemetry; a worker that dies is replaced."""
@@ -294,7 +295,7 @@ class Supervisor:
             if bank is None:
                 return
             blocks: list[FrameBlock] = []
-            found: tuple[EstimatorBank, list[Window]] = bank, []
+            found: Fed = bank, []
             with self._surviving("telemetry"):
                 try:
                     blocks, found = await loop.run_in_executor(
@@ -306,9 +307,7 @@ class Supervisor:
             for block in blocks:
                 self._worker_load.count_frames(block.n_frames * block.dt_ns * 1e-9)
 
-    def _taken_in(
-        self, bank: EstimatorBank
-    ) -> tuple[list[FrameBlock], tuple[EstimatorBank, list[Window]]]:
+    def _taken_in(self, bank: EstimatorBank) -> tuple[list[FrameBlock], Fed]:
         blocks = self._bridge.drain(before_events=True)
         return blocks, process_blocks(bank, blocks)
 
@@ -316,8 +315,7 @@ class Supervisor:
     def _surviving(self, what: str) -> Iterator[None]:
         """Go on after a fault that nobody foresaw: it is on record, and costs what was gathered.
 
-        The estimators begin anew before anything is posted: each event leads them on, so that what
-        broke one would break the report of it as well.
+        The estimators begin anew before anything is posted: each event leads them on.
         """
         try:
             yield
@@ -329,7 +327,7 @@ class Supervisor:
             self._engine.begin_anew()
             self._note("internal.error", text, Level.ALARM)
 
-    def fit(self, window: Spectra | Correlated) -> None:
+    def fit(self, window: EndedWindow) -> None:
         """Put a window where the worker finds it."""
         if isinstance(window, Correlated):
             self._actions.noisy.take(window, self._engine.state)
@@ -407,8 +405,8 @@ class Supervisor:
             async with self._workers.turn(OpticsWorker.fit_passive):
                 async with self._telemetry_lock:
                     sums = self._engine.take_sums()
-                event = await fit_passive(sums, self._engine.state, self._workers)
-            if event is not None:
+                events = await fit_passive(sums, self._engine.state, self._workers)
+            for event in events:
                 self._post(event)
 
     def _post(self, event: Event, cause: str = "") -> tuple[Effect, ...]:

@@ -15,6 +15,7 @@ from service.control.dither import (
     tabulated,
 )
 from service.estimation.loop import why_open
+from service.estimation.windows import SETTLING_S
 from service.tracking import mode_proof
 from service.tracking.alarms import Interlock
 from service.tracking.dither_modes import (
@@ -26,7 +27,6 @@ from service.tracking.dither_modes import (
 from service.tracking.dither_request import (
     OUR_DITHERS,
     OWN_DITHER,
-    SETTLING_S,
     SPARE_S,
     Dither,
     DitherParameters,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from service.control.dither import Schedule, clear_of
 from service.errors import CommandError, ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
-from service.estimation.dither_monitor import ExpectedDither
 from service.estimation.lockin import LockInPlan
 from service.estimation.random_dither import FRAMES_PER_MODE, RandomPlan
+from service.estimation.windows import SETTLING_S, ExpectedDither
 from service.tracking.dither_modes import LINE_FRACTIONS, LINE_RANGE, N_LINES, chosen_modes
 from service.tracking.policy import Policy
 from service.tracking.products import ModeSet
@@ -22,9 +22,6 @@ from service.wire import DitherKind, DitherRequest, Status
 CLEARANCES_HZ = (21.0, 8.0)
 """Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond
 a vibration's own width."""
-
-SETTLING_S = 0.3
-"""Of the loop, after a dither has begun, before the first window."""
 
 SPARE_S = 0.3
 """Of dither behind the last window, for one that begins late because frames were lost."""
@@ -205,6 +202,7 @@ def expected_dither(
     if products is not None and max(modes) < len(products):
         response = tuple(products[modes, modes].tolist())
     return ExpectedDither(
+        id=dither.id,
         modes=request.modes,
         amplitude_m=request.amplitude_m,
         frequency_hz=dither.frequency_hz,

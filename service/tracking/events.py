@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from service.control.expected_gain import ExpectedGain
 from service.control.gate import GateVerdict
 from service.estimation.comparison import ProbationFinding
+from service.estimation.estimate import PassiveEstimate
 from service.estimation.lockin import LockInEstimate
 from service.estimation.openloop import WideCaptureEstimate
-from service.estimation.passive import PassiveEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration

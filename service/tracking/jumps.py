@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation.estimate import BIAS_FLOOR
 from service.estimation.kalman import JUMP_THRESHOLD, Joint
-from service.estimation.passive import BIAS_FLOOR
 from service.model.misregistration import Misregistration
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (

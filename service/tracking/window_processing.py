@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import kalman
+from service.estimation.estimate import PassiveEstimate
 from service.estimation.kalman import Joint
 from service.estimation.loop import loop_numbers, same_numbers
-from service.estimation.passive import PassiveEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind
 from service.model.misregistration import Misregistration, step_text

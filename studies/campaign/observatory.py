@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PyrcalError
-from service.estimation.lockin import Spectra
+from service.estimation.dither_windows import EndedWindow
+from service.estimation.passive_sums import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
 from service.runtime.actions import Actions, Publishing, judged_now
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
-from service.runtime.passive_sums import PASSIVE_INTERVAL_S
 from service.runtime.ports import StorePort
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import patience_s
@@ -322,7 +322,7 @@ class Observatory:
             )
         )
 
-    def fit(self, window: Spectra | Correlated) -> None:
+    def fit(self, window: EndedWindow) -> None:
         """Fit a window at once if the worker has a hand free, else after what it is at."""
         if isinstance(window, Correlated):
             self._actions.noisy.take(window, self.state)
@@ -351,14 +351,14 @@ class Observatory:
 
     def _look_at_sums(self) -> _Job:
         sums = self._engine.take_sums()
-        event = asyncio.run(fit_passive(sums, self.state, self._workers))
+        events = asyncio.run(fit_passive(sums, self.state, self._workers))
 
         def done() -> None:
-            if event is not None:
+            for event in events:
                 self._post(event)
             self._in(PASSIVE_INTERVAL_S, self._watch)
 
-        return 0.0 if event is None else self.latencies.watch_s, done
+        return self.latencies.watch_s if events else 0.0, done
 
     def _post(self, event: Event, cause: str = "") -> None:
         self._engine.post(event, cause)

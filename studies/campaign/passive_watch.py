@@ -20,10 +20,9 @@ from service.estimation.kalman import (
     predicted,
 )
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
-from service.estimation.passive import Passive, accumulate
+from service.estimation.passive import PASSIVE_MEMORY_S, Passive, accumulate
 from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
-from service.runtime.estimator_bank import PASSIVE_MEMORY_S
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.real_time_computer import RealTimeComputer

@@ -17,13 +17,13 @@ from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
-from service.estimation import passive
 from service.estimation.description import Description
-from service.estimation.estimate import DitheredEstimate
+from service.estimation.estimate import DitheredEstimate, PassiveEstimate
 from service.estimation.light import far_starts
 from service.estimation.lockin import LockInEstimate, Spectra, fit_window
 from service.estimation.openloop import WideCaptureEstimate, WideCaptureSearch, find, not_found
 from service.estimation.own_matrix import OwnMatrix, recognise_modes
+from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
 from service.estimation.slope_convention import LIKELY, SlopeConvention, of_answer, of_reconstructor
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
@@ -438,18 +438,17 @@ class OpticsWorker:
 
     @waits(at_most_s=6.0)
     def fit_passive(
-        self, state: passive.Passive, start: Misregistration | None
-    ) -> passive.PassiveEstimate | None:
+        self, sums: PassiveSums, start: Misregistration | None
+    ) -> PassiveEstimate | None:
         """Estimate α from ordinary telemetry; None when there is too little of it.
 
-        About ``start``, or without one about the nominal rotation.
+        As whoever has summed it does, about ``start``, or without one about the nominal rotation.
         """
-        found = passive.fit(state, self._sensor.near(start or self._start))
+        found = sums.fit(self._sensor.near(start or self._start))
         if found is None:
             return None
-        return replace(
-            found, optical_gain=found.optical_gain * self._sensor.ratio()[: state.n_modes]
-        )
+        gains = found.optical_gain * self._sensor.ratio()[: sums.n_modes]
+        return replace(found, optical_gain=gains)
 
 
 def _largest_passing(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:

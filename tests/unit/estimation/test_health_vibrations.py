@@ -27,7 +27,7 @@ def slopes(seed: int, vibrations: dict[float, float], n_segments: int = 12) -> n
 
 def listened(rows: np.ndarray, batch: int = 50) -> SlopeSpectra:
     block = block_of(rows, np.zeros((len(rows), 1)), None)
-    state = VibrationMonitor.begin(N_SLOPES).quiet
+    state = VibrationMonitor.of(N_SLOPES).quiet
     for start in range(0, len(rows), batch):
         state = state.with_frames(part(block, start, min(start + batch, len(rows))))
     return state
@@ -67,7 +67,7 @@ def test_nothing_is_said_before_enough_has_been_heard():
 def test_a_gap_starts_the_segment_anew():
     rows = slopes(1, {}, n_segments=2)
     block = block_of(rows, np.zeros((len(rows), 1)), None)
-    state = VibrationMonitor.begin(N_SLOPES).quiet
+    state = VibrationMonitor.of(N_SLOPES).quiet
     state = state.with_frames(part(block, 0, 1000))
     state = state.with_frames(part(block, 1010, 2010))
     assert state.n_segments == 0
@@ -82,7 +82,7 @@ def overheard(parts: list[tuple[dict[str, float], bool, int]]) -> tuple[float, .
 
     The dither's lines show in the slopes as any vibration does.
     """
-    state, first = VibrationMonitor.begin(N_SLOPES), 0
+    state, first = VibrationMonitor.of(N_SLOPES), 0
     for seed, (vibrations, dithered, n_segments) in enumerate(parts):
         lines = vibrations | (dict.fromkeys(DITHER_HZ, 0.3) if dithered else {})
         rows = slopes(seed, lines, n_segments)
@@ -90,7 +90,7 @@ def overheard(parts: list[tuple[dict[str, float], bool, int]]) -> tuple[float, .
         block = replace(block_of(rows, np.zeros((len(rows), 1)), dither), first_seq=first)
         for start in range(0, len(rows), 50):
             piece = part(block, start, min(start + 50, len(rows)))
-            state = state.update(piece, DITHER_HZ if dithered else ())
+            state = state.follow(piece, DITHER_HZ if dithered else ())
         first += len(rows)
     return state.lines_hz
 

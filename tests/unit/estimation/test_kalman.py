@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation.estimate import BIAS_FLOOR, BIAS_OVER_SCATTER
 from service.estimation.kalman import (
     JUMP_THRESHOLD,
     PASSIVE,
@@ -20,7 +21,6 @@ from service.estimation.kalman import (
     predicted,
     widened,
 )
-from service.estimation.passive import BIAS_FLOOR, BIAS_OVER_SCATTER
 
 DITHERED = np.diag(np.array([0.008, 0.008, np.deg2rad(0.02), 0.0008]) ** 2)
 SCATTER = np.diag(np.array([0.003, 0.003, np.deg2rad(0.01), 0.0003]) ** 2)

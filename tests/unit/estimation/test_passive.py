@@ -8,16 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from service.estimation.estimate import BIAS_FLOOR, PassiveEstimate
 from service.estimation.frames import FrameBlock
-from service.estimation.passive import (
-    BIAS_FLOOR,
-    MIN_FRAMES_PER_MODE,
-    Passive,
-    PassiveEstimate,
-    accumulate,
-    fit,
-    passive_matrix,
-)
+from service.estimation.passive import MIN_FRAMES_PER_MODE, Passive, accumulate, fit, passive_matrix
 from service.model.misregistration import Misregistration
 from tests.numerics import (
     N_CONTROLLED,

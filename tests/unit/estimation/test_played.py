@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.dither_monitor import DitherMonitor, ExpectedDither, measure_block
+from service.estimation.dither_monitor import DitherMonitor, measure_block
 from service.estimation.frames import FrameBlock
+from service.estimation.windows import ExpectedDither
 
 RATE_HZ = 1000.0
 N_MODES = 12

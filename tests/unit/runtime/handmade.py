@@ -1,8 +1,12 @@
 """An RTC written by hand, a clock that goes on when it is asked, a night on which α is known."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from service.estimation.passive import Passive
 from service.model.misregistration import Misregistration
+from service.runtime.estimator_bank import close_sums
 from service.tracking.registration import Registration
 from service.wire import Reply, layout_of
 from tests.states import tracker_state
@@ -78,3 +82,15 @@ class Clock:
     def __call__(self):
         self.now_ns += 1_000_000
         return self.now_ns
+
+
+def take_sums(bank, **told):
+    """Return the bank, and what the passive estimate has summed or why it has not."""
+    bank, every = close_sums(bank, **told)
+    return bank, every[Passive]
+
+
+def with_member(bank, member):
+    """Return the bank with another estimator of its kind."""
+    members = tuple(member if type(m) is type(member) else m for m in bank.members)
+    return replace(bank, members=members)

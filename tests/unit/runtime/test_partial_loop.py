@@ -9,14 +9,15 @@ from threadpoolctl import threadpool_limits
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.description import LOW_MODES
+from service.estimation.health import LoopHealth
 from service.runtime.engine import shape_mismatch
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_rtc
-from service.runtime.passive_sums import take_passive_sums
 from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking.registration import Source
 from service.tracking.state import Mode
 from studies.campaign.observatory import Observatory
+from tests.unit.runtime.handmade import take_sums
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 from tests.unit.runtime.test_streams import DESCRIPTION, MANY, N_MANY, RING, driven
 
@@ -74,8 +75,8 @@ def test_ordinary_telemetry_is_looked_at_and_agrees(night):
 def many():
     """Streams of a mirror whose outer ring can be watched."""
     variance = np.full(N_MANY, 1e-16)
-    return EstimatorBank(
-        description=replace(DESCRIPTION, n_modes=N_MANY, mode_variance_m2=variance, actuators=RING)
+    return EstimatorBank.of(
+        replace(DESCRIPTION, n_modes=N_MANY, mode_variance_m2=variance, actuators=RING)
     )
 
 
@@ -99,16 +100,16 @@ class TestTheStreams:
 
     def test_the_edge_is_watched_on_the_modes_that_move(self, many):
         bank = with_rtc(many, partial(self.GAINS))
-        assert bank.edge_watch is not None
-        assert not np.isin(np.arange(60, 65), bank.edge_watch.modes).any()
+        assert bank.loop.edge is not None
+        assert not np.isin(np.arange(60, 65), bank.loop.edge.modes).any()
         few = (*(0.4,) * (2 * LOW_MODES), *(0.0,) * (N_MANY - 2 * LOW_MODES))
-        assert with_rtc(many, partial(few)).edge_watch is None
+        assert with_rtc(many, partial(few)).loop.edge is None
 
     def test_what_stands_in_the_others_is_no_instrument_of_the_passive_estimate(self, many):
         bank = with_rtc(many, partial(self.GAINS))
         for first_seq in range(0, 2000, 10):
             bank, _ = process_block(bank, standing(first_seq))
-        _, heard = take_passive_sums(bank)
+        _, heard = take_sums(bank)
         _, moved, power = heard.sums
         assert not power[60:65].any()
         assert not moved[60:65].any()
@@ -118,21 +119,21 @@ class TestTheStreams:
         bank, rng = with_rtc(many, partial(self.GAINS)), np.random.default_rng(1)
         for first_seq in range(0, 2000, 10):
             bank, _ = process_block(bank, standing(first_seq, 1e-8 * rng.standard_normal(10)))
-        _, heard = take_passive_sums(bank)
+        _, heard = take_sums(bank)
         expected, power = heard.n_effective * 1e-16, heard.sums[2]
         assert 0.1 * expected < power[62, 62] < 10.0 * expected
         assert not power[61].any()
 
     def test_without_any_gain_it_is_open_and_says_nothing(self, many):
         bank = with_rtc(many, partial((0.0,) * N_MANY))
-        assert bank.edge_watch is None
-        assert take_passive_sums(bank)[1] == "no passive estimate: all gains of the loop are 0"
+        assert bank.loop.edge is None
+        assert take_sums(bank)[1] == "no passive estimate: all gains of the loop are 0"
         bank, _ = process_block(bank, driven(0, 1e-3))
-        assert not bank.health.diverging
+        assert not bank[LoopHealth].diverging
 
     def test_an_rtc_of_more_modes_than_the_instrument_file_knows_ends_nothing(self, many):
         """It is named, and its frames are not used, as soon as its status has been seen."""
         other = replace(MANY, n_modes=2 * N_MANY, n_controlled=100, gains=(0.4,) * 2 * N_MANY)
         bank = with_rtc(many, other)
-        assert shape_mismatch(bank.description, other)
-        assert bank.in_loop.max() < N_MANY
+        assert shape_mismatch(bank.loop.description, other)
+        assert bank.loop.in_loop.max() < N_MANY

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.errors import CommandError, ModelError
+from service.errors import CommandError
 from service.estimation.description import Description
+from service.estimation.dither_windows import DitherWindows
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn
 from service.estimation.random_dither import Correlated
@@ -52,7 +53,7 @@ def block(first_seq, n=100, *, dither=True, cm_id="initial"):
 
 @pytest.fixture
 def streams():
-    return with_dither(with_rtc(EstimatorBank(description=DESCRIPTION), RTC), DITHER, 2.0)
+    return with_dither(with_rtc(EstimatorBank.of(DESCRIPTION), RTC), DITHER, 2.0)
 
 
 def play(streams, first_seq, n_blocks, **changes):
@@ -68,15 +69,14 @@ def test_random_signs_are_correlated_in_windows_of_the_dithers_own_length(stream
     assert [(type(w), w.first_seq) for w in windows] == [(Correlated, 300), (Correlated, 700)]
     assert windows[0].plan.modes == (1, 6)
     # a third window would be cut by the end of the dither: it is never begun
-    assert streams.cutter is None
-    assert streams.cutter is None
+    assert streams[DitherWindows].cutter is None
 
 
 def test_another_loop_makes_the_open_window_void(streams):
     streams, _ = play(streams, 0, 5)
     streams = with_rtc(streams, replace(RTC, leak=0.99, seq=499))
-    assert streams.cutter.window is None
-    assert streams.cutter.plan.first_seq == 799
+    assert streams[DitherWindows].cutter.window is None
+    assert streams[DitherWindows].cutter.plan.first_seq == 799
 
 
 def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
@@ -90,13 +90,16 @@ def test_a_sine_after_random_signs_is_read_as_a_sine(streams):
     )
     sine = Dither(request=request, start_seq=0, window_s=0.5, asked_ns_utc=0)
     streams = with_dither(streams, sine, 2.0)
-    assert isinstance(streams.cutter, LockIn)
-    assert streams.cutter.plan.modes == (6,)
+    assert isinstance(streams[DitherWindows].cutter, LockIn)
+    assert streams[DitherWindows].cutter.plan.modes == (6,)
 
 
 def test_a_window_too_short_for_its_modes_is_refused_with_how_long_it_must_be(streams):
-    with pytest.raises(ModelError, match="found windows of 100 frames, expected at least 192"):
-        with_dither(streams, replace(DITHER, request=replace(REQUEST, id="d-3"), window_s=0.1), 2.0)
+    short = replace(DITHER, request=replace(REQUEST, id="d-3"), window_s=0.1)
+    found = with_dither(streams, short, 2.0)
+    assert found[DitherWindows].cutter is None
+    expected = "found windows of 100 frames, expected at least 192"
+    assert expected in found.loop.dither.why_unreadable
 
 
 def test_a_new_reconstructor_inside_a_window_cuts_it_short(streams):

@@ -269,7 +269,7 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
 
     async with running(supervisor):
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
-        monkeypatch.setattr("service.runtime.engine.process_block", broken)
+        monkeypatch.setattr("service.runtime.estimator_bank.process_block", broken)
         monkeypatch.setattr(
             bridge, "drain", lambda **_: [SimpleNamespace(n_frames=50, dt_ns=10**6)]
         )
@@ -278,7 +278,7 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "an inhomogeneous shape" in entry.text
         assert "telemetry was dropped" in entry.text
-        assert supervisor._engine.bank.rtc is not None
+        assert supervisor._engine.bank.loop.rtc is not None
         assert supervisor.snapshot().ready
 
 
@@ -291,7 +291,7 @@ async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, br
         await until(lambda: "internal.error" in [e.name for e in supervisor._engine.state.log])
         monkeypatch.undo()
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
-        await until(lambda: supervisor._engine.bank.rtc is not None)
+        await until(lambda: supervisor._engine.bank.loop.rtc is not None)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a ring that is bent" in entry.text
 
@@ -310,7 +310,7 @@ async def test_frames_are_looked_at_before_what_was_told_after_them(
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         send(bridge._intake, 0)
         await until(lambda: bridge._intake.events() == [] and not bridge.drain())
-        monkeypatch.setattr("service.runtime.engine.process_block", seen)
+        monkeypatch.setattr("service.runtime.estimator_bank.process_block", seen)
         monkeypatch.setattr(supervisor._engine, "receive", lambda told: order.append(told.id))
         send(bridge._intake, 10)
         applied(bridge._intake, "s1")
@@ -325,24 +325,24 @@ async def test_an_order_is_carried_out_while_frames_are_looked_at(supervisor, br
     def slowly(streams, block):
         looking.set()
         assert go_on.wait(patience(20.0))
-        return replace(streams, received_ns_utc=1), []
+        return replace(streams, loop=replace(streams.loop, received_ns_utc=1)), []
 
     async with running(supervisor):
         blocks = [SimpleNamespace(n_frames=50, dt_ns=10**6)]
-        monkeypatch.setattr("service.runtime.engine.process_block", slowly)
+        monkeypatch.setattr("service.runtime.estimator_bank.process_block", slowly)
         monkeypatch.setattr(bridge, "drain", lambda **_: [blocks.pop()] if blocks else [])
         await until(looking.is_set, 20.0)
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)
         assert await supervisor.submit(cmd.SetMode(mode=Mode.AUTO)) == "mode is auto"
-        assert supervisor._engine.bank.received_ns_utc != 1
+        assert supervisor._engine.bank.loop.received_ns_utc != 1
         go_on.set()
-        await until(lambda: supervisor._engine.bank.received_ns_utc == 1, 20.0)
-        assert supervisor._engine.bank.rtc is not None  # what was heard meanwhile is followed
+        await until(lambda: supervisor._engine.bank.loop.received_ns_utc == 1, 20.0)
+        assert supervisor._engine.bank.loop.rtc is not None  # what was heard meanwhile is followed
 
 
 async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, monkeypatch):
     def broken(streams, state, policy):
-        if streams.received_ns_utc == 1:
+        if streams.loop.received_ns_utc == 1:
             raise ValueError("samples of two matrices")
         return follow_state(streams, state, policy)
 
@@ -351,8 +351,10 @@ async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, m
         async with (
             supervisor._telemetry_lock
         ):  # what is lent to somebody is not what it was when it is back
-            supervisor._engine.bank = replace(supervisor._engine.bank, received_ns_utc=1)
-        await until(lambda: supervisor._engine.bank.received_ns_utc != 1)
+            bank = supervisor._engine.bank
+            marked = replace(bank.loop, received_ns_utc=1)
+            supervisor._engine.bank = replace(bank, loop=marked)
+        await until(lambda: supervisor._engine.bank.loop.received_ns_utc != 1)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a tick was dropped" in entry.text
         assert "samples of two matrices" in entry.text

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from service.control.dither import tabulated
-from service.estimation.passive import PassiveEstimate
+from service.estimation.estimate import PassiveEstimate
+from service.estimation.windows import SETTLING_S
 from service.tracking import events as ev
-from service.tracking.dither_request import SETTLING_S, total_m
+from service.tracking.dither_request import total_m
 from service.tracking.state import Mode
 from service.wire import DitherRequest, DitherStatus, DitherStop
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, estimate, moved, rtc

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 
 from service.control.dither import tabulated
 from service.errors import CommandError
+from service.estimation.windows import SETTLING_S
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_plan import FAINT_WINDOW_S, LASTING_S, MIN_WINDOWS, budget_m
-from service.tracking.dither_request import SETTLING_S, DitherPhase, total_m
+from service.tracking.dither_request import DitherPhase, total_m
 from service.wire import DitherRequest, DitherStop
 from tests.states import changed
 from tests.unit.tracking.dithered import DitheredNight

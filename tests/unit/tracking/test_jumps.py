@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.passive import PassiveEstimate
+from service.estimation.estimate import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.tracking import events as ev
 from service.tracking.state import Mode

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.estimation.estimate import PassiveEstimate
 from service.estimation.loop import loop_numbers
-from service.estimation.passive import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev

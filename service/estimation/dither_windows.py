@@ -1,0 +1,84 @@
+"""Windows of whatever dither plays: demodulated at its lines, or correlated with its signs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from typing_extensions import override
+
+from service.estimation.estimator import (
+    UNMARKED,
+    Change,
+    Estimator,
+    FrameContext,
+    LoopContext,
+    Mark,
+)
+from service.estimation.lockin import LockIn, LockInPlan, Spectra
+from service.estimation.random_dither import Correlated, RandomDither, RandomPlan
+from service.estimation.windows import WindowRefused
+
+EndedWindow = Spectra | Correlated
+"""One that the worker can fit."""
+
+Window = EndedWindow | WindowRefused
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DitherWindows(Estimator):
+    """The window under way, cut as the dither allows."""
+
+    resets = Change.GONE | Change.RATE | Change.LOOP | Change.DITHER | Change.STANDSTILL
+    unless = Mark.STANDS
+
+    cutter: LockIn | RandomDither | None = None
+    """None: no dither plays, none that can be read, or its end would cut the next window."""
+
+    last_ended: tuple[Window, ...] = ()
+
+    @classmethod
+    @override
+    def begin(cls, loop: LoopContext) -> DitherWindows:
+        """Return windows of the dither that plays."""
+        plan = None if loop.dither is None else loop.dither.plan
+        if isinstance(plan, LockInPlan):
+            return cls(cutter=LockIn(plan=plan))
+        return cls(cutter=RandomDither(plan=plan) if isinstance(plan, RandomPlan) else None)
+
+    @override
+    def begun_anew(self, loop: LoopContext, why: Change) -> DitherWindows:
+        """Give up the open window; the next begins when the changed loop has settled.
+
+        Counted from the status' own frame, not from when it was read, so that a recorded night is
+        cut at the same frames again.
+        """
+        if why & (Change.GONE | Change.RATE | Change.DITHER):
+            return self.begin(loop)
+        cutter = None if self.cutter is None else self.cutter.begun_anew(loop.settled_seq)
+        return DitherWindows(cutter=cutter)
+
+    @override
+    def update(self, frames: FrameContext) -> DitherWindows:
+        """Return them after one more block."""
+        if self.cutter is None:
+            return DitherWindows()
+        cutter, ended = self.cutter.accumulate(frames.block)
+        dither, window = frames.loop.dither, cutter.window
+        over = (
+            dither is not None
+            and window is not None
+            and window.first_seq + cutter.plan.n_frames > dither.stop_seq
+        )
+        return DitherWindows(cutter=None if over else cutter, last_ended=tuple(ended))
+
+    @property
+    @override
+    def ended(self) -> tuple[Window, ...]:
+        """Windows that ended in the last block, or why they were refused."""
+        return self.last_ended
+
+    @property
+    @override
+    def marks(self) -> Mark:
+        """Whether windows are being cut."""
+        return UNMARKED if self.cutter is None else Mark.WINDOWS

@@ -1,0 +1,223 @@
+"""What every streaming estimator is: fed block by block, begun anew by one declared rule.
+
+An estimator is a frozen record that returns itself anew. The bank that feeds all of them
+(``service.runtime.estimator_bank``) knows none by name: each says what it begins anew for, of which
+frames it wants nothing, and what it says of a block to those that come after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import Flag, auto
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.description import Description, EdgeWatch
+from service.estimation.frames import FrameBlock
+from service.estimation.loop import closed_loop
+from service.estimation.windows import SETTLING_S, ClosedLoop, ExpectedDither, Telemetry
+from service.wire import Status
+
+
+class Change(Flag):
+    """What has changed about telemetry since the block, or the status, before."""
+
+    GONE = auto()
+    """No RTC is there any more, or nobody knows whose telemetry it is."""
+
+    SESSION = auto()
+    RATE = auto()
+    """The frame rate, or the first RTC has come."""
+
+    LOOP = auto()
+    """The loop is another than the one with which the open window and all sums were begun."""
+
+    STATUS = auto()
+    """The loop is another than the status before told: gains may creep away from those of sums."""
+
+    DITHER = auto()
+    OPEN = auto()
+    """No mode is in the loop; said of every block."""
+
+    MATRIX = auto()
+    """Another matrix multiplied the slopes of this block than those of the one before."""
+
+    STANDSTILL = auto()
+    """The slopes stand; said of every block: what came just before is no measurement either."""
+
+
+class Mark(Flag):
+    """What an estimator says of a block to those after it."""
+
+    STANDS = auto()
+    """The slopes are no measurement."""
+
+    ABSURD = auto()
+    """The commands are in another unit."""
+
+    WINDOWS = auto()
+    """Windows of a dither are being cut."""
+
+
+NOTHING = Change(0)
+UNMARKED = Mark(0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopContext:
+    """What all estimators are told of the loop whose telemetry they see."""
+
+    description: Description
+    rtc: Status | None = None
+    """As its last status has it."""
+
+    in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    """Modes it moves by itself; empty: it is open."""
+
+    still: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    """Controlled modes that have no gain."""
+
+    edge: EdgeWatch | None = None
+    """How its outer ring is watched; None: too few modes are controlled."""
+
+    matrices: tuple[tuple[str, NDArray[np.float32]], ...] = ()
+    """Reconstructors by id, oldest first, bounded."""
+
+    dither: ExpectedDither | None = None
+    """The one whose windows are under way, or cannot be; None: none plays."""
+
+    received_ns_utc: int = 0
+    """End of the last frame that came, the RTC's clock; 0: none has."""
+
+    cm_id: str | None = None
+    """The matrix of the last block."""
+
+    from_seq: int = 0
+    """Frames before this one may have been made by another loop, or by no measurement."""
+
+    settled_seq: int = 0
+    """By this one the loop has settled after that."""
+
+    def terms(self, cm_id: str | None) -> ClosedLoop | None:
+        """Return the loop that a matrix closes; None: it is open, not known, or another's."""
+        rtc = self.rtc
+        matrix = next((matrix for known, matrix in self.matrices if known == cm_id), None)
+        if rtc is None or rtc.loop == "open" or cm_id is None or matrix is None:
+            return None
+        if matrix.shape[1] != rtc.n_slopes or len(matrix) > rtc.n_modes:
+            return None
+        return closed_loop(rtc, cm_id, matrix)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameContext:
+    """A block of telemetry, and what all estimators need of it."""
+
+    block: FrameBlock
+    loop: LoopContext
+    rtc: Status
+    terms: ClosedLoop | None
+    """The loop that the block's matrix closes; None: it is open, or nobody knows."""
+
+    lines_hz: tuple[float, ...]
+    """Of the dither that plays: what stands there is no vibration, nor anybody's noise."""
+
+    marks: Mark = UNMARKED
+    """What those before have said of it."""
+
+    def marked(self, marks: Mark) -> FrameContext:
+        """Return it with what one has said; where slopes stand, measurements begin after that."""
+        loop = self.loop
+        if Mark.STANDS in marks:
+            seq = self.block.next_seq + round(SETTLING_S * self.rtc.frame_rate_hz)
+            loop = replace(loop, from_seq=seq, settled_seq=seq)
+        return replace(self, loop=loop, marks=self.marks | marks)
+
+    @property
+    def moving(self) -> FrameBlock:
+        """The block without what stands in controlled modes that have no gain.
+
+        An integrator without leak keeps it for ever; a mode that never moves tells nothing.
+        """
+        block, still = self.block, self.loop.still
+        if not len(still):
+            return block
+        commands = block.commands_m.copy()
+        commands[:, still] = 0.0 if block.dither_m is None else block.dither_m[:, still]
+        return replace(block, commands_m=commands)
+
+
+class Streaming:
+    """Fed with ``update``, block by block; what has been found is read off the record."""
+
+    __slots__ = ()
+
+    resets: ClassVar[Change] = NOTHING
+    """What it begins anew for; all else leaves it as it is."""
+
+    unless: ClassVar[Mark] = UNMARKED
+    """Blocks that are marked so are not for it."""
+
+    only_closed: ClassVar[bool] = False
+    """Blocks of an open loop are not for it."""
+
+    @classmethod
+    def begin(cls, loop: LoopContext) -> Self:
+        """Return one that has seen nothing of this loop."""
+        return cls()
+
+    def begun_anew(self, loop: LoopContext, why: Change) -> Self:
+        """Return it after changes that it has declared: with nothing, unless some of it lasts."""
+        return self.begin(loop)
+
+    def on_status(self, loop: LoopContext) -> Self:
+        """Return it after one more status: what was seen up to there may be judged."""
+        return self
+
+    def update(self, frames: FrameContext) -> Self:
+        """Return it after one more block."""
+        raise NotImplementedError
+
+    @property
+    def marks(self) -> Mark:
+        """What it says of the last block to those after it."""
+        return UNMARKED
+
+
+class Detector(Streaming):
+    """Finds what must be seen while it lasts."""
+
+    __slots__ = ()
+
+    @property
+    def conditions(self) -> tuple[str | None, ...]:
+        """What is the matter, and what to do, of each of its alarms; None: nothing."""
+        return ()
+
+    def vet(self, window: Telemetry, loop: LoopContext) -> tuple[Self, str | None]:
+        """Return why a window that has ended must not be used; None: it may."""
+        return self, None
+
+
+class Estimator(Streaming):
+    """Estimates α: from windows that end as a dither allows, or from sums that are asked for."""
+
+    __slots__ = ()
+
+    @property
+    def ended(self) -> Sequence[Any]:
+        """Windows that ended in the last block, as the worker fits them, or why they cannot be."""
+        return ()
+
+    def close(
+        self, loop: LoopContext, marks: Mark, *, has_windows: bool
+    ) -> tuple[Self, Self | str | None]:
+        """Return it begun anew, and the sums to be fitted, or why there are none; None: not yet.
+
+        ``marks`` are those of the last block; ``has_windows``: dithered windows have told of α
+        just now.
+        """
+        return self, None

@@ -1,0 +1,138 @@
+"""Which estimators and detectors there are, one line each, and what the tracker hears of them.
+
+The order is that in which they are fed: what one marks in a block, those after it see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from service.estimation.control_law import ControlLawCheck
+from service.estimation.dither_monitor import LOUDER, DitherMeasurement, DitherWatch
+from service.estimation.dither_windows import DitherWindows
+from service.estimation.estimator import Detector, LoopContext, Streaming
+from service.estimation.health import EdgeHealth, LoopHealth, VibrationMonitor
+from service.estimation.loopcheck import LoopCheck
+from service.estimation.passive import Passive
+from service.estimation.probation import Comparison
+from service.estimation.rejection import Rejection
+from service.estimation.standstill import Standstill
+from service.tracking import alarms
+from service.tracking import events as ev
+from service.tracking.dither import SILENT_S
+from service.tracking.events import Event
+from service.tracking.state import TrackerState
+
+Changes = Callable[[Any, Any, LoopContext, TrackerState], list[Event]]
+"""What the tracker should hear of a detector: as it was before these blocks, as it is now."""
+
+
+def _dither(
+    before: DitherWatch, watch: DitherWatch, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    """Return that a dither is missed, twice a second, or is otherwise than it was asked for."""
+    found: list[Event] = []
+    if loop.dither is None:
+        return found
+    silent_s = watch.silent_s
+    if silent_s >= SILENT_S and int(2 * silent_s) > int(2 * before.silent_s):
+        found.append(ev.DitherSilent(id=loop.dither.id, silent_s=silent_s))
+    if watch.measurement is not None:
+        found += _other_dither(loop.dither.id, watch.measurement, state)
+        found += _answered(watch.measurement, loop, state)
+    return found
+
+
+def _other_dither(
+    dither_id: str, measurement: DitherMeasurement, state: TrackerState
+) -> list[Event]:
+    """Return what the frames hold of the dither, where it is told for the first time or is over."""
+    told = state.dithers.policy
+    raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
+    louder = measurement.found_m > LOUDER * told.amiss_m
+    news = told.amiss_id != dither_id or louder if measurement.text else raised
+    if not news:
+        return []
+    return [
+        ev.DitherMeasured(
+            id=dither_id,
+            found_m=measurement.found_m,
+            asked_m=measurement.asked_m,
+            text=measurement.text,
+        )
+    ]
+
+
+def _answered(
+    measurement: DitherMeasurement, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    """Return that the slopes do not answer the dither, or do so again.
+
+    Of an open loop, and of one that is being closed, the optical gain may be next to nothing.
+    """
+    found = measurement.unanswered
+    raised = state.alarm(alarms.MIRROR_SILENT) is not None
+    closed = len(loop.in_loop) > 0 and not state.operations.acquisition.under_way
+    if found is None or not closed or not (found or raised):
+        return []
+    text, t_ns = found or "the slopes answer the dither again", loop.received_ns_utc
+    return [
+        ev.ConditionChanged(name=alarms.MIRROR_SILENT, text=text, over=not found, t_ns_utc=t_ns)
+    ]
+
+
+def _vibrations(
+    _: VibrationMonitor, monitor: VibrationMonitor, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    lines = monitor.lines_hz
+    return [] if lines == state.loop.vibrations_hz else [ev.Vibrations(lines_hz=lines)]
+
+
+def _held(_: Rejection, now: Rejection, loop: LoopContext, state: TrackerState) -> list[Event]:
+    holds = now.holds
+    return [] if holds is None or holds is state.loop.holds else [ev.LoopHeld(holds=holds)]
+
+
+def _compared(
+    _: Comparison, now: Comparison, loop: LoopContext, state: TrackerState
+) -> list[Event]:
+    judged, trial = now.found, state.operations.probation
+    awaited = trial is not None and judged is not None and trial.awaits(judged.before, judged.after)
+    return [ev.Compared(finding=judged)] if judged is not None and awaited else []
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One estimator or detector."""
+
+    kind: type[Streaming]
+    alarms: Mapping[str, str] = field(default_factory=dict)
+    """Of its conditions, in their order, and what is said when each is over."""
+
+    events: Changes | None = None
+    """What else the tracker hears of it."""
+
+    def conditions(self, member: Streaming) -> list[tuple[str, str | None, str]]:
+        """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
+        texts = member.conditions if isinstance(member, Detector) else ()
+        found = zip(self.alarms.items(), texts, strict=True)
+        return [(name, text, over) for (name, over), text in found]
+
+
+_IN_METRES = "commands are what a mirror can play"
+
+REGISTRY: Final = (
+    Entry(Standstill, {alarms.SLOPES_STAND: "the slopes change again"}),
+    Entry(DitherWatch, events=_dither),
+    Entry(VibrationMonitor, events=_vibrations),
+    Entry(LoopHealth, {alarms.WRONG_UNIT: _IN_METRES, alarms.DIVERGING: "the high modes are calm"}),
+    Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop is as told again"}),
+    Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
+    Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
+    Entry(Rejection, events=_held),
+    Entry(Comparison, events=_compared),
+    Entry(Passive),
+    Entry(DitherWindows),
+)

@@ -13,7 +13,7 @@
 """
 
 from service.archive.archive import Archive
-from service.archive.index import AuditEntry, Pin, Range
+from service.archive.index import Actor, AuditEntry, Channel, Pin, Range
 from service.archive.nights import Mark, Night
 
-__all__ = ["Archive", "AuditEntry", "Mark", "Night", "Pin", "Range"]
+__all__ = ["Actor", "Archive", "AuditEntry", "Channel", "Mark", "Night", "Pin", "Range"]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -100,6 +102,55 @@ class AuditEntry:
 
     id: int = 0
     """Place in the trail, from 1 on, growing; 0: not written yet."""
+
+
+class Channel(StrEnum):
+    """What an order came through."""
+
+    PAGE = "page"
+    """A browser."""
+
+    REST = "rest"
+    """A program of somebody's own."""
+
+    CLI = "cli"
+    """``pyrcal`` on a command line."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Actor:
+    """Whoever gives an order, besides the name in it."""
+
+    address: str = ""
+    key: str = ""
+    """Name of the API key it was given with; empty: none is needed."""
+
+    channel: Channel = Channel.REST
+    check: Callable[[], None] = lambda: None
+    """Raises where what the order was decided on has changed."""
+
+    def entry(
+        self,
+        name: str,
+        text: str = "",
+        *,
+        by: str = "",
+        why: str = "",
+        answer: str = "",
+        cause: str = "",
+    ) -> AuditEntry:
+        """Return a line of the audit trail on what they do; ``by``: what they call themselves."""
+        return AuditEntry(
+            t_ns_utc=time.time_ns(),
+            who=self.key or by or self.address or "operator",
+            name=name,
+            text=text,
+            address=self.address,
+            channel=self.channel,
+            why=why,
+            answer=answer,
+            cause=cause,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,15 +10,14 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
-from enum import StrEnum
+from dataclasses import fields
 from functools import partial
 from itertools import takewhile
 
 import msgspec
 import structlog
 
-from service.archive import Archive, AuditEntry
+from service.archive import Actor, Archive, AuditEntry
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
 from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError
@@ -57,55 +56,6 @@ BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
 
 _LOGGED = ("who", "text", "address", "channel", "why", "answer")
 """What the log tells of an order."""
-
-
-class Channel(StrEnum):
-    """What an order came through."""
-
-    PAGE = "page"
-    """A browser."""
-
-    REST = "rest"
-    """A program of somebody's own."""
-
-    CLI = "cli"
-    """``pyrcal`` on a command line."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Actor:
-    """Whoever gives an order, besides the name in it."""
-
-    address: str = ""
-    key: str = ""
-    """Name of the API key it was given with; empty: none is needed."""
-
-    channel: Channel = Channel.REST
-    check: Callable[[], None] = lambda: None
-    """Raises where what the order was decided on has changed."""
-
-    def entry(
-        self,
-        name: str,
-        text: str = "",
-        *,
-        by: str = "",
-        why: str = "",
-        answer: str = "",
-        cause: str = "",
-    ) -> AuditEntry:
-        """Return a line of the audit trail on what they do; ``by``: what they call themselves."""
-        return AuditEntry(
-            t_ns_utc=time.time_ns(),
-            who=self.key or by or self.address or "operator",
-            name=name,
-            text=text,
-            address=self.address,
-            channel=self.channel,
-            why=why,
-            answer=answer,
-            cause=cause,
-        )
 
 
 class ArchiveWriter:

@@ -14,7 +14,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from service.archive import Archive, AuditEntry
+from service.archive import Actor, Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
 from service.estimation.description import Description
@@ -28,7 +28,7 @@ from service.link.statistics import LinkStatistics
 from service.model.instrument import Instrument
 from service.rtc_bridge import Bridge
 from service.runtime.actions import Actions
-from service.runtime.archiving import Actor, ArchiveWriter, ids_of
+from service.runtime.archiving import ArchiveWriter, ids_of
 from service.runtime.clock import ServiceClock
 from service.runtime.command_results import GivenCommand
 from service.runtime.engine import Engine

@@ -22,9 +22,8 @@ from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from typing_extensions import override
 
-from service.archive import AuditEntry
+from service.archive import Actor, AuditEntry, Channel
 from service.errors import ConfigurationError, UnknownIdError
-from service.runtime.archiving import Actor, Channel
 from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
 from service.web.problems import INVALID, UNKNOWN, problem

@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Discriminator, TypeAdapter, Validati
 from pydantic_core import from_json
 from starlette.datastructures import MutableHeaders
 
+from service.archive import Actor
 from service.errors import StaleError, UntaggedError
-from service.runtime.archiving import Actor
 from service.runtime.supervisor import Supervisor
 from service.tracking.commands import (
     AbortAcquisition,

@@ -17,10 +17,9 @@ from pyrcal.__main__ import main
 from pyrcal.client import orders
 from pyrcal.client.remote import REQUESTS
 from service.api import create_app
-from service.archive import AuditEntry
+from service.archive import AuditEntry, Channel
 from service.archive.recordings import RecordingRecord
 from service.errors import CommandError
-from service.runtime.archiving import Channel
 from service.runtime.snapshot import Snapshot
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import MakeMatrix, MatrixMade

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from service.archive import AuditEntry, Range
+from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
-from service.runtime.archiving import Actor, Channel, taken_up
+from service.runtime.archiving import taken_up
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as cmd

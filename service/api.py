@@ -118,7 +118,6 @@ def _routes(*, with_fits: bool) -> list[BaseRoute]:
         page.router,
         matrices.refits,
         commands.router,
-        commands.observatory,
         matrices.router,
         matrices.noisy,
         health.router,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
 import uuid
@@ -66,7 +67,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     if request.method == "POST":
         headers["Idempotency-Key"] = str(uuid.uuid4())
     who = login() if options.who is None else options.who
-    given = named(options, request.body.split())
+    given = named(options, request.body)
     body = {**given, **request.always, "reason": why, "by": who}
     answer = service.order(request.method, path_of(request.path, options), body, headers).document
     with understood(service):
@@ -96,19 +97,16 @@ def _refuse_early(service: Service, request: Request) -> None:
 
 def path_of(path: str, options: argparse.Namespace) -> str:
     """Return a path with the id that is meant."""
-    return path.replace("{id}", quote(str(getattr(options, "id", "")), safe=""))
+    return re.sub(r"{\w+}", quote(str(getattr(options, "id", "")), safe=""), path)
 
 
 def _show(service: Service, request: Request, options: argparse.Namespace) -> str:
     """Show what an order decides on, and return its ETag; ``options.id`` becomes its own."""
     document, tag = service.get(path_of(request.decides_on, options))
-    about = document
-    if "id" not in options:
-        about, tag = service.get(f"{request.decides_on}/previous")
     options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
-        lines = list(reconstructor_lines(about))
-        options.source = str(about["id"])
+        lines = list(reconstructor_lines(document))
+        options.source = str(document["id"])
         if "id" in options:
             options.id = str(document["id"])
     for line in lines:

@@ -1,24 +1,34 @@
-"""The commands that ask a running service: each declared once, here. Nothing heavy is imported.
+"""The commands that ask a running service, in the words of the command line; quickly imported.
 
-What the service answers to an order is printed as it says it; what it refuses, too.
+Where REST takes an order, what it is decided on and where to look for what becomes of it stands in
+the service's own table, ``service/commands.toml``. What the service answers to an order is printed
+as it says it; what it refuses, too.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
+import tomllib
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from pyrcal.options import Words, add, words
+from service import errors
 from service.errors import ConfigurationError, say
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
 """Exit statuses; 2 is that of a command line that makes no sense."""
 
 USUAL_URL = "http://127.0.0.1:8080"
+ORDERS: Final = tomllib.loads(
+    Path(errors.__file__).with_name("commands.toml").read_text(encoding="utf-8")
+)
+"""Every order by the name of its operation, as the service has it."""
+
 URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
 """Variables of the environment."""
 
@@ -41,9 +51,6 @@ class Request(NamedTuple):
     """Method and path of REST; words in braces are options."""
 
     words: tuple[Words, ...] = ()
-    body: str = ""
-    """Options that the body of an order says; ``reason`` and ``by`` are of every one."""
-
     always: Mapping[str, str] = {}
     """What the body says besides."""
 
@@ -55,7 +62,7 @@ class Request(NamedTuple):
 
     needs_why: bool = False
     permitted: str = ""
-    """Name of the order in the state's ``permitted``; only where somebody is asked something."""
+    """Name of the order in the state's ``permitted``; empty: it may always be given."""
 
     then: str = ""
     """What to do afterwards."""
@@ -74,12 +81,38 @@ class Request(NamedTuple):
         """Of REST; words in braces are options."""
         return self.call.partition(" ")[2]
 
+    @property
+    def body(self) -> list[str]:
+        """Options that the body of an order says; ``reason`` and ``by`` are of every one."""
+        said = (one.form.partition(" ")[0].lstrip("-").replace("-", "_") for one in self.words)
+        return [name for name in said if name not in {"id", "no_wait"}]
+
 
 def _reads(name: str, purpose: str, path: str, *every: Words, by: str = "reading") -> Request:
     return Request(name, purpose, by, f"GET {path}", every)
 
 
-def _orders(name: str, purpose: str, call: str, *every: Words, **more: Any) -> Request:  # noqa: ANN401
+def _orders(name: str, purpose: str, *every: Words, operation: str = "", **more: Any) -> Request:  # noqa: ANN401
+    """Return the command that gives an order of the service's table, mostly the one of its name."""
+    order = ORDERS[operation or name.replace("-", "_")]
+    kind = order["command"]
+    if not isinstance(kind, str):
+        kind = kind[more.get("always", {}).get("action", "start")]
+    followed = next(iter(order.get("follows", {"state": "/v1/state"}).values()))
+    return Request(
+        name,
+        purpose,
+        "orders",
+        order["call"],
+        every,
+        decides_on=order.get("decides_on", [""])[-1],
+        permitted=re.sub(r"(?<!^)(?=[A-Z])", "_", kind).lower(),
+        follows=followed if _NO_WAIT in every else "",
+        **more,
+    )
+
+
+def _records(name: str, purpose: str, call: str, *every: Words, **more: Any) -> Request:  # noqa: ANN401
     return Request(name, purpose, "orders", call, every, **more)
 
 
@@ -112,7 +145,6 @@ _SINCE = words("--since TIME", "RFC 3339, like 2026-03-01T20:00:00Z")
 _UNTIL = words("--until TIME", "up to this time")
 
 RECONSTRUCTORS = "/v1/reconstructors"
-_ONE = f"{RECONSTRUCTORS}/{{id}}"
 _RESUMES = "pyrcal mode propose, or auto, ends it"
 
 REQUESTS = (
@@ -150,151 +182,113 @@ REQUESTS = (
     _orders(
         "approve",
         "send the reconstructor that is proposed",
-        f"POST {_ONE}/approve",
         *(_CANDIDATE, _NO_WAIT),
-        decides_on=_ONE,
-        permitted="approve",
         asks="send it to the RTC",
-        follows=_ONE,
     ),
     _orders(
         "reject",
         "discard the reconstructor that is proposed",
-        f"POST {_ONE}/reject",
         _CANDIDATE,
-        decides_on=_ONE,
-        permitted="reject",
         needs_why=True,
     ),
     _orders(
         "publish",
         "send a known reconstructor again",
-        f"POST {_ONE}/publish",
         *(_ID, _NO_WAIT),
-        decides_on=_ONE,
-        permitted="publish",
         asks="send it to the RTC again",
-        follows=RECONSTRUCTORS,
     ),
     _orders(
         "rollback",
         "go back to the reconstructor before; mode becomes hold",
-        "POST /v1/rollback",
         words("--anyway", "even if the gate refuses it: alpha may be what is wrong", default=None),
         _NO_WAIT,
-        body="anyway",
-        decides_on=RECONSTRUCTORS,
-        permitted="rollback",
         asks="go back to the one before; mode becomes hold",
         needs_why=True,
         then=_RESUMES,
-        follows=RECONSTRUCTORS,
     ),
     _orders(
         "hold",
         "only measure: make and send nothing by itself",
-        "PUT /v1/mode",
+        operation="mode",
         always={"mode": "hold"},
         then=_RESUMES,
     ),
     _orders(
         "mode",
         "how much it may do by itself",
-        "PUT /v1/mode",
         words("mode", choices=("auto", "propose", "hold")),
-        body="mode",
     ),
     _orders(
         "stop",
         "stop everything: dither off, nothing made or sent",
-        "POST /v1/stop",
         then="pyrcal resume releases it",
     ),
     _orders(
         "resume",
         "release what pyrcal stop has stopped (hold is ended by pyrcal mode)",
-        "POST /v1/resume",
     ),
     _orders(
         "acknowledge",
         "say that an alarm is known of; it stays for as long as it lasts",
-        "POST /v1/alarms/{id}/acknowledge",
         _ALARM,
     ),
     _orders(
         "mute",
         "show an alarm no more for a time; it is counted",
-        "POST /v1/alarms/{id}/mute",
         *(_ALARM, words("for_s SECONDS", "twelve hours at most", type=float)),
-        body="for_s",
     ),
-    _orders("unmute", "show an alarm again", "POST /v1/alarms/{id}/unmute", _ALARM),
+    _orders("unmute", "show an alarm again", _ALARM),
     _orders(
         "dither",
         "start or stop the dither",
-        "POST /v1/dither",
         words("action", choices=("start", "stop")),
         words("--kind", "binary: random signs", choices=("sine", "binary")),
         *(_MODES, _EACH, _LINES, _TOTAL, _LASTS, _OVER),
-        body="action kind modes amplitude_m frequency_hz total_amplitude_m duration_s over_budget",
     ),
     _orders(
         "refit",
         "compute a reconstructor for the alpha of now",
-        "POST /v1/refit",
         *(words("--n-modes N", "to control; default: as many as now", type=int), _NO_WAIT),
-        body="n_modes",
-        follows="/v1/refits/{id}",
     ),
     _orders(
-        "abort", "end an acquisition under way", "POST /v1/acquisition", always={"action": "abort"}
+        "abort", "end an acquisition under way", operation="acquisition", always={"action": "abort"}
     ),
     _orders(
         "acquire",
         "find alpha from nothing: open the loop, look, close it step by step",
-        "POST /v1/acquisition",
         _NO_WAIT,
+        operation="acquisition",
         always={"action": "start"},
-        permitted="acquire",
         asks="open the loop and dither strongly; the image is lost for tens of seconds",
         needs_why=True,
-        follows="/v1/state",
     ),
     _orders(
         "measure",
         "have the RTC measure an interaction matrix; all but a sine open the loop",
-        "POST /v1/measurements",
         words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
         words("--n-average N", "pushes, and pulls, of each", type=int),
         *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
-        body="pattern n_average modes amplitude_m frequency_hz duration_s",
-        permitted="measure",
         asks="have the RTC measure; all patterns but sine open the loop",
-        follows="/v1/measurements/{id}",
     ),
     _orders(
         "measure-noisy",
         "measure a noisy interaction matrix on sky, by random signs",
-        "POST /v1/noisy-matrix",
         *(_MODES, _TOTAL, _LASTS, _OVER, _NO_WAIT),
-        body="modes total_amplitude_m duration_s over_budget",
-        follows="/v1/noisy-matrix/{id}",
     ),
-    _orders(
+    _records(
         "record",
         "keep the telemetry that comes from now on, byte for byte; a minute if not told otherwise",
         "POST /v1/recordings",
         *(_LASTS, words("--before-s S", "of what came before, 60 at most", type=float), _NO_WAIT),
-        body="duration_s before_s",
         follows="/v1/recordings/{id}",
     ),
-    _orders(
+    _records(
         "end-recording",
         "keep no more of it; what there is stays",
         "POST /v1/recordings/{id}/end",
         _RECORDING,
     ),
-    _orders(
+    _records(
         "remove-recording",
         "remove telemetry that was kept, for good",
         "DELETE /v1/recordings/{id}",
@@ -304,7 +298,6 @@ REQUESTS = (
     _orders(
         "give-up",
         "wait no longer for a matrix that is measured",
-        "DELETE /v1/measurements/{id}",
         words("id ID", "of the measurement"),
     ),
 )

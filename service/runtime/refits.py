@@ -54,11 +54,6 @@ class Refits:
     def __init__(self) -> None:
         self._jobs: dict[str, RefitJob] = {}
 
-    @property
-    def newest(self) -> RefitJob:
-        """The job that began last; there must have been one."""
-        return next(reversed(self._jobs.values()))
-
     def begin(self, effects: Iterable[Effect], now_ns: int) -> None:
         """Remember a job from the moment its computation begins; its id is the order's."""
         (made,) = (effect for effect in effects if isinstance(effect, ev.MakeMatrix))

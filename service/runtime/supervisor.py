@@ -172,10 +172,11 @@ class Supervisor:
         """Take a line of the audit trail that is of no command."""
         self._writer.add(entry)
 
-    async def submit(self, command: Command, actor: Actor = OPERATOR) -> str:
+    async def submit(self, command: Command, actor: Actor = OPERATOR, order_id: str = "") -> str:
         """Carry out an operator's command; return one sentence on what came of it.
 
-        It is on record before it is done, and so is why it is refused.
+        It is on record before it is done, and so is why it is refused. What it leads to has its
+        ``order_id``; empty: it is given one.
 
         Raises
         ------
@@ -187,7 +188,7 @@ class Supervisor:
             If it cannot be recorded; nothing has been done.
         """
         state, now_ns = self._engine.state, self._clock.now_ns()
-        order = GivenCommand(command, ev.new_id(ev.kebab(type(command)), now_ns))
+        order = GivenCommand(command, order_id or ev.new_id(ev.kebab(type(command)), now_ns))
         again = isinstance(command, cmd.SetValue) and not changes_value(state, command, now_ns)
         if again or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
             return await self._result_of(order)

@@ -1,15 +1,20 @@
-"""What an operator asks of the service, and what the observatory tells it.
+"""What an operator asks of the service, and what the observatory tells it: a route for each order.
 
-A body is read straight into the record that the tracker obeys, all faults at once. Each answer is
-202 and says in one sentence what was done and, where an RTC answers within some seconds, what it
-said. What takes longer is seen in the state and in the events.
+The routes are made of the table of orders, ``service/commands.toml``. A body is read straight into
+the record that the tracker obeys, all faults at once. Each answer is 202 and says in one sentence
+what was done and, where an RTC answers within some seconds, what it said. What takes longer is seen
+in the state and in the events.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, TypeVar
+import re
+import tomllib
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from importlib.resources import files
+from inspect import Parameter, Signature
+from typing import Annotated, Any, ClassVar, Final, Union
 
 from fastapi import APIRouter, Depends, Path, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -20,43 +25,25 @@ from starlette.datastructures import MutableHeaders
 from service.archive import Actor
 from service.errors import StaleError, UntaggedError
 from service.runtime.supervisor import Supervisor
-from service.tracking.commands import (
-    AbortAcquisition,
-    AcknowledgeAlarm,
-    Acquire,
-    Approve,
-    Command,
-    Instruction,
-    MuteAlarm,
-    MuteTime,
-    Publish,
-    Ramp,
-    Reject,
-    ReportedValue,
-    Resume,
-    Rollback,
-    SeenAlarm,
-    SetLoop,
-    SetMode,
-    SetPointing,
-    SetValue,
-    StartDither,
-    StopDither,
-    StopEverything,
-    UnmuteAlarm,
-)
+from service.tracking import commands as instructions
+from service.tracking.commands import Instruction
+from service.tracking.events import new_id
 from service.tracking.state import TrackerState
-from service.web.authentication import actor_of
+from service.web.authentication import actor_of, needs
+from service.web.keys import KeyScope
 from service.web.numbers import MatrixId
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.web.views import RECONSTRUCTORS, ServiceDep, found_or_refuse, tagged
+from service.web.views import (
+    RECONSTRUCTORS,
+    ServiceDep,
+    found_or_refuse,
+    tagged,
+)
 
 # --- what is asked: JSON, read into a record
 
 
 JSON = "application/json"
-
-Asked = TypeVar("Asked", bound=Instruction)
 
 
 class Body:
@@ -108,12 +95,6 @@ def body(kind: Any) -> Any:  # noqa: ANN401  as FastAPI has it
 
 Said = Annotated[Instruction, body(Instruction)]
 """The body of a request whose path says all the rest."""
-
-
-def about(kind: type[Asked], instruction: Instruction, **more: str) -> Asked:
-    """Return the command that says the same, and what the path or the service adds."""
-    return kind(**instruction.as_fields(), **more)
-
 
 Where = tuple[int | str, ...]
 
@@ -177,22 +158,68 @@ def _is_of_type(fault: Mapping[str, Any]) -> bool:
     return kind == "enum" or kind.endswith("_type")
 
 
+# --- the table of orders
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderRoute:
+    """An order as ``service/commands.toml`` has it: that says what each of these is."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
+
+    call: str
+    command: str | dict[str, str]
+    text: str
+    scope: KeyScope = KeyScope.OPERATE
+    decides_on: tuple[str, ...] = ()
+    follows: Mapping[str, str] = field(default_factory=dict)
+    makes: str = ""
+    tag: str = "what an operator asks of it"
+
+    @property
+    def kinds(self) -> tuple[type[Instruction], ...]:
+        """The commands that may be given there: several are told apart by their ``action``."""
+        names = [self.command] if isinstance(self.command, str) else self.command.values()
+        return tuple(getattr(instructions, name) for name in names)
+
+    @property
+    def path(self) -> str:
+        """Where REST takes it."""
+        return self.call.partition(" ")[2]
+
+    @property
+    def method(self) -> str:
+        """How."""
+        return self.call.partition(" ")[0]
+
+    @property
+    def named(self) -> str:
+        """The field of the command that the path names; empty: none."""
+        return "".join(re.findall(r"{(\w+)}", self.path))
+
+    @property
+    def read(self) -> Any:  # noqa: ANN401  the type of a type
+        """What the body is read as: of the command all that neither path nor service says."""
+        if len(self.kinds) > 1:
+            return Annotated[Union[self.kinds], Discriminator("action")]  # noqa: UP007
+        told = {self.named, "id" if self.makes else ""}
+        bases = self.kinds[0].__mro__
+        return next(base for base in bases if told.isdisjoint(f.name for f in fields(base)))
+
+    def commanded(self, said: Instruction, **given: str) -> Instruction:
+        """Return the command of a body, and what path and service say besides."""
+        known = {field.name for field in fields(self.kinds[0])}
+        more = {name: value for name, value in given.items() if name in known}
+        return self.kinds[0](**said.as_fields(), **more) if more else said
+
+
+ORDERS: Final = TypeAdapter(dict[str, OrderRoute]).validate_python(
+    tomllib.loads(files("service").joinpath("commands.toml").read_text("utf-8"))
+)
+"""By the name of the operation."""
+
+
 # --- who asks, and for what
-
-
-router = APIRouter(
-    prefix="/v1",
-    tags=["what an operator asks of it"],
-    responses={**COMMAND, **INVALID},
-)
-
-observatory = APIRouter(
-    prefix="/v1", tags=["what the observatory tells it"], responses={**COMMAND, **INVALID}
-)
-
-_BY_ACTION = Discriminator("action")
-_DITHER = body(Annotated[StartDither | StopDither, _BY_ACTION])
-_ACQUISITION = body(Annotated[Acquire | AbortAcquisition, _BY_ACTION])
 
 
 class AcceptedView(BaseModel):
@@ -205,6 +232,23 @@ class AcceptedView(BaseModel):
 
     links: dict[str, str]
     """Where to look for what becomes of it."""
+
+
+class MatrixAcceptedView(AcceptedView):
+    """A matrix that is being measured."""
+
+    id: str
+    """Of the matrix to come."""
+
+
+class RefitAcceptedView(AcceptedView):
+    """A reconstructor that is being computed."""
+
+    id: str
+    """Of the job: ``GET /v1/refits/{id}`` says what came of it."""
+
+
+_ALWAYS = {"state": "/v1/state", "events": "/v1/events"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,36 +268,36 @@ class Client:
     headers: MutableHeaders
     """Of the answer."""
 
-    async def orders(self, command: Command, **links: str) -> AcceptedView:
-        """Hand a command on; say what was done, and where to look for what becomes of it."""
-        return await self._orders(command, self.actor, links)
+    async def gives(self, order: OrderRoute, said: Any, name: str) -> AcceptedView:  # noqa: ANN401
+        """Hand an order on; say what was done, and where to look for what becomes of it.
 
-    async def decides(
-        self, command: Command, *shown: Callable[[TrackerState], Response], **links: str
-    ) -> AcceptedView:
-        """Do the same, if one of what is ``shown`` is still what whoever decides has seen."""
-        actor = replace(self.actor, check=lambda: self._check(shown))
-        return await self._orders(command, actor, links)
+        One that decides about something only if that still is what whoever decides has seen.
+        """
+        made = new_id(order.makes, self.service.snapshot().now_ns) if order.makes else ""
+        command: Any = order.commanded(said, **{order.named or "id": name or made})
+        actor = self.actor
+        if order.decides_on:
+            actor = replace(actor, check=lambda: self._check(order.decides_on, name))
+        if actor.key:
+            by = f"{command.by} ({actor.key})" if command.by else actor.key
+            command = replace(command, by=by)
+        text = await self.service.submit(command, actor, made)
+        about = {order.named or "id": name or made}
+        links = {what: where.format(**about) for what, where in order.follows.items()}
+        self.headers["Location"] = next(iter((links | _ALWAYS).values()))
+        answered = {"text": text, "links": _ALWAYS | links, "id": made}
+        return _ANSWERS.get(order.makes, AcceptedView).model_validate(answered)
 
-    def _check(self, shown: Sequence[Callable[[TrackerState], Response]]) -> None:
+    def _check(self, decides_on: Sequence[str], name: str) -> None:
         if self.seen is None:
             if self.strict:
                 raise UntaggedError("found no If-Match, expected the ETag of what is decided on")
             return
         state = self.service.snapshot().tracker
-        now = [each(state).headers["ETag"] for each in shown]
+        now = [_SHOWN[what](state, name).headers["ETag"] for what in decides_on]
         if self.seen != "*" and not {tag.strip() for tag in self.seen.split(",")} & {*now}:
             told = " or ".join(now)
             raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: look again")
-
-    async def _orders(self, command: Command, actor: Actor, links: dict[str, str]) -> AcceptedView:
-        if actor.key:
-            by = f"{command.by} ({actor.key})" if command.by else actor.key
-            command = replace(command, by=by)
-        text = await self.service.submit(command, actor)
-        usual = {"state": "/v1/state", "events": "/v1/events"}
-        accepted = self.accepted(text, **(links or usual))
-        return accepted.model_copy(update={"links": usual | links})
 
     def accepted(self, text: str, **links: str) -> AcceptedView:
         """Return what came of an order; the first link is where to look for what was begun."""
@@ -271,35 +315,15 @@ ClientDep = Annotated[Client, Depends(_client_of)]
 """Whoever gives the order."""
 
 
-def _link(matrix_id: str) -> str:
-    return f"/v1/reconstructors/{matrix_id}"
+def _one(state: TrackerState, name: str) -> Response:
+    return tagged(found_or_refuse(state.reconstructor(name), f"unknown reconstructor {name}"))
 
 
-_ALL = "/v1/reconstructors"
-
-AlarmName = Annotated[str, Path(max_length=128)]
-
-
-@router.post("/dither", status_code=202)
-async def dither(
-    client: ClientDep, command: Annotated[StartDither | StopDither, _DITHER]
-) -> AcceptedView:
-    """Start or stop the dither."""
-    return await client.orders(command)
-
-
-def _one(matrix_id: str) -> Callable[[TrackerState], Response]:
-    """Return what shows a reconstructor."""
-    return lambda state: tagged(
-        found_or_refuse(state.reconstructor(matrix_id), f"unknown reconstructor {matrix_id}")
-    )
-
-
-def _all(state: TrackerState) -> Response:
+def _all(state: TrackerState, _: str = "") -> Response:
     return tagged(state, RECONSTRUCTORS)
 
 
-def _before(state: TrackerState) -> Response:
+def _before(state: TrackerState, _: str) -> Response:
     """Return what shows the reconstructor that was in use before; where there is none, all.
 
     It stays as it is while the one in use is judged and others are proposed.
@@ -308,138 +332,68 @@ def _before(state: TrackerState) -> Response:
     return _all(state) if before is None else tagged(before)
 
 
-_DECIDES: dict[int | str, Any] = {**UNKNOWN, **DECISION}
+_SHOWN: Mapping[str, Callable[[TrackerState, str], Response]] = {
+    "/v1/reconstructors/{id}": _one,
+    "/v1/reconstructors": _all,
+    "/v1/reconstructors/previous": _before,
+}
+"""What an order may be decided on."""
+
+# --- the routes
 
 
-@router.post("/reconstructors/{id}/approve", status_code=202, responses=_DECIDES)
-async def approve(client: ClientDep, matrix_id: MatrixId, instruction: Said) -> AcceptedView:
-    """Publish a proposed reconstructor."""
-    command = about(Approve, instruction, id=matrix_id)
-    return await client.decides(command, _one(matrix_id), reconstructor=_link(matrix_id))
+MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
+NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
+RefitId = Annotated[str, Path(alias="id", max_length=128, description="Id of a refit")]
+_AlarmName = Annotated[str, Path(alias="name", max_length=128)]
+
+_NAMED: Mapping[str, Any] = {
+    "reconstructors": MatrixId,
+    "alarms": _AlarmName,
+    "values": _AlarmName,
+    "measurements": MeasurementId,
+    "noisy-matrix": NoisyId,
+}
+"""How a path names what an order is about, by what that is."""
+
+_ANSWERS = {"refit": RefitAcceptedView, "im": MatrixAcceptedView, "noisy": MatrixAcceptedView}
+"""To an order that begins something with an id, by the beginning of that."""
+
+router = APIRouter(responses={**INVALID})
 
 
-@router.post("/reconstructors/{id}/reject", status_code=202, responses=_DECIDES)
-async def reject(client: ClientDep, matrix_id: MatrixId, instruction: Said) -> AcceptedView:
-    """Discard a proposed reconstructor; the reason is kept with it."""
-    command = about(Reject, instruction, id=matrix_id)
-    return await client.decides(command, _one(matrix_id), reconstructor=_link(matrix_id))
+def _endpoint(order: OrderRoute) -> Callable[..., Awaitable[AcceptedView]]:
+    """Return what answers an order, with the parameters that FastAPI is to read."""
+
+    async def give(client: Client, said: Instruction, name: str = "") -> AcceptedView:
+        return await client.gives(order, said, name)
+
+    taken = {"client": ClientDep, "said": Annotated[Any, body(order.read)]}
+    if order.named:
+        taken["name"] = _NAMED[order.path.split("/")[2]]
+    signature = Signature(
+        [Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind) for name, kind in taken.items()]
+    )
+    vars(give)["__signature__"] = signature
+    return give
 
 
-@router.post("/reconstructors/{id}/publish", status_code=202, responses=_DECIDES)
-async def publish(client: ClientDep, matrix_id: MatrixId, instruction: Said) -> AcceptedView:
-    """Send a known reconstructor again, under a new id, unless the gate refuses it now.
-
-    What has been in use is sent even where the gate cannot judge it: α unknown, or the loop open.
-    """
-    command = about(Publish, instruction, id=matrix_id)
-    return await client.decides(command, _one(matrix_id), reconstructors=_ALL)
-
-
-@router.post("/rollback", status_code=202, responses={**DECISION})
-async def rollback(client: ClientDep, command: Annotated[Rollback, body(Rollback)]) -> AcceptedView:
-    """Go back to the one in use before, unless the gate refuses it; with ``anyway`` even then.
-
-    It is sent even where the gate cannot judge it: α unknown, or the loop open.
-    """
-    return await client.decides(command, _all, _before, reconstructors=_ALL)
+def _add(name: str, order: OrderRoute) -> None:
+    unknown = UNKNOWN if order.named else {}
+    decides = DECISION if order.decides_on else {}
+    router.add_api_route(
+        order.path,
+        _endpoint(order),
+        name=name,
+        methods=[order.method],
+        status_code=202,
+        response_model=_ANSWERS.get(order.makes, AcceptedView),
+        description=order.text,
+        tags=[order.tag],
+        responses={**COMMAND, **unknown, **decides},
+        openapi_extra=dict(needs(order.scope)),
+    )
 
 
-@router.post("/stop", status_code=202)
-async def stop(
-    client: ClientDep, command: Annotated[StopEverything, body(StopEverything)]
-) -> AcceptedView:
-    """Stop everything: whatever runs is ended, no dither, nothing made or sent until released.
-
-    The service goes on to look at telemetry. A restart releases nothing. Of the RTC nothing is
-    asked but that a dither ends and, at once, what gives back a loop that was opened for an
-    acquisition. It is carried out even where the disk refuses to record it.
-    """
-    return await client.orders(command)
-
-
-@router.post("/resume", status_code=202)
-async def resume(client: ClientDep, command: Annotated[Resume, body(Resume)]) -> AcceptedView:
-    """Release what was stopped: mode and dither are as they were ordered before."""
-    return await client.orders(command)
-
-
-@router.post("/alarms/{name}/acknowledge", status_code=202, responses={**UNKNOWN})
-async def acknowledge(
-    client: ClientDep, name: AlarmName, instruction: Annotated[SeenAlarm, body(SeenAlarm)]
-) -> AcceptedView:
-    """Say that an alarm is known of: it stays while it lasts; one that is over goes."""
-    return await client.orders(about(AcknowledgeAlarm, instruction, name=name), alarms="/v1/alarms")
-
-
-@router.post("/alarms/{name}/mute", status_code=202, responses={**UNKNOWN})
-async def mute(
-    client: ClientDep, name: AlarmName, instruction: Annotated[MuteTime, body(MuteTime)]
-) -> AcceptedView:
-    """Show an alarm no more for a time; what it forbids, it goes on to forbid."""
-    return await client.orders(about(MuteAlarm, instruction, name=name), alarms="/v1/alarms")
-
-
-@router.post("/alarms/{name}/unmute", status_code=202, responses={**UNKNOWN})
-async def unmute(client: ClientDep, name: AlarmName, instruction: Said) -> AcceptedView:
-    """Show an alarm again."""
-    return await client.orders(about(UnmuteAlarm, instruction, name=name), alarms="/v1/alarms")
-
-
-@router.put("/mode", status_code=202)
-async def mode(client: ClientDep, command: Annotated[SetMode, body(SetMode)]) -> AcceptedView:
-    """Choose how much the service may do by itself."""
-    return await client.orders(command)
-
-
-@router.post("/loop", status_code=202)
-async def loop(client: ClientDep, command: Annotated[SetLoop, body(SetLoop)]) -> AcceptedView:
-    """Open or close the loop, set gains by groups of modes, its leak, how many modes it controls.
-
-    The answer comes when the RTC has accepted; 409 with its reason when it refuses. The state shows
-    the loop as the RTC's next status tells it.
-    """
-    return await client.orders(command)
-
-
-@router.post("/loop/ramp", status_code=202)
-async def ramp(client: ClientDep, command: Annotated[Ramp, body(Ramp)]) -> AcceptedView:
-    """Have the RTC find, for each group of modes, the gain of least residual slopes.
-
-    The answer comes when the RTC has begun; 409 with its reason when it refuses. What it chose is
-    seen in the gains of the state, which change while it tries, too.
-    """
-    return await client.orders(command)
-
-
-@router.post("/acquisition", status_code=202)
-async def acquisition(
-    client: ClientDep, command: Annotated[Acquire | AbortAcquisition, _ACQUISITION]
-) -> AcceptedView:
-    """Find the registration from nothing, in any mode: its matrices need no further approval.
-
-    The loop is opened, smooth modes are dithered to find the mirror and others to confirm it, and
-    the loop closes on as many modes as the gate allows, then on more.
-    """
-    return await client.orders(command)
-
-
-@observatory.put("/values/{name}", status_code=202, responses={**UNKNOWN})
-async def value(
-    client: ClientDep, name: AlarmName, said: Annotated[ReportedValue, body(ReportedValue)]
-) -> AcceptedView:
-    """Tell a value that operators' own rules ask for; it counts for the time that is said.
-
-    What is told again unchanged is not written into the audit trail again.
-    """
-    return await client.orders(about(SetValue, said, name=name), alarms="/v1/alarms")
-
-
-@observatory.put("/pointing", status_code=202)
-async def pointing(
-    client: ClientDep, command: Annotated[SetPointing, body(SetPointing)]
-) -> AcceptedView:
-    """Say where the telescope looks, at least whenever it has moved by a degree.
-
-    The registration moves with it. An RTC that says so in its status overrules this.
-    """
-    return await client.orders(command)
+for _name, _order in ORDERS.items():
+    _add(_name, _order)

@@ -1,4 +1,4 @@
-"""Matrices that are made or measured on request: ask for one, see how far it is, take it away.
+"""Matrices that are made or measured on request: how far each is, and take it away.
 
 A reconstructor for the registration of now is a job that can be followed to its end. The RTC
 measures an interaction matrix, or the service sums a noisy one on sky from a random dither. A noisy
@@ -8,43 +8,28 @@ one can never become a reconstructor: no route, and nothing behind one, publishe
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.runtime.refits import RefitJob
-from service.runtime.snapshot import Snapshot
-from service.tracking.commands import (
-    GiveUp,
-    Measure,
-    MeasureChoice,
-    MeasureNoisy,
-    NoisyChoice,
-    Refit,
-)
-from service.tracking.dither_request import NOISY_DITHER
 from service.tracking.products import MeasurementRecord, NoisyFinding
 from service.tracking.state import TrackerState
 from service.web import views
-from service.web.commands import AcceptedView, ClientDep, Said, about, body
+from service.web.commands import MeasurementId, NoisyId, RefitId
 from service.web.connections import not_modified, tag_of
 from service.web.numbers import MatrixParameters, describes_numbers, numbers_of
-from service.web.problems import COMMAND, INVALID, UNKNOWN
+from service.web.problems import INVALID, UNKNOWN
 from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
 router = APIRouter(
     prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}
 )
+refits = APIRouter(prefix="/v1", tags=["what an operator asks of it"], responses={**INVALID})
 noisy = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
 
-_MEASURED = "/v1/measurements"
-_NOISY = "/v1/noisy-matrix"
-
-MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
-NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
-
+REFIT = define_view("RefitView", RefitJob)
 define_view(
     "NoisyFindingView",
     NoisyFinding,
@@ -66,23 +51,11 @@ NOISY_MATRICES = define_view(
 )
 
 
-class MatrixAcceptedView(AcceptedView):
-    """A matrix that is being measured."""
-
-    id: str
-    """Of the matrix to come."""
-
-
 _MEASURED_NUMBERS = describes_numbers(
     "The measured interaction matrix, slope per metre OPD",
     "Rows (slopes) and columns (modes)",
     "1384,400",
 )
-
-
-def _new_id(prefix: str, snapshot: Snapshot) -> str:
-    now = datetime.fromtimestamp(snapshot.now_ns / 1e9, UTC)
-    return f"{prefix}{now:%Y%m%dT%H%M%S.%f}"
 
 
 async def _file(request: Request, file_of: Callable[[str], bytes], matrix_id: str) -> Response:
@@ -95,17 +68,10 @@ async def _file(request: Request, file_of: Callable[[str], bytes], matrix_id: st
     )
 
 
-@router.post("/measurements", status_code=202, responses={**COMMAND})
-async def measure(
-    client: ClientDep, choice: Annotated[MeasureChoice, body(MeasureChoice)]
-) -> MatrixAcceptedView:
-    """Have the RTC measure an interaction matrix; 409 with its reason when it will not.
-
-    The answer comes when the RTC has begun; the matrix follows seconds to minutes later.
-    """
-    command = about(Measure, choice, id=_new_id("im-", client.service.snapshot()))
-    answered = await client.orders(command, measurement=f"{_MEASURED}/{command.id}")
-    return MatrixAcceptedView(id=command.id, **answered.model_dump())
+@refits.get("/refits/{id}", responses={200: shows(REFIT), **UNKNOWN})
+async def refit_job(service: ServiceDep, refit_id: RefitId) -> Response:
+    """Return how far a refit is: which reconstructor it has made, or why none."""
+    return answer(service.refits.job(refit_id))
 
 
 @router.get("/measurements", responses={200: shows(views.MEASUREMENTS)})
@@ -119,20 +85,6 @@ async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Res
     """Return how a matrix was measured, or how far it is."""
     record = service.snapshot().tracker.measurement(measurement_id)
     return answer(found_or_refuse(record, f"unknown measurement {measurement_id}"))
-
-
-@router.delete("/measurements/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def give_up(
-    client: ClientDep, measurement_id: MeasurementId, instruction: Said
-) -> AcceptedView:
-    """Wait no longer for a matrix under way; one that is stored stays.
-
-    Nothing on the wire ends the RTC's own work: it may go on to the end, and refuse other commands
-    until then. The service ignores what comes of it and asks, as often as it takes, for the loop
-    to be closed again if it was closed before.
-    """
-    command = about(GiveUp, instruction, id=measurement_id)
-    return await client.orders(command, measurement=f"{_MEASURED}/{measurement_id}")
 
 
 @router.get(
@@ -156,19 +108,6 @@ async def measured_matrix(
     return await numbers_of(request, measurement_id, parameters.format, kept.matrix, kept.file)
 
 
-@noisy.post("/noisy-matrix", status_code=202, responses={**COMMAND})
-async def measure_noisy(
-    client: ClientDep, choice: Annotated[NoisyChoice, body(NoisyChoice)]
-) -> MatrixAcceptedView:
-    """Measure a noisy interaction matrix on sky, loop closed, by a random dither.
-
-    The service's own dither makes way for it; every window of it is fitted like any other.
-    """
-    command = about(MeasureNoisy, choice, id=_new_id(NOISY_DITHER, client.service.snapshot()))
-    answered = await client.orders(command, matrix=f"{_NOISY}/{command.id}")
-    return MatrixAcceptedView(id=command.id, **answered.model_dump())
-
-
 @noisy.get("/noisy-matrix", responses={200: shows(NOISY_MATRICES)})
 async def noisy_matrices(service: ServiceDep) -> Response:
     """Return the noisy interaction matrices the service remembers, oldest first."""
@@ -180,13 +119,6 @@ async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return what is known of a noisy matrix, or how far it is."""
     record = service.snapshot().tracker.measurement(noisy_id)
     return answer(found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
-
-
-@noisy.delete("/noisy-matrix/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
-async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, instruction: Said) -> AcceptedView:
-    """End a noisy matrix under way, and its dither; one that is stored stays."""
-    command = about(GiveUp, instruction, id=noisy_id)
-    return await client.orders(command, matrix=f"{_NOISY}/{noisy_id}")
 
 
 @noisy.get(
@@ -203,38 +135,3 @@ async def give_up_noisy(client: ClientDep, noisy_id: NoisyId, instruction: Said)
 async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
     """Return the archived HDF5 file of a noisy matrix; ``pyrcal fit`` reads it."""
     return await _file(request, service.archive.noisy.file, noisy_id)
-
-
-# --- reconstructors that an operator has computed
-
-
-refits = APIRouter(prefix="/v1", tags=["what an operator asks of it"], responses={**INVALID})
-
-RefitId = Annotated[str, Path(alias="id", max_length=128, description="Id of a refit")]
-
-REFIT = define_view("RefitView", RefitJob)
-
-
-class RefitAcceptedView(AcceptedView):
-    """A reconstructor that is being computed."""
-
-    id: str
-    """Of the job: ``GET /v1/refits/{id}`` says what came of it."""
-
-
-@refits.post("/refit", status_code=202, responses={**COMMAND})
-async def refit(client: ClientDep, command: Annotated[Refit, body(Refit)]) -> RefitAcceptedView:
-    """Compute a reconstructor for the current registration; gate and mode apply as always.
-
-    The answer has the id of a job, which tells which reconstructor came of it.
-    """
-    answered = await client.orders(command, reconstructors="/v1/reconstructors")
-    job = client.service.refits.newest.id  # nothing has run since: no other can have begun
-    links = client.accepted(answered.text, refit=f"/v1/refits/{job}").links | answered.links
-    return RefitAcceptedView(id=job, text=answered.text, links=links)
-
-
-@refits.get("/refits/{id}", responses={200: shows(REFIT), **UNKNOWN})
-async def refit_job(service: ServiceDep, refit_id: RefitId) -> Response:
-    """Return how far a refit is: which reconstructor it has made, or why none."""
-    return answer(service.refits.job(refit_id))

@@ -57,6 +57,7 @@ def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
     expected = [
         *(ROOT / "service" / "instruments").glob("*.toml"),
         *(ROOT / "service" / "web" / "dashboard").iterdir(),
+        ROOT / "service" / "commands.toml",
         ROOT / "service" / "tracking" / "alarms.toml",
         ROOT / "service" / "web" / "openapi.json",
     ]

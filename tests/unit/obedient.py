@@ -34,11 +34,11 @@ class Obedient:
             policy=self.policy,
         )
 
-    async def submit(self, command, caller):
+    async def submit(self, command, caller, order_id=""):
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)
         if isinstance(command, Refit):
-            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause="refit-1")
+            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause=order_id)
             self.refits.begin([effect], self.now_ns)
         return f"{type(command).__name__}: 1 action(s) under way"

@@ -228,13 +228,13 @@ class FakeService:
     def snapshot(self):
         return self.now
 
-    async def submit(self, command, caller):
+    async def submit(self, command, caller, order_id=""):
         if self.refusal is not None:
             raise self.refusal
         self.commands.append(command)
         self.callers.append(caller)
         if isinstance(command, Refit):
-            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause="refit-1")
+            effect = MakeMatrix(n_modes=command.n_modes or 1, why="", cause=order_id)
             self.refits.begin([effect], self.now.now_ns)
         return f"{type(command).__name__} is on its way"
 

@@ -24,7 +24,7 @@ class FakeService:
     def snapshot(self):
         return SimpleNamespace(tracker=None)
 
-    async def submit(self, command, caller):
+    async def submit(self, command, caller, order_id=""):
         self.asked.append((command, caller))
         return "so it is"
 

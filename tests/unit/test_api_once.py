@@ -34,7 +34,7 @@ class FakeService:
             ready_reason="",
         )
 
-    async def submit(self, command, caller):
+    async def submit(self, command, caller, order_id=""):
         await asyncio.sleep(0.01)
         caller.check()
         if self.refusal is not None:

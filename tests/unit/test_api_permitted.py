@@ -39,10 +39,10 @@ REQUESTS = {
 class AtOneMoment(Obedient):
     """Asks the tracker what becomes of an order, and stays as it is."""
 
-    async def submit(self, command, caller):
+    async def submit(self, command, caller, order_id=""):
         step(self.tracker, command, self.policy, self.now_ns)
         if isinstance(command, Refit):
-            return await super().submit(command, caller)
+            return await super().submit(command, caller, order_id)
         return "done"
 
 

@@ -130,7 +130,7 @@ async def test_how_a_refit_ends_is_kept(client, service, event, state, made, rea
     service.refits.end(ev.MakeMatrix(n_modes=300, why="", cause="refit-2"), None)
     service.refits.end(ev.JudgeMatrix(id="cm-1", cause="refit-1"), None)  # what else it led to
     service.refits.end(effect, event)
-    job = (await client.get(f"/v1/refits/{service.refits.newest.id}")).json()
+    job = (await client.get("/v1/refits/refit-1")).json()
     assert (job["state"], job["reconstructor"]) == (state, made)
     assert reason in job["reason"]
 

@@ -42,9 +42,9 @@ TRAIL = tuple(
 class Listening(FakeService):
     """Checks, as the service does, whether what was decided on is still so."""
 
-    async def submit(self, command, caller):
+    async def submit(self, command, caller, order_id=""):
         caller.check()
-        return await super().submit(command, caller)
+        return await super().submit(command, caller, order_id)
 
 
 @contextlib.contextmanager
@@ -320,7 +320,8 @@ def test_a_refit_is_followed_until_there_is_a_reconstructor(
     )
 
     def happens():
-        effect = MakeMatrix(n_modes=300, why="", cause=service.refits.newest.id)
+        (job,) = service.refits._jobs
+        effect = MakeMatrix(n_modes=300, why="", cause=job)
         service.refits.end(effect, MatrixMade(record=made, wanted=True))
 
     at_the_next_look(monkeypatch, happens)

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from service.tracking import (
     alarm_records,
+    alarm_rules,
     alarms,
     dither,
     interlocks,
@@ -26,6 +27,7 @@ from service.tracking import (
 )
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.alarm_rules import derive_alarms
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.loop import CommandState
@@ -79,18 +81,24 @@ def step(
         interlocks.require(state, event, policy, now_ns)
     cause = cause or ev.new_id(ev.kebab(type(event)), now_ns)
     context = StepContext(state, policy, now_ns, cause)
-    alarm_records.judge_rules(context)
+    derive_alarms(context)
+    for part in (_react, _go_on):
+        part(context, event)
+        derive_alarms(context)
+    ordered = isinstance(event, Command)
+    alarm_records.follow(context, timely=isinstance(event, ev.Tick), ordered=ordered)
+    return context.state, tuple(context.effects)
+
+
+def _react(context: StepContext, event: Event) -> None:
+    """Take the event in."""
     measurement.watch(context, event)
     reaction = REACTIONS.get(type(event))
     if reaction is not None:
         reaction(context, event)
+    refusals.follow(context)
     probation.follow(context, event)
-    alarm_records.judge_rules(context)
     note_declined(context, rejected=isinstance(event, cmd.Reject))
-    _go_on(context, event)
-    ordered = isinstance(event, Command)
-    alarm_records.follow(context, timely=isinstance(event, ev.Tick), ordered=ordered)
-    return context.state, tuple(context.effects)
 
 
 def _go_on(context: StepContext, event: Event) -> None:
@@ -114,7 +122,6 @@ def _on_tick(context: StepContext, _: ev.Tick) -> None:
     """Let what depends on the time alone age: the RTC's silence, α, alarms."""
     rtc.on_tick(context)
     validity.age(context)
-    refusals.follow(context)
     operator.close_again(context)
 
 
@@ -227,7 +234,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.JobFailed: _on_failure,
     cmd.SetMode: operator.set_mode,
     cmd.SetPointing: operator.set_pointing,
-    cmd.SetValue: alarm_records.set_value,
+    cmd.SetValue: alarm_rules.set_value,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
     cmd.StopEverything: resume.stop,

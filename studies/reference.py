@@ -241,6 +241,7 @@ def runbook(acts: Mapping[str, str]) -> str:
         forbids = ", ".join(f"`{act}`" for act in acts if act in kind.blocks)
         head = [f"*{kind.severity.value}*", forbids and f"forbids {forbids}"]
         head.append(f"the {kind.responsible} can end it" if kind.responsible else "")
+        head.append(f"found in `service/{kind.origin}`")
         means = kind.means[:1].upper() + kind.means[1:]
         do = f"**Do**: {kind.do}."
         parts += [f"## {name}", "; ".join(part for part in head if part), f"{means}.", do]

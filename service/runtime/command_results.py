@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from service.errors import CommandError, LinkError
 from service.tracking import commands as cmd
-from service.tracking.alarm_records import as_text, muted
+from service.tracking.alarm_records import muted
+from service.tracking.alarm_rules import as_text
 from service.tracking.alarms import AlarmRecord
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m

@@ -51,7 +51,7 @@ from service.runtime.worker import OpticsWorker
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarm_records import changes_value
+from service.tracking.alarm_rules import changes_value
 from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event

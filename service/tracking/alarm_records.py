@@ -1,8 +1,4 @@
-"""Operators and alarms: rules of their own that raise some, and who has seen which.
-
-A rule forbids some acts while a condition on what is told or known holds ("do not publish while the
-shutter is shut"); one that holds is an alarm like others. Its condition is on a value that the
-observatory tells for a time, or on a field of the state.
+"""What operators have seen of alarms: acknowledged, muted, gone unseen.
 
 As LSST's ts_watcher has it: an alarm is acknowledged, not dismissed; one that goes unseen stays
 as stale; the worst it has been is kept; an acknowledgement holds until the alarm is over, or worse
@@ -11,27 +7,22 @@ than whoever gave it has seen. What an operator's order ends has been seen.
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable
 from dataclasses import replace
-from difflib import get_close_matches
-from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking.alarms import (
     ALARMS,
+    RULE_PREFIX,
     Alarm,
-    AlarmDefinition,
     AlarmRecord,
     AlarmState,
     OperatorNote,
     Severity,
 )
-from service.tracking.policy import SECOND_NS, Rule
-from service.tracking.state import ObservatoryValue, Orders, TrackerState
+from service.tracking.policy import SECOND_NS
+from service.tracking.state import Orders, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import end_alarm
 
 RAISED_AGAIN_S = 60.0
 """After a restart of the service, for an alarm that lasts to be raised again."""
@@ -195,7 +186,7 @@ def _unmuted(record: AlarmRecord, now_ns: int) -> AlarmRecord:
 def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord], AlarmRecord]:
     """Return all notes by name, and one of them, or a new one."""
     notes = {record.name: record for record in context.alarms.records}
-    own = {f"{PREFIX}{rule.name}" for rule in context.policy.rules}
+    own = {f"{RULE_PREFIX}{rule.name}" for rule in context.policy.rules}
     if name not in notes and name not in ALARMS and name not in own:
         raise UnknownIdError(f"unknown alarm {name}")
     return notes, notes.get(name, AlarmRecord(name=name))
@@ -211,112 +202,3 @@ def _keep(context: StepContext, notes: dict[str, AlarmRecord]) -> None:
 def _operator_note(context: StepContext, command: cmd.Instruction) -> OperatorNote:
     by = command.by or "an operator"
     return OperatorNote(by=by, reason=command.reason, t_ns_utc=context.now_ns)
-
-
-PREFIX = "rule."
-"""Of the alarms of rules: no other alarm has a dot in its name."""
-
-_COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
-
-FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
-    "state.mode": lambda state: state.operator.mode.value,
-    "state.loop": lambda state: None if state.loop.rtc is None else state.loop.rtc.loop.value,
-    "state.n_controlled": lambda state: (
-        None if state.loop.rtc is None else state.loop.rtc.n_controlled
-    ),
-    "state.magnitude": lambda state: None if state.loop.rtc is None else state.loop.rtc.magnitude,
-    "state.elevation_deg": lambda state: (
-        None if state.alpha.pointing is None else state.alpha.pointing.elevation_deg
-    ),
-    "state.azimuth_deg": lambda state: (
-        None if state.alpha.pointing is None else state.alpha.pointing.azimuth_deg
-    ),
-}
-"""What a condition may ask of the state; nothing where it is not known."""
-
-
-def judge_rules(context: StepContext) -> None:
-    """Raise the alarms of the rules that hold, and end those of the others."""
-    raised = {alarm.name: alarm.text for alarm in context.alarms.active}
-    for rule in context.policy.rules:
-        name, found = f"{PREFIX}{rule.name}", _found(context, rule)
-        holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
-        text = f"{rule.text} ({rule.about} is {'not known' if found is None else as_text(found)})"
-        if holds and raised.get(name) != text:
-            context.raise_alarm(name, text, _kind(rule))
-        elif not holds and name in raised:
-            end_alarm(context, name)
-
-
-def set_value(context: StepContext, command: cmd.SetValue) -> None:
-    """Take a value that a rule asks for; it counts for as long as was said.
-
-    Raises
-    ------
-    CommandError
-        If it is of another kind than the rule compares it with.
-    UnknownIdError
-        If no rule asks for it.
-    """
-    asked = {rule.about: rule for rule in context.policy.rules if rule.about not in FIELDS}
-    if command.name not in asked:
-        near = get_close_matches(command.name, asked, n=1)
-        known = ", ".join(sorted(asked)) or "none"
-        hint = f", did you mean {near[0]}?" if near else f"; asked for: {known}"
-        raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
-    rule = asked[command.name]
-    if kind_of(command.value) != kind_of(rule.than):
-        raise CommandError(
-            f"{command.name}: found {as_text(command.value)}, expected {kind_of(rule.than)}: rule "
-            f"{rule.name} compares it with {as_text(rule.than)}"
-        )
-    until_ns = context.now_ns + round(command.for_s * SECOND_NS)
-    told = ObservatoryValue(
-        name=command.name, value=command.value, until_ns_utc=until_ns, by=command.by
-    )
-    others = tuple(each for each in context.alarms.observatory_values if each.name != command.name)
-    context.alarms = replace(context.alarms, observatory_values=(*others, told))
-
-
-def changes_value(state: TrackerState, command: cmd.SetValue, now_ns: int) -> bool:
-    """Return whether a value is told that differs from what is known."""
-    return not any(
-        each.name == command.name and each.until_ns_utc > now_ns and each.value == command.value
-        for each in state.alarms.observatory_values
-    )
-
-
-def kind_of(value: cmd.Value) -> str:
-    """Return what a value is, in words."""
-    if isinstance(value, bool):
-        return "true or false"
-    return "a text" if isinstance(value, str) else "a number"
-
-
-def as_text(value: cmd.Value) -> str:
-    """Return a value as TOML and JSON write it."""
-    return str(value).lower() if isinstance(value, bool) else repr(value)
-
-
-def _found(context: StepContext, rule: Rule) -> cmd.Value | None:
-    if rule.about in FIELDS:
-        return FIELDS[rule.about](context.state)
-    told = (each for each in context.alarms.observatory_values if each.name == rule.about)
-    return next((each.value for each in told if each.until_ns_utc > context.now_ns), None)
-
-
-def _kind(rule: Rule) -> AlarmDefinition:
-    return AlarmDefinition(
-        severity=rule.severity,
-        means=rule.text,
-        do="see to it, or change the rule in the settings",
-        blocks=rule.blocks,
-        because=rule.text if rule.blocks else "",
-    )

@@ -62,6 +62,10 @@ SLOPES_STAND = "slopes-stand"
 NOT_FOUND = "registration-not-found"
 
 
+RULE_PREFIX = "rule."
+"""Of the alarms of operators' own rules: no other alarm has a dot in its name."""
+
+
 class Interlock(StrEnum):
     """What an alarm may forbid."""
 
@@ -149,6 +153,9 @@ class AlarmDefinition:
 
     responsible: Responsible | None = None
     """Who can end it, where that is waited for though it may forbid nothing."""
+
+    origin: str = "settings"
+    """File of the service that finds it; ``settings``: a rule of the operators' own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -149,7 +149,6 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
         context.dither = replace(
             context.dither, start_seq=reply.start_seq, asked_ns_utc=context.now_ns
         )
-        context.clear_alarm(alarms.NO_DITHER)
         text = f"{request.id} starts at frame {reply.start_seq}"
         context.log("dither.started", text, _level(request))
         return
@@ -244,8 +243,6 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
     rtc, dither = context.rtc, context.dither
     if not event.text:
         context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
-        context.clear_alarm(alarms.NOT_AS_ASKED)
-        context.clear_alarm(alarms.OVER_BUDGET)
         return None
     if rtc is None or dither is None or dither.id != event.id:
         return None
@@ -280,18 +277,11 @@ def stop_unwanted(context: StepContext, rtc: Status) -> None:
     why = loud or dither_plan.why_unwanted(context, rtc)
     if running is None or why is None:
         forget_unwanted(context)
-        _forgive(context, rtc)
         return
     if context.dither_policy.unwanted_id != running:
         _meet_unwanted(context, running)
         if loud is not None:
             _blame(context, running, loud)
-    if context.now_ns - context.dither_policy.stopped_ns_utc >= GONE_WITHIN_S * SECOND_NS:
-        text = (
-            f"{why}, and the RTC goes on playing {running}: it is asked every {TELL_EVERY_S:.0f} s "
-            "to stop it; stop it at the RTC"
-        )
-        context.raise_alarm(alarms.NOT_STOPPED, text)
     if context.now_ns - context.dither_policy.stop_asked_ns_utc >= TELL_EVERY_S * SECOND_NS:
         tell_to_stop(context)
 
@@ -300,7 +290,40 @@ def forget_unwanted(context: StepContext) -> None:
     """Note that no unwanted dither plays, or nobody knows of one."""
     if context.dither_policy.unwanted_id is not None:
         context.dither_policy = replace(context.dither_policy, unwanted_id=None)
-        context.clear_alarm(alarms.NOT_STOPPED)
+
+
+def not_stopped_text(context: StepContext) -> str | None:
+    """Return that the RTC plays a dither that it was asked to stop, or None."""
+    rtc, memory = context.rtc, context.dither_policy
+    if rtc is None or memory.unwanted_id is None or rtc.dither_id != memory.unwanted_id:
+        return None
+    if context.now_ns - memory.stopped_ns_utc < GONE_WITHIN_S * SECOND_NS:
+        return None
+    why = dither_plan.too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
+    return why and (
+        f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
+        f"{TELL_EVERY_S:.0f} s to stop it; stop it at the RTC"
+    )
+
+
+def is_not_as_asked(context: StepContext) -> bool:
+    """Return whether the last dither is still the one that was not played as asked for."""
+    return context.dither_policy.amiss_id is not None and not _is_given_up(context)
+
+
+def is_over_budget(context: StepContext) -> bool:
+    """Return whether no dither has been played as it may since one was too strong."""
+    memory, own, rtc = context.dither_policy, context.dither, context.rtc
+    if memory.unwanted_id is not None:
+        return True
+    plays = own is not None and rtc is not None and rtc.dither_id == own.id
+    return not (plays and not memory.loud_text) and not _is_given_up(context)
+
+
+def _is_given_up(context: StepContext) -> bool:
+    """Return whether no dither is wanted, and none plays that is not."""
+    unwanted = context.dithers.stopped or not context.policy.dither_enabled
+    return unwanted and context.dither_policy.unwanted_id is None
 
 
 def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
@@ -389,7 +412,6 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
         )
         if why_unusable(dither, rtc, context.policy) is None:
             context.dither = dither
-            context.clear_alarm(alarms.NO_DITHER)
             context.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True
     return False
@@ -487,14 +509,3 @@ def _blame(context: StepContext, running: str, loud: str) -> None:
     )
     context.dither_policy = replace(context.dither_policy, loud_ns_utc=context.now_ns)
     context.raise_alarm(alarms.OVER_BUDGET, text)
-
-
-def _forgive(context: StepContext, rtc: Status) -> None:
-    """End the alarm of a dither too strong once one is played as it may, or none is wanted."""
-    own = context.dither
-    fine = own is not None and rtc.dither_id == own.id and not context.dither_policy.loud_text
-    given_up = context.dithers.stopped or not context.policy.dither_enabled
-    if given_up:
-        context.clear_alarm(alarms.NOT_AS_ASKED)
-    if fine or given_up:
-        context.clear_alarm(alarms.OVER_BUDGET)

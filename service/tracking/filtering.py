@@ -16,7 +16,7 @@ from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, Why
 from service.model.misregistration import Misregistration
 from service.tracking import mode_proof, validity
-from service.tracking.alarms import DISAGREES, SUSPECTED, Interlock, blocking_alarm
+from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.jumps import as_previous
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
@@ -253,8 +253,6 @@ def accept(
     context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
     if not doubted:
         validity.have_window(context)
-        context.clear_alarm(SUSPECTED)
-        context.clear_alarm(DISAGREES)
     remember(context, entry_of(measured, registration, update.innovation))
     validity.age(context)
 

@@ -15,8 +15,7 @@ from typing import Final, get_args
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking.acquisition_state import AcquisitionStage
-from service.tracking.alarm_records import PREFIX
-from service.tracking.alarms import ALARMS
+from service.tracking.alarms import ALARMS, RULE_PREFIX
 from service.tracking.commands import Command
 from service.tracking.loop import NO_RTC
 from service.tracking.operations.acquisition_stages import why_not_now
@@ -298,7 +297,7 @@ def _unmute(moment: Moment, alarm: str) -> str | None:
 
 
 def _is_known(alarm: str) -> bool:
-    return alarm in ALARMS or alarm.startswith(PREFIX) or not alarm
+    return alarm in ALARMS or alarm.startswith(RULE_PREFIX) or not alarm
 
 
 INTERLOCKS: Final[dict[type, Callable[[Moment, str], str | None]]] = {

@@ -229,8 +229,9 @@ def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> No
     if proof == before:
         return
     context.matrices = replace(context.matrices, mode_proof=proof)
-    _report_answers(context, rtc, bad)
-    _tell_uneven(context, before)
+    in_the_way = _contrary_in_the_way(context, rtc)
+    if in_the_way and bad & shunned_modes(context.state):
+        limit_modes(context, in_the_way[0], _contrary_in_words(proof, in_the_way))
 
 
 def _answers(
@@ -255,14 +256,10 @@ def recognise(context: StepContext, event: ev.ModesRecognised) -> None:
         context.matrices.mode_proof,
         strange=frozenset(event.strange),
         own_response_ratio=event.response,
+        own_uneven=event.uneven,
     )
     context.matrices = replace(context.matrices, mode_proof=proof)
     context.log("modes.recognised", f"{event.id}: {event.text}")
-    before = context.matrices.mode_proof
-    context.matrices = replace(
-        context.matrices, mode_proof=replace(before, own_uneven=event.uneven)
-    )
-    _tell_uneven(context, before)
 
 
 def proof_to_keep(state: TrackerState) -> ModeProof | None:
@@ -334,21 +331,26 @@ def _uneven(
     return odd
 
 
-def _report_answers(context: StepContext, rtc: Status, bad: frozenset[int]) -> None:
-    """Say which modes answer otherwise, and control none of them for a while."""
-    proof = context.matrices.mode_proof
-    contrary = shunned_modes(context.state)
-    in_the_way = sorted(mode for mode in contrary if mode < _target(context, rtc))
-    if not in_the_way:
-        context.clear_alarm(alarms.MODES_CONTRARY)
-        return
-    text = (
+def contrary_text(context: StepContext) -> str | None:
+    """Return which modes that are to be controlled answer otherwise than the file says, or None."""
+    if context.rtc is None:
+        return context.alarm_text(alarms.MODES_CONTRARY)
+    in_the_way = _contrary_in_the_way(context, context.rtc)
+    return _contrary_in_words(context.matrices.mode_proof, in_the_way) if in_the_way else None
+
+
+def _contrary_in_words(proof: ModeProof, in_the_way: list[int]) -> str:
+    return (
         f"{_named(in_the_way)} not answered the dither as the instrument file says"
         f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
-    context.raise_alarm(alarms.MODES_CONTRARY, text)
-    if bad & contrary:
-        limit_modes(context, in_the_way[0], text)
+
+
+def _contrary_in_the_way(context: StepContext, rtc: Status) -> list[int]:
+    if not context.matrices.mode_proof.contrary:
+        return []
+    target = _target(context, rtc)
+    return sorted(mode for mode in shunned_modes(context.state) if mode < target)
 
 
 def _in_words(proof: ModeProof, modes: list[int]) -> str:
@@ -368,11 +370,9 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
     return f" ({', '.join(said)}{times})" if said else ""
 
 
-def _tell_uneven(context: StepContext, before: ModeProof) -> None:
-    """Say which modes answer more or less strongly than their neighbours."""
+def uneven_text(context: StepContext) -> str | None:
+    """Return which modes answer more or less strongly than their neighbours, or None."""
     proof = context.matrices.mode_proof
-    if (proof.uneven, proof.own_uneven) == (before.uneven, before.own_uneven):
-        return
     found = [f"{proof.own_uneven}: matrices allow for it"] if proof.own_uneven else []
     if proof.uneven:
         one = "answers" if len(proof.uneven) == 1 else "answer"
@@ -381,10 +381,7 @@ def _tell_uneven(context: StepContext, before: ModeProof) -> None:
             f"{noun} {_listed(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
             "strongly or as weakly as the modes beside"
         )
-    if found:
-        context.raise_alarm(alarms.MODES_UNEVEN, "; ".join(found))
-    else:
-        context.clear_alarm(alarms.MODES_UNEVEN)
+    return "; ".join(found) or None
 
 
 def _missed(proof: ModeProof) -> ModeProof:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from service.errors import CommandError, UnknownIdError
 from service.tracking import events as ev
 from service.tracking import update_policy
-from service.tracking.alarms import NOT_ACKNOWLEDGED, OTHER_SUM, SHORT_MARGIN, Interlock
+from service.tracking.alarms import Interlock
 from service.tracking.loop import commanded_gains, extended_gains
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.sending import (
@@ -304,8 +304,6 @@ def _acknowledged(
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
         change(context, record)
         use(context, record.id)
-        context.clear_alarm(NOT_ACKNOWLEDGED)
-        context.clear_alarm(SHORT_MARGIN)
         gains = () if context.rtc is None else commanded_gains(context.rtc, record.n_modes)
         of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
         context.matrices = replace(
@@ -350,8 +348,6 @@ def use_named(context: StepContext, matrix_id: str) -> None:
     if record is None or why_unread(context.state, matrix_id):
         return
     use(context, matrix_id)
-    if record.on_its_way or record.state is MatrixState.FAILED:
-        context.clear_alarm(NOT_ACKNOWLEDGED)
     if record.state is MatrixState.FAILED:
         text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
         change_state(context, matrix_id, MatrixState.APPLIED, text)
@@ -359,7 +355,7 @@ def use_named(context: StepContext, matrix_id: str) -> None:
 
 
 def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
-    """Note margin and loss of the matrix in use; raise an alarm when the margin is short."""
+    """Note margin and loss of the matrix in use."""
     record, verdict, judged = context.state.reconstructor(event.id), event.verdict, event.judged
     if record is None:
         return
@@ -381,12 +377,6 @@ def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
             id=event.id, alpha=event.alpha, expected=event.expected, t_ns_utc=context.now_ns
         )
     context.matrices = replace(context.matrices, margin=verdict, assessment=assessment)
-    if verdict.accepted:
-        context.clear_alarm(SHORT_MARGIN)
-    else:
-        context.raise_alarm(
-            SHORT_MARGIN, f"{event.id}: {verdict.reason}", critical=verdict.unstable
-        )
 
 
 def _sendable(
@@ -425,7 +415,6 @@ def _distrust(
         mismatched_id=record.id,
         applied_asked_ns_utc=context.now_ns,
     )
-    context.raise_alarm(OTHER_SUM, text)
 
 
 def _trust(context: StepContext, matrix_id: str) -> None:
@@ -435,7 +424,6 @@ def _trust(context: StepContext, matrix_id: str) -> None:
     if context.matrices.mismatched_id is not None:
         context.matrices = replace(context.matrices, mismatched_id=None)
         context.log("reconstructor.right", f"the RTC holds {matrix_id} as it was sent")
-        context.clear_alarm(OTHER_SUM)
 
 
 def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:

@@ -28,48 +28,53 @@ def count(context: StepContext) -> None:
 
 
 def refuse(context: StepContext, reason: str, kind: RefusalKind) -> None:
-    """Count a window that gave nothing; the third in a row is an alarm, with its reason."""
+    """Count a window that gave nothing, and why."""
     count(context)
     if kind in AS_EXPECTED:
         return
     run = min(context.windows.run, 0) - 1
-    context.windows = replace(context.windows, run=run)
-    if run > -IN_A_ROW or _excused(context):
-        return
-    text = f"windows are refused one after the other: {reason}; α is not measured meanwhile"
-    before = context.state.alarm(alarms.WINDOWS_REFUSED)
-    if before is not None and says_the_same(before.text, text):
-        text = before.text  # one cause is one text: of each window the log tells the numbers
-    context.raise_alarm(alarms.WINDOWS_REFUSED, text)
+    context.windows = replace(context.windows, run=run, refused_because=reason)
 
 
 def use(context: StepContext) -> None:
-    """Note that a window could be used; as many in a row as raise the alarm end it."""
-    run = max(context.windows.run, 0) + 1
-    context.windows = replace(context.windows, run=run)
-    if run >= IN_A_ROW:
-        context.clear_alarm(alarms.WINDOWS_REFUSED)
+    """Note that a window could be used."""
+    context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
 
 
 def follow(context: StepContext) -> None:
-    """End the alarm, and begin to count anew, where no window is expected any more.
+    """Begin to count anew where no window is expected any more."""
+    if context.windows.run < 0 and _excused(context):
+        context.windows = replace(context.windows, run=0)
 
-    One that is expected and does not come is as good as refused.
+
+def refused_text(context: StepContext) -> str | None:
+    """Return why windows are refused one after the other, or none comes; None: they are not.
+
+    As many in a row as raise the alarm end it. One that is expected and does not come is as good as
+    refused.
     """
-    if _excused(context):
-        if context.windows.run < 0 or context.state.alarm(alarms.WINDOWS_REFUSED):
-            context.windows = replace(context.windows, run=0)
-            context.clear_alarm(alarms.WINDOWS_REFUSED)
-        return
+    raised, run = context.alarm_text(alarms.WINDOWS_REFUSED), context.windows.run
+    if run <= -IN_A_ROW:
+        because = context.windows.refused_because
+        text = f"windows are refused one after the other: {because}; α is not measured meanwhile"
+        if raised is not None and says_the_same(raised, text):
+            text = raised  # one cause is one text: of each window the log tells the numbers
+    elif raised is not None:
+        text = raised if run < IN_A_ROW else ""
+    else:
+        text = _missing_text(context)
+    return None if not text or _excused(context) else text
+
+
+def _missing_text(context: StepContext) -> str:
     registration, dither = context.registration, context.dither
     if dither is None or dither.start_seq is None:
-        return
+        return ""
     since_ns = max(registration.window_ns_utc if registration else 0, dither.asked_ns_utc)
     patience_s = max(NONE_FOR_S, 3.0 * (dither.window_s or 0.0))
-    raised = context.state.alarm(alarms.WINDOWS_REFUSED) is not None
-    if not raised and context.now_ns - since_ns >= patience_s * SECOND_NS:
-        text = f"no window was accepted for {patience_s:.0f} s although a dither runs"
-        context.raise_alarm(alarms.WINDOWS_REFUSED, text)
+    if context.now_ns - since_ns < patience_s * SECOND_NS:
+        return ""
+    return f"no window was accepted for {patience_s:.0f} s although a dither runs"
 
 
 def _excused(context: StepContext) -> bool:

@@ -126,6 +126,9 @@ class SuspectedJump(TimedEstimate):
     held_ns_utc: int
     """When it was put aside, by the service's clock."""
 
+    text: str = ""
+    """How far out it lies, for its alarm."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Registration:

@@ -7,7 +7,8 @@ from dataclasses import replace
 from service.tracking import commands as cmd
 from service.tracking import dither, mode_proof, offload
 from service.tracking.alarm_records import take_over
-from service.tracking.alarms import STOPPED, Interlock
+from service.tracking.alarm_rules import derive_alarms
+from service.tracking.alarms import Interlock
 from service.tracking.operations.acquisition import inherit, left_behind
 from service.tracking.operations.acquisition_stages import abort
 from service.tracking.operations.measurement import give_up
@@ -40,7 +41,8 @@ def stop(context: StepContext, command: cmd.StopEverything) -> None:
     if not context.operator.stopped_because:
         ramp = ramping(context.state, context.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
-        _stay(context, f"everything was stopped {command.signed}{left}")
+        text = f"everything was stopped {command.signed}{left}"
+        context.operator = replace(context.operator, stopped_because=text)
     if context.acquisition.under_way:
         abort(context, "by the operator", held_off=True)
     for record in (context.state.measuring, context.state.noisy_measurement):
@@ -55,7 +57,6 @@ def stop(context: StepContext, command: cmd.StopEverything) -> None:
 def release(context: StepContext, command: cmd.Resume) -> None:
     """Go on in the mode and with the dither that were ordered before, or meanwhile."""
     context.operator = replace(context.operator, stopped_because="")
-    context.clear_alarm(STOPPED)
     context.log("resumed", command.signed)
 
 
@@ -63,13 +64,6 @@ def keep_stopped(context: StepContext) -> None:
     """Have no dither of the service's own on the mirror while everything is stopped."""
     if context.rtc is not None and context.blocking_alarm(Interlock.ASK) is None:
         dither.stop_unwanted(context, context.rtc)
-
-
-def _stay(context: StepContext, text: str) -> None:
-    context.operator = replace(context.operator, stopped_because=text)
-    context.raise_alarm(
-        STOPPED, f"{text}: nothing is dithered, made or sent until the stop is released"
-    )
 
 
 def orders_of(state: TrackerState) -> Orders:
@@ -170,12 +164,13 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     context = StepContext(state, policy, now_ns)
     if saved.orders is not None and saved.system == state.system:
         obey(context, saved.orders)
-        if saved.orders.stopped:
-            _stay(context, saved.orders.stopped)
+        stopped = saved.orders.stopped
+        context.operator = replace(context.operator, stopped_because=stopped)
         take_over(context, saved.orders)
     _take_over_alpha(context, saved, now_ns)
     if saved.offload is not None and saved.system == state.system:
         offload.go_on(context, saved.offload)
+    derive_alarms(context)
     return context.state
 
 

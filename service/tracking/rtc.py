@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.estimation.loop import loop_numbers, same_loop, same_numbers, why_open
+from service.estimation.loop import loop_numbers, same_loop, same_numbers
 from service.tracking import alarms, dither, mode_proof, reconstructors, validity
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import Effect
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
@@ -17,11 +16,6 @@ from service.wire import DitherRequest, DitherStop, Status
 
 ACKNOWLEDGE_WITHIN_S = 3.0
 """An RTC applies within 2 s of the commit, or it has failed."""
-
-FORGOTTEN_AFTER_S = 15.0
-"""An alarm the link repeats while it lasts is over after this much silence."""
-
-_RENEWED = (alarms.SECOND_RTC, alarms.OTHER_BASIS)
 
 _SAME_LINE_HZ = 2.5
 
@@ -41,10 +35,6 @@ def on_tick(context: StepContext) -> None:
             reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
             with context.because_of(record.cause):
                 context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
-    for alarm in context.alarms.active:
-        silent_ns = context.now_ns - alarm.seen_ns_utc
-        if alarm.name in _RENEWED and silent_ns > FORGOTTEN_AFTER_S * SECOND_NS:
-            validity.end_alarm(context, alarm.name)
     since_ns = context.matrices.making_since_ns_utc
     if since_ns is not None and context.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
         reconstructors.made_none(context)
@@ -56,7 +46,6 @@ def on_tick(context: StepContext) -> None:
 def on_status(context: StepContext, rtc: Status) -> None:
     """Take over what the RTC says of itself."""
     before, registration = context.rtc, context.registration
-    context.clear_alarm(alarms.VANISHED)
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
         reconstructors.judge_again(context)
@@ -76,14 +65,6 @@ def on_status(context: StepContext, rtc: Status) -> None:
     _tell_of_gains(context, before, rtc)
     if rtc.cm_id is not None:
         reconstructors.use_named(context, rtc.cm_id)
-    measuring, acquisition = context.state.measuring, context.acquisition
-    opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
-    # its alarm tells more, and not to close the loop on any matrix
-    opened = opened or acquisition.stage is AcquisitionStage.INTERRUPTED
-    if not rtc.in_loop and not opened:
-        context.raise_alarm(alarms.LOOP_OPEN, f"{why_open(rtc)}: close it to calibrate")
-    else:
-        context.clear_alarm(alarms.LOOP_OPEN)
     dither.follow_status(context, rtc)
 
 
@@ -139,7 +120,6 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     dither.found_again(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)
-    context.clear_alarm(alarms.OTHER_SUM)
     context.log("rtc.session", f"the RTC started session {started.session}")
 
 

@@ -164,6 +164,9 @@ class WindowCounts:
     run: int = 0
     """How many of the last windows could be used one after the other; below 0: were refused."""
 
+    refused_because: str = ""
+    """Why the last of those was; empty: none was yet."""
+
     outlying: int = 0
     """Believable in themselves, but so far from all others that they were not believed."""
 

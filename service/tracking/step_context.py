@@ -161,6 +161,11 @@ class StepContext:
         """Return an alarm that forbids this now, or None."""
         return blocking_alarm(self.state.alarms.active, interlock)
 
+    def alarm_text(self, name: str) -> str | None:
+        """Return the text of an alarm that lasts; None: it does not."""
+        alarm = self.state.alarm(name)
+        return None if alarm is None else alarm.text
+
     def put_off(self, *, dither_s: float = 0.0, make_s: float = 0.0) -> None:
         """Ask for no dither, make no reconstructor for so long; 0: that one is not put off."""
         dither_ns, make_ns = (

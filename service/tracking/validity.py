@@ -209,11 +209,6 @@ def age(context: StepContext) -> None:
         elif context.dither is None and _too_wide_for_the_gate(context.state, registration):
             want_window(context, "σ has grown beyond what the stability gate accepts")
         context.registration = replace(registration, validity=standing)
-    text = _stale_reason(context.state, context.now_ns)
-    if text is None:
-        context.clear_alarm(STALE)
-    else:
-        context.raise_alarm(STALE, text)
 
 
 def want_window(context: StepContext, reason: str) -> None:
@@ -308,17 +303,12 @@ def _without_old_suspicion(registration: Registration, now_ns: int) -> Registrat
     return replace(registration, suspected_jump=None, doubt=doubt, doubt_voids=True)
 
 
-def _stale_reason(state: TrackerState, now_ns: int) -> str | None:
+def stale_text(context: StepContext) -> str | None:
     """Return why α is worth too little for a closed loop, in the words of its validity, or None."""
-    registration = state.alpha.registration
-    if (
-        registration is None
-        or state.loop.rtc is None
-        or not state.loop.rtc.in_loop
-        or registration.n_windows == 0
-    ):
+    registration, rtc = context.registration, context.rtc
+    if registration is None or rtc is None or not rtc.in_loop or registration.n_windows == 0:
         return None
-    if state.alarm(STALE) is None and _sharpens(registration, now_ns):
+    if context.alarm_text(STALE) is None and _sharpens(registration, context.now_ns):
         return None
     if registration.validity.level in _WORTHLESS and not registration.doubt:
         return f"{registration.validity.reason}: have it dithered"

@@ -178,6 +178,7 @@ def _suspect_jump(
         t_ns_utc=measured.t_ns_utc,
         held_ns_utc=context.now_ns,
         began_ns_utc=(first or measured).began_ns_utc,
+        text=text,
     )
     doubt = "a jump is suspected"
     validity.store_registration(
@@ -188,7 +189,6 @@ def _suspect_jump(
     )
     if first is None or registration.suspected_jump is None:
         context.warn("registration.jump-suspected", text)
-    context.raise_alarm(alarms.SUSPECTED, text)
     validity.want_window(context, doubt)
     validity.age(context)
 

@@ -22,7 +22,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors, update_policy
 from service.tracking.acquisition_state import Acquisition, AcquisitionStage, Interruption
-from service.tracking.alarms import ACQUISITION, Interlock
+from service.tracking.alarms import Interlock
 from service.tracking.dither import allow, choose_dither, make_way
 from service.tracking.events import Event
 from service.tracking.loop import present
@@ -58,7 +58,6 @@ def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
 
 def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
     """End one because an operator says so."""
-    context.clear_alarm(ACQUISITION)
     stages.abort(context, "by the operator", held_off=True)
 
 
@@ -71,7 +70,6 @@ def acquire(context: StepContext, event: Event) -> None:
         if context.windows.accepted > context.before.windows.accepted:
             stages.go_on(context, replace(acquisition, misses=0))
         _forget_when_over(context, event)
-        stages.tell_of_misses(context)
         why = stages.why_needed(context.state, context.policy, context.now_ns)
         if why is not None and context.rtc and ramping(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
@@ -101,14 +99,11 @@ def left_behind(state: TrackerState) -> Acquisition | None:
 def inherit(context: StepContext, left: Acquisition) -> None:
     """Take over the acquisition that the service before this one has left."""
     stages.go_on(context, left)
-    if left.stage is AcquisitionStage.FAILED:
-        context.raise_alarm(ACQUISITION, left.text)
-    elif left.stage is not AcquisitionStage.ABORTED:
+    if left.stage not in {AcquisitionStage.FAILED, AcquisitionStage.ABORTED}:
         _wait(context, NO_RTC)
 
 
 def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> None:
-    context.clear_alarm(ACQUISITION)
     make_way(context)
     cut_off(context, "an acquisition has begun")
     lost = _own_loop_lost(context)
@@ -328,7 +323,6 @@ def _finish(context: StepContext, record: ReconstructorRecord) -> None:
     of_goal = "" if record.n_modes >= goal else f" of {goal}"
     text = f"tracking after {took_s:.0f} s, {record.n_modes}{of_goal} modes controlled"
     stages.enter_stage(context, AcquisitionStage.TRACKING, text)
-    context.clear_alarm(ACQUISITION)
 
 
 def _forget_when_over(context: StepContext, event: Event) -> None:
@@ -348,7 +342,6 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
     else:
         return
     stages.go_on(context, Acquisition(text=text, since_ns_utc=context.now_ns))
-    context.clear_alarm(ACQUISITION)
     context.log("acquisition.idle", text)
 
 
@@ -392,7 +385,6 @@ def _take_up(context: StepContext) -> None:
         return
     cause = _cause(context.acquisition)
     stages.go_on(context, replace(context.acquisition, interruption=None))
-    context.clear_alarm(ACQUISITION)
     stages.restart(context, cause)
 
 
@@ -412,14 +404,11 @@ def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
 def _wait(context: StepContext, what: str, do: str = "") -> None:
     """Say what was going on, and what it waits for."""
     text = f"{_cause_text(context.acquisition)}; {what}{'. ' if do else ''}{do}"
-    if any((alarm.name, alarm.text) == (ACQUISITION, text) for alarm in context.alarms.active):
+    acquisition, stage = context.acquisition, AcquisitionStage.INTERRUPTED
+    if (acquisition.stage, acquisition.text) == (stage, text):
         return
-    stage = AcquisitionStage.INTERRUPTED
-    stages.go_on(
-        context, replace(context.acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
-    )
+    stages.go_on(context, replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns))
     context.warn("acquisition.interrupted", what)
-    context.raise_alarm(ACQUISITION, text)
 
 
 def _note_closed(context: StepContext, rtc: Status) -> None:
@@ -428,7 +417,6 @@ def _note_closed(context: StepContext, rtc: Status) -> None:
     if rtc.cm_id is not None and rtc.cm_id == context.acquisition.matrix:
         told = "which had passed the gate: the registration is followed from there"
     text = f"{_cause_text(context.acquisition)}; the loop is closed on {matrix}, {told}"
-    context.clear_alarm(ACQUISITION)
     stages.enter_stage(context, AcquisitionStage.ABORTED, text)
 
 

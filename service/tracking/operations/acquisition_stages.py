@@ -21,7 +21,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.acquisition_state import Acquisition, AcquisitionStage, LoopFound
-from service.tracking.alarms import ACQUISITION, NOT_FOUND, Interlock, alarm_blocks, blocking_alarm
+from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import ask_for, ask_to_stop, make_way
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
 from service.tracking.loop import NO_RTC
@@ -204,28 +204,15 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         lasted_ns = now_ns - alarm.since_ns_utc
         if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
-    if _missed_enough(state) and not state.loop.holds:
+    if missed_enough(state) and not state.loop.holds:
         return f"{acquisition.misses} windows in a row found no registration"
     return None
 
 
-def _missed_enough(state: TrackerState) -> bool:
+def missed_enough(state: TrackerState) -> bool:
+    """Return whether so many windows in a row found no registration that it is no chance."""
     known = state.alpha.registration is not None and state.alpha.registration.usable
     return state.operations.acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE)
-
-
-def tell_of_misses(context: StepContext) -> None:
-    """Say that no registration is found in a loop that holds well: it is not opened for that."""
-    if context.loop.holds and _missed_enough(context.state):
-        text = (
-            "window after window finds no registration, though the loop holds well: modes or "
-            "slopes are probably in another order, or of another sign, than the instrument file "
-            "tells; compare both with it, or measure an interaction matrix; the loop is left "
-            "closed (acquire opens it to look from afar)"
-        )
-        context.raise_alarm(NOT_FOUND, text)
-    elif not context.acquisition.misses:
-        context.clear_alarm(NOT_FOUND)
 
 
 def count_miss(context: StepContext, kind: RefusalKind) -> None:
@@ -326,7 +313,6 @@ def give_up(context: StepContext, reason: str) -> None:
         "loop on a matrix of your own"
     )
     enter_stage(context, AcquisitionStage.FAILED, text)
-    context.raise_alarm(ACQUISITION, text)
 
 
 def abort(context: StepContext, why: str, *, held_off: bool = False) -> None:

@@ -99,7 +99,6 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
             _await_opening(context, trial, event)
         case ProbationState.OPENED if context.rtc is not None and context.rtc.in_loop:
             _set(context, replace(trial, state=ProbationState.ROLLED_BACK))
-            context.clear_alarm(LOOP_OPENED)
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
@@ -253,7 +252,6 @@ def _end_watch(context: StepContext, trial: Probation, found: str, *, lost: bool
 def _open(context: StepContext, trial: Probation) -> None:
     """Ask the RTC to open a loop that is lost, and say so."""
     _end(context, trial, ProbationState.OPENING, trial.text)
-    context.raise_alarm(LOOP_OPENED, _opening(trial, "the RTC is asked to open the loop"))
     set_loop(context, cmd.SetLoop(loop="open"))
 
 
@@ -262,19 +260,26 @@ def _await_opening(context: StepContext, trial: Probation, event: Event) -> None
     rtc, asked = context.rtc, context.loop.command
     if isinstance(event, cmd.SetMode):
         _set(context, replace(trial, state=ProbationState.KEPT))
-        context.clear_alarm(LOOP_OPENED)
     elif rtc is not None and not rtc.in_loop:
         _set(context, replace(trial, state=ProbationState.OPENED))
-        context.raise_alarm(LOOP_OPENED, _opening(trial, "the loop was asked to open, and is open"))
     elif rtc is not None and asked is not None and not context.operator.stopped_because:
-        if asked.state in {CommandState.REFUSED, CommandState.FAILED}:
-            why = f"the RTC was asked to open the loop and has not ({asked.reason}): open it there"
-            context.raise_alarm(LOOP_OPENED, _opening(trial, why))
-        if context.now_ns - asked.asked_ns_utc > OPEN_AGAIN_S * SECOND_NS:
+        waited_ns = context.now_ns - asked.asked_ns_utc
+        if waited_ns > OPEN_AGAIN_S * SECOND_NS:
             set_loop(context, cmd.SetLoop(loop="open"))
 
 
-def _opening(trial: Probation, does: str) -> str:
+def opening_text(context: StepContext) -> str | None:
+    """Return that the loop was lost and is asked to open, and whether it did; None: it is not."""
+    trial, asked = context.operations.probation, context.loop.command
+    if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:
+        return None
+    raised, does = context.alarm_text(LOOP_OPENED), "the RTC is asked to open the loop"
+    if trial.state is ProbationState.OPENED:
+        does = "the loop was asked to open, and is open"
+    elif asked is not None and asked.state in {CommandState.REFUSED, CommandState.FAILED}:
+        does = f"the RTC was asked to open the loop and has not ({asked.reason}): open it there"
+    elif raised is not None:
+        return raised  # it is asked again and again
     return (
         f"{trial.id} {trial.text}; {does}; find out why, then close it on a matrix known to be "
         "good; the mode is hold until an operator sets another"

@@ -1,14 +1,19 @@
 """What each alarm forbids, seen from outside: told to the tracker, whatever it is doing."""
 
+import ast
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+import service
 from service.errors import CommandError
 from service.estimation.windows import RefusalKind, WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.alarm_rules import LASTING, RULES
 from service.tracking.alarms import ALARMS, AlarmDefinition, Interlock, Severity
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
@@ -19,6 +24,28 @@ STRANGERS = ["second-rtc", "basis-mismatch", "instrument-mismatch"]
 OUT_OF_HAND = ["loop-diverging", "edge-slip", "commands-off-loop"]
 
 MISTOLD = ["matrix-mismatch", "response-mismatch", "loop-law", "command-unit"]
+
+NAMES = {
+    constant: name
+    for constant, name in vars(alarms).items()
+    if constant.isupper() and constant not in {"ALARMS", "RULE_PREFIX"}
+}
+SERVICE = Path(service.__file__).parent
+
+
+def raised_in(path):
+    """The constants of the alarms that a file raises or reports."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        match node:
+            case ast.Call(func=ast.Attribute(attr="raise_alarm"), args=[name, *_]):
+                found.add(ast.unparse(name).rpartition(".")[2])
+            case ast.Call(func=ast.Attribute(attr="ConditionChanged"), keywords=[name, *_]):
+                found.add(ast.unparse(name.value).rpartition(".")[2])
+            case _:
+                continue
+    return found
+
 
 FORBIDDING = pytest.mark.parametrize("name", [*STRANGERS, *OUT_OF_HAND])
 
@@ -107,10 +134,27 @@ def test_where_only_new_matrices_are_forbidden_one_that_was_in_use_may_come_back
 
 
 def test_every_alarm_is_in_the_table_and_says_what_it_refuses():
-    names = {value for name, value in vars(alarms).items() if name.isupper() and name != "ALARMS"}
-    assert names == set(ALARMS)
+    assert {*NAMES.values()} == set(ALARMS)
     for name, kind in ALARMS.items():
         assert bool(kind.because) == bool(kind.blocks), name
+
+
+def test_every_alarm_is_found_in_the_file_that_the_table_says_and_nowhere_else():
+    """One that follows from the state has a rule; one that an event raises is named there."""
+    by_rule = {name for name, kind in ALARMS.items() if kind.origin == "tracking/alarm_rules.py"}
+    assert by_rule == set(RULES)
+    assert not by_rule & set(LASTING)
+    for constant, name in NAMES.items():
+        source = SERVICE / ALARMS[name].origin
+        assert re.search(rf"\b{constant}\b", source.read_text(encoding="utf-8")), name
+    for path in SERVICE.rglob("*.py"):
+        # the tracker says besides what the dither that told of it has come to
+        for constant in raised_in(path) & set(NAMES) - {"MIRROR_SILENT"}:
+            assert ALARMS[NAMES[constant]].origin == str(path.relative_to(SERVICE)), constant
+
+
+def test_what_raises_an_alarm_is_seen():
+    assert raised_in(SERVICE / "tracking" / "rtc.py") >= {"VANISHED", "STANDING_BY"}
 
 
 def test_a_name_that_is_in_no_table_forbids_nothing():

@@ -142,18 +142,18 @@ def test_one_muted_before_it_comes_can_be_unmuted(story):
 
 
 def test_a_restart_changes_nothing_of_what_was_seen_and_what_was_not(small, tmp_path):
-    for name in ("edge-slip", "loop-open", "margin"):
+    for name in ("edge-slip", "frames-lost", "disk-low"):
         raised(small, name)
-    raised(small, "margin", over=True)
+    raised(small, "disk-low", over=True)
     small.tell(cmd.AcknowledgeAlarm(name="edge-slip", **ADA))
     small.tell(cmd.MuteAlarm(name="second-rtc", for_s=3600.0, **ADA))
     again = restarted(small, tmp_path)
-    assert {left.name for left in stale(again.state)} == {"margin", "loop-open"}
+    assert {left.name for left in stale(again.state)} == {"disk-low", "frames-lost"}
     assert [quiet.name for quiet in muted(again.state)] == ["second-rtc"]
     raised(again, "edge-slip")
     assert note(again, "edge-slip").alarm_state is AlarmState.ACKNOWLEDGED
-    raised(again, "loop-open")
-    assert note(again, "loop-open").alarm_state is AlarmState.ACTIVE
+    raised(again, "frames-lost")
+    assert note(again, "frames-lost").alarm_state is AlarmState.ACTIVE
 
 
 def test_what_was_acknowledged_and_is_not_raised_again_after_a_restart_is_over(small, tmp_path):

@@ -11,7 +11,7 @@ from service.errors import CommandError, ConfigurationError, UnknownIdError
 from service.tracker import step
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarm_records import FIELDS, changes_value
+from service.tracking.alarm_rules import FIELDS, changes_value
 from service.tracking.alarms import Interlock, Severity, blocking_alarm
 from service.tracking.state import Mode
 from tests.states import tracker_state

@@ -1,0 +1,288 @@
+"""Alarms that follow from the state: one table of rules, worked out at one place of a step.
+
+Where an alarm comes from stands in alarms.toml (``origin``). One that can be read from the state
+has its rule here; one that an event tells is raised where that event is taken in, and ends by its
+condition in ``LASTING`` where the state tells that its cause has gone. Operators' own rules forbid
+some acts while a condition on what the observatory reports, or on a field of the state, holds ("do
+not publish while the shutter is shut").
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import replace
+from difflib import get_close_matches
+from typing import Any, Final
+
+from service.errors import CommandError, UnknownIdError
+from service.estimation.loop import why_open
+from service.tracking import alarms, dither, mode_proof, refusals, validity
+from service.tracking import commands as cmd
+from service.tracking.acquisition_state import AcquisitionStage
+from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
+from service.tracking.operations.acquisition_stages import missed_enough
+from service.tracking.operations.probation import opening_text
+from service.tracking.policy import SECOND_NS, Rule
+from service.tracking.products import MatrixState
+from service.tracking.state import ObservatoryValue, TrackerState
+from service.tracking.step_context import StepContext
+
+RENEWED_S = 15.0
+"""An alarm that the link repeats while it lasts is over after this much silence."""
+
+
+def derive_alarms(context: StepContext) -> None:
+    """Raise what the state says is the matter, and end what is over."""
+    for name, rule in RULES.items():
+        _set(context, name, rule(context), _definition(context, name))
+    for alarm in context.alarms.active:
+        lasts = LASTING.get(alarm.name)
+        if lasts is not None and not lasts(context):
+            validity.end_alarm(context, alarm.name)
+    for own in context.policy.rules:
+        _set(context, f"{RULE_PREFIX}{own.name}", _rule_text(context, own), _own_definition(own))
+
+
+def _set(
+    context: StepContext, name: str, text: str | None, definition: AlarmDefinition | None
+) -> None:
+    """Raise an alarm with this text, or end it; one that goes on as it is is let be."""
+    raised = context.state.alarm(name)
+    if text is None:
+        if raised is not None:
+            validity.end_alarm(context, name)
+    elif raised is None or (raised.text, raised.own) != (text, definition):
+        context.raise_alarm(name, text, definition)
+
+
+def _definition(context: StepContext, name: str) -> AlarmDefinition | None:
+    """Return what an alarm is where that is not as the table has it, else None."""
+    margin = context.matrices.margin
+    if name == alarms.SHORT_MARGIN and margin is not None and margin.unstable:
+        return replace(ALARMS[name], severity=Severity.CRITICAL)
+    return None
+
+
+def _stopped(context: StepContext) -> str | None:
+    who = context.operator.stopped_because
+    return f"{who}: nothing is dithered, made or sent until the stop is released" if who else None
+
+
+def _loop_open(context: StepContext) -> str | None:
+    """Return that the loop is open and nothing has opened it.
+
+    Asked of each status: what had the loop open may end before a status shows that it is closed.
+    """
+    rtc, acquisition, measuring = context.rtc, context.acquisition, context.state.measuring
+    if rtc is None or rtc is context.before.loop.rtc:
+        return context.alarm_text(alarms.LOOP_OPEN)
+    # the alarm of an interrupted acquisition tells more, and not to close the loop on any matrix
+    interrupted = acquisition.stage is AcquisitionStage.INTERRUPTED
+    opened = acquisition.under_way or (measuring is not None and measuring.opens_loop)
+    if rtc.in_loop or interrupted or opened:
+        return None
+    return f"{why_open(rtc)}: close it to calibrate"
+
+
+def _wrong_matrix(context: StepContext) -> str | None:
+    mismatched = context.matrices.mismatched_id
+    record = None if mismatched is None else context.state.reconstructor(mismatched)
+    if record is None or record.state is not MatrixState.FAILED:
+        return None if mismatched is None else context.alarm_text(alarms.OTHER_SUM)
+    return record.reason
+
+
+def _margin(context: StepContext) -> str | None:
+    margin = context.matrices.margin
+    if margin is None or margin.accepted:
+        return None
+    return f"{context.matrices.in_use}: {margin.reason}"
+
+
+def _acquisition(context: StepContext) -> str | None:
+    ended = {AcquisitionStage.FAILED, AcquisitionStage.INTERRUPTED}
+    return context.acquisition.text if context.acquisition.stage in ended else None
+
+
+def _not_found(context: StepContext) -> str | None:
+    if context.acquisition.under_way or not context.acquisition.misses:
+        return None
+    if not (context.loop.holds and missed_enough(context.state)):
+        return context.alarm_text(alarms.NOT_FOUND)
+    return (
+        "window after window finds no registration, though the loop holds well: modes or slopes "
+        "are probably in another order, or of another sign, than the instrument file tells; "
+        "compare both with it, or measure an interaction matrix; the loop is left closed (acquire "
+        "opens it to look from afar)"
+    )
+
+
+def _jump_suspected(context: StepContext) -> str | None:
+    registration = context.registration
+    if registration is None or not (registration.doubt and registration.doubt_voids):
+        return None
+    jump = registration.suspected_jump
+    return registration.doubt if jump is None else jump.text
+
+
+RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
+    alarms.STOPPED: _stopped,
+    alarms.LOOP_OPEN: _loop_open,
+    alarms.ACQUISITION: _acquisition,
+    alarms.NOT_FOUND: _not_found,
+    alarms.OTHER_SUM: _wrong_matrix,
+    alarms.SHORT_MARGIN: _margin,
+    alarms.LOOP_OPENED: opening_text,
+    alarms.NOT_STOPPED: dither.not_stopped_text,
+    alarms.MODES_CONTRARY: mode_proof.contrary_text,
+    alarms.MODES_UNEVEN: mode_proof.uneven_text,
+    alarms.SUSPECTED: _jump_suspected,
+    alarms.STALE: validity.stale_text,
+    # the last: windows may be refused for what another alarm says
+    alarms.WINDOWS_REFUSED: refusals.refused_text,
+}
+"""The text of each alarm by state, policy and time; None: there is nothing to see.
+
+One that must not waver about a limit asks whether it lasts already: alarms are part of the state.
+"""
+
+
+def _no_rtc(context: StepContext) -> bool:
+    return context.rtc is None
+
+
+def _no_dither_plays(context: StepContext) -> bool:
+    return context.dither is None or context.dither.start_seq is None
+
+
+def _not_used_since(context: StepContext) -> bool:
+    """Return whether the reconstructor that was sent last has never been in use."""
+    newest_first = reversed(context.matrices.reconstructors)
+    sent = max(newest_first, key=lambda record: record.published_ns_utc or 0, default=None)
+    return sent is None or not sent.was_used
+
+
+def _in_doubt(context: StepContext) -> bool:
+    return context.registration is not None and bool(context.registration.doubt)
+
+
+def _is_repeated(name: str) -> Callable[[StepContext], bool]:
+    def repeated(context: StepContext) -> bool:
+        alarm = context.state.alarm(name)
+        return alarm is not None and context.now_ns - alarm.seen_ns_utc <= RENEWED_S * SECOND_NS
+
+    return repeated
+
+
+LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
+    alarms.VANISHED: _no_rtc,
+    alarms.SECOND_RTC: _is_repeated(alarms.SECOND_RTC),
+    alarms.OTHER_BASIS: _is_repeated(alarms.OTHER_BASIS),
+    alarms.NO_DITHER: _no_dither_plays,
+    alarms.NOT_AS_ASKED: dither.is_not_as_asked,
+    alarms.OVER_BUDGET: dither.is_over_budget,
+    alarms.NOT_ACKNOWLEDGED: _not_used_since,
+    alarms.DISAGREES: _in_doubt,
+}
+"""Whether an alarm that an event has raised still lasts; all others are ended by an event, too."""
+
+_COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+
+FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
+    "state.mode": lambda state: state.operator.mode.value,
+    "state.loop": lambda state: None if state.loop.rtc is None else state.loop.rtc.loop.value,
+    "state.n_controlled": lambda state: (
+        None if state.loop.rtc is None else state.loop.rtc.n_controlled
+    ),
+    "state.magnitude": lambda state: None if state.loop.rtc is None else state.loop.rtc.magnitude,
+    "state.elevation_deg": lambda state: (
+        None if state.alpha.pointing is None else state.alpha.pointing.elevation_deg
+    ),
+    "state.azimuth_deg": lambda state: (
+        None if state.alpha.pointing is None else state.alpha.pointing.azimuth_deg
+    ),
+}
+"""What a condition may ask of the state; nothing where it is not known."""
+
+
+def _rule_text(context: StepContext, rule: Rule) -> str | None:
+    """Return what an operators' rule says that holds now, else None."""
+    found = _value(context, rule)
+    holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
+    shown = "not known" if found is None else as_text(found)
+    return f"{rule.text} ({rule.about} is {shown})" if holds else None
+
+
+def _own_definition(rule: Rule) -> AlarmDefinition:
+    return AlarmDefinition(
+        severity=rule.severity,
+        means=rule.text,
+        do="see to it, or change the rule in the settings",
+        blocks=rule.blocks,
+        because=rule.text if rule.blocks else "",
+    )
+
+
+def set_value(context: StepContext, command: cmd.SetValue) -> None:
+    """Take a value that a rule asks for; it counts for as long as was said.
+
+    Raises
+    ------
+    CommandError
+        If it is of another kind than the rule compares it with.
+    UnknownIdError
+        If no rule asks for it.
+    """
+    asked = {rule.about: rule for rule in context.policy.rules if rule.about not in FIELDS}
+    if command.name not in asked:
+        near = get_close_matches(command.name, asked, n=1)
+        known = ", ".join(sorted(asked)) or "none"
+        hint = f", did you mean {near[0]}?" if near else f"; asked for: {known}"
+        raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
+    rule = asked[command.name]
+    if kind_of(command.value) != kind_of(rule.than):
+        raise CommandError(
+            f"{command.name}: found {as_text(command.value)}, expected {kind_of(rule.than)}: rule "
+            f"{rule.name} compares it with {as_text(rule.than)}"
+        )
+    until_ns = context.now_ns + round(command.for_s * SECOND_NS)
+    value = ObservatoryValue(
+        name=command.name, value=command.value, until_ns_utc=until_ns, by=command.by
+    )
+    others = tuple(each for each in context.alarms.observatory_values if each.name != command.name)
+    context.alarms = replace(context.alarms, observatory_values=(*others, value))
+
+
+def changes_value(state: TrackerState, command: cmd.SetValue, now_ns: int) -> bool:
+    """Return whether a value is reported that differs from what is known."""
+    return not any(
+        each.name == command.name and each.until_ns_utc > now_ns and each.value == command.value
+        for each in state.alarms.observatory_values
+    )
+
+
+def kind_of(value: cmd.Value) -> str:
+    """Return what a value is, in words."""
+    if isinstance(value, bool):
+        return "true or false"
+    return "a text" if isinstance(value, str) else "a number"
+
+
+def as_text(value: cmd.Value) -> str:
+    """Return a value as TOML and JSON write it."""
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _value(context: StepContext, rule: Rule) -> cmd.Value | None:
+    if rule.about in FIELDS:
+        return FIELDS[rule.about](context.state)
+    reported = (each for each in context.alarms.observatory_values if each.name == rule.about)
+    return next((each.value for each in reported if each.until_ns_utc > context.now_ns), None)

@@ -85,7 +85,7 @@ def _loop_open(context: StepContext) -> str | None:
     return f"{why_open(rtc)}: close it to calibrate"
 
 
-def _wrong_matrix(context: StepContext) -> str | None:
+def _other_numbers(context: StepContext) -> str | None:
     mismatched = context.matrices.mismatched_id
     record = None if mismatched is None else context.state.reconstructor(mismatched)
     if record is None or record.state is not MatrixState.FAILED:
@@ -131,7 +131,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.LOOP_OPEN: _loop_open,
     alarms.ACQUISITION: _acquisition,
     alarms.NOT_FOUND: _not_found,
-    alarms.OTHER_SUM: _wrong_matrix,
+    alarms.OTHER_SUM: _other_numbers,
     alarms.SHORT_MARGIN: _margin,
     alarms.LOOP_OPENED: opening_text,
     alarms.NOT_STOPPED: dither.not_stopped_text,
@@ -167,6 +167,26 @@ def _in_doubt(context: StepContext) -> bool:
     return context.registration is not None and bool(context.registration.doubt)
 
 
+def _is_not_as_asked(context: StepContext) -> bool:
+    """Return whether the last dither is still the one that was not played as asked for."""
+    return context.dither_policy.amiss_id is not None and not _is_given_up(context)
+
+
+def _is_over_budget(context: StepContext) -> bool:
+    """Return whether no dither has been played as it may since one was too strong."""
+    memory, own, rtc = context.dither_policy, context.dither, context.rtc
+    if memory.unwanted_id is not None:
+        return True
+    plays = own is not None and rtc is not None and rtc.dither_id == own.id
+    return not (plays and not memory.loud_text) and not _is_given_up(context)
+
+
+def _is_given_up(context: StepContext) -> bool:
+    """Return whether no dither is wanted, and none plays that is not."""
+    unwanted = context.dithers.stopped or not context.policy.dither_enabled
+    return unwanted and context.dither_policy.unwanted_id is None
+
+
 def _is_repeated(name: str) -> Callable[[StepContext], bool]:
     def repeated(context: StepContext) -> bool:
         alarm = context.state.alarm(name)
@@ -180,8 +200,8 @@ LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
     alarms.SECOND_RTC: _is_repeated(alarms.SECOND_RTC),
     alarms.OTHER_BASIS: _is_repeated(alarms.OTHER_BASIS),
     alarms.NO_DITHER: _no_dither_plays,
-    alarms.NOT_AS_ASKED: dither.is_not_as_asked,
-    alarms.OVER_BUDGET: dither.is_over_budget,
+    alarms.NOT_AS_ASKED: _is_not_as_asked,
+    alarms.OVER_BUDGET: _is_over_budget,
     alarms.NOT_ACKNOWLEDGED: _not_used_since,
     alarms.DISAGREES: _in_doubt,
 }

@@ -306,26 +306,6 @@ def not_stopped_text(context: StepContext) -> str | None:
     )
 
 
-def is_not_as_asked(context: StepContext) -> bool:
-    """Return whether the last dither is still the one that was not played as asked for."""
-    return context.dither_policy.amiss_id is not None and not _is_given_up(context)
-
-
-def is_over_budget(context: StepContext) -> bool:
-    """Return whether no dither has been played as it may since one was too strong."""
-    memory, own, rtc = context.dither_policy, context.dither, context.rtc
-    if memory.unwanted_id is not None:
-        return True
-    plays = own is not None and rtc is not None and rtc.dither_id == own.id
-    return not (plays and not memory.loud_text) and not _is_given_up(context)
-
-
-def _is_given_up(context: StepContext) -> bool:
-    """Return whether no dither is wanted, and none plays that is not."""
-    unwanted = context.dithers.stopped or not context.policy.dither_enabled
-    return unwanted and context.dither_policy.unwanted_id is None
-
-
 def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     """Ask for a dither if it is time, and nothing left behind is in its way."""
     loud_ns = context.dither_policy.loud_ns_utc

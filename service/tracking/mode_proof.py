@@ -229,9 +229,7 @@ def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> No
     if proof == before:
         return
     context.matrices = replace(context.matrices, mode_proof=proof)
-    in_the_way = _contrary_in_the_way(context, rtc)
-    if in_the_way and bad & shunned_modes(context.state):
-        limit_modes(context, in_the_way[0], _contrary_in_words(proof, in_the_way))
+    _limit_to_proven(context, rtc, bad)
 
 
 def _answers(
@@ -298,8 +296,7 @@ def take_over(context: StepContext, rtc: Status) -> None:
         context.log("modes.not-restored", "the RTC is not the one whose modes were seen")
         return
     context.log("modes.restored", f"{now.n_proven} modes were seen before the restart")
-    _report_answers(context, rtc, now.contrary)
-    _tell_uneven(context, ModeProof())
+    _limit_to_proven(context, rtc, now.contrary)
 
 
 def _classify(
@@ -329,6 +326,14 @@ def _uneven(
         usual, spare = float(np.median(gains[beside])), CERTAIN * sigma[k]
         odd[k] = gains[k] - spare > UNEVEN * usual or gains[k] + spare < usual / UNEVEN
     return odd
+
+
+def _limit_to_proven(context: StepContext, rtc: Status, bad: frozenset[int]) -> None:
+    """Control none of the modes that answer otherwise for a while, where one of them did anew."""
+    in_the_way = _contrary_in_the_way(context, rtc)
+    if in_the_way and bad & shunned_modes(context.state):
+        text = _contrary_in_words(context.matrices.mode_proof, in_the_way)
+        limit_modes(context, in_the_way[0], text)
 
 
 def contrary_text(context: StepContext) -> str | None:
@@ -373,6 +378,8 @@ def _in_words(proof: ModeProof, modes: list[int]) -> str:
 def uneven_text(context: StepContext) -> str | None:
     """Return which modes answer more or less strongly than their neighbours, or None."""
     proof = context.matrices.mode_proof
+    if proof.session:
+        return None  # whose modes they are is not known yet
     found = [f"{proof.own_uneven}: matrices allow for it"] if proof.own_uneven else []
     if proof.uneven:
         one = "answers" if len(proof.uneven) == 1 else "answer"

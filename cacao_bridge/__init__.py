@@ -1,1 +1,1 @@
-"""The bridge to cacao: its streams in shared memory on one side, pyrcal's contract on the other."""
+"""The bridge from cacao's streams in shared memory to pyrcal's contract."""

@@ -1,4 +1,4 @@
-"""``pyrcal cacao``: the bridge as a process of its own, an RTC to the service."""
+"""``pyrcal cacao``: run the bridge."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _log = structlog.get_logger("cacao")
 
 
 def arguments_parser() -> argparse.ArgumentParser:
-    """Return what reads the command line."""
+    """Return the parser of the command line."""
     parser = argparse.ArgumentParser(prog="pyrcal cacao", description=__doc__)
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="settings, TOML")
     parser.add_argument(
@@ -60,7 +60,7 @@ def arguments_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the bridge until it is told to stop; return the exit status."""
+    """Run the bridge until a signal stops it; return the exit status."""
     options = arguments_parser().parse_args(arguments)
     log_to_terminal()
     stopped = stop_signal()
@@ -143,7 +143,7 @@ class Bridge:
         sender: Sender,
         stopped: threading.Event,
     ) -> None:
-        """Send what comes until ``stopped`` or cut off."""
+        """Send telemetry until ``stopped`` or cut off."""
         status = status_publisher(session, keys)
         lifeline, next_status_s, next_report_s = Lifeline(time.monotonic()), 0.0, 0.0
         said = ""

@@ -1,4 +1,4 @@
-"""Matrices on their way to cacao: kept, written into its streams, taken up when it restarts.
+"""Bring matrices into cacao's streams.
 
 cacao copies its modes when the process that multiplies them starts, and looks at the streams no
 more. So a matrix is in use when that process is another one than it was when the streams were
@@ -65,7 +65,7 @@ class Calibration:
             _log.warning("matrix.waits", id=name, text=f"pyrcal cacao --config FILE --apply {name}")
 
     def look(self, process: int, shape: tuple[int, ...]) -> str | None:
-        """Write what may be written; return the id of a matrix just taken up, None: none was.
+        """Write what may be written; return the id of a matrix just taken up, or None.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Calibration:
         return name == self.waiting
 
     def _found(self, *, restarted: bool) -> Reconstructor:
-        """Return what the process that multiplies has copied."""
+        """Return the matrix that the multiplying process has copied."""
         recorded = self._known["in_use"]
         if recorded is not None and not restarted:
             return self._kept(recorded)
@@ -125,7 +125,7 @@ class Calibration:
         return self._foreign(cube)
 
     def _foreign(self, cube: Array32) -> Reconstructor:
-        """Return what somebody else has written, under a name of its own."""
+        """Return numbers that another program has written, under an id of their own."""
         matrix = np.ascontiguousarray(cube[:, self.index] * self._unit)
         name = f"own-{checksum(matrix)[:12]}"
         own = Reconstructor.own(name, matrix, self._identity, created_ns=0)
@@ -133,7 +133,7 @@ class Calibration:
         return own
 
     def _slices(self, of: Reconstructor, n_values: int) -> Array32:
-        """Return a matrix as cacao has it: one slice a mode, 0 where there is no slope."""
+        """Return a matrix in cacao's layout: one slice a mode, 0 where there is no slope."""
         cube = np.zeros((len(of.matrix), n_values), dtype=np.float32)
         cube[:, self.index] = of.matrix / self._unit
         return cube
@@ -150,7 +150,7 @@ class Calibration:
         return path_of(name, self._settings.streams.directory)
 
     def _keep(self, matrix: Reconstructor) -> None:
-        """Lay down the numbers, and beside them where they come from."""
+        """Write the numbers, and their sources beside them."""
         data = encode(matrix.manifest)
         name = self._folder / matrix.manifest.id
         np.save(f"{name}.npy", matrix.matrix, allow_pickle=False)
@@ -172,7 +172,7 @@ class Calibration:
 
 
 def consent(settings: Settings, name: str) -> str:
-    """Let the matrix that waits be written into cacao's streams; return its id.
+    """Let the waiting matrix be written into cacao's streams; return its id.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""cacao's loop as an RTC of the contract: what its streams hold, and what can be asked of it."""
+"""cacao's loop as an RTC of the contract."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Cacao:
         self._unlink()
 
     def _unlink(self) -> None:
-        """Let go of the streams: what comes next is another session."""
+        """Close the streams: another session follows."""
         self._streams, self.session = {}, new_session()
         self._stop_dither()
         self._rows.forget()
@@ -110,18 +110,18 @@ class Cacao:
 
     @property
     def n_unpaired(self) -> int:
-        """Frames of slopes of whose command nothing is known."""
+        """Number of frames of slopes whose command is unknown."""
         return self._rows.n_unpaired
 
     @property
     def pause_s(self) -> float:
-        """How long may be slept between two looks without a frame being lost."""
+        """Longest sleep between two reads that loses no frame, seconds."""
         streams = [self._streams.get(name) for name in ("slopes", "commands")]
         n_kept = min((stream.n_kept for stream in streams if stream is not None), default=64)
         return min(max(n_kept / 4, 0.25) / self._loop.frame_rate_hz, _PAUSE_S)
 
     def poll(self) -> list[tuple[FrameHeader, Array32]]:
-        """Return what is new, fit to be sent; what is wrong is in :attr:`complaint`."""
+        """Return new rows, ready to send; a complaint is in :attr:`complaint`."""
         try:
             self._link()
             self._read_slopes()
@@ -251,7 +251,7 @@ class Cacao:
         return ""
 
     def _off_rate(self) -> str:
-        """Say when frames come at another rate than they should, as they do from two writers."""
+        """Say when frames come at a wrong rate, as from two writers."""
         counter, now_s = self._streams["slopes"].counter, time.monotonic()
         if self._rate_from is None:
             self._rate_from = counter, now_s
@@ -295,12 +295,12 @@ class Cacao:
 
     @property
     def known(self) -> bool:
-        """Whether it is known which matrix cacao multiplies with: before, there is no RTC."""
+        """Whether the matrix that cacao multiplies with is known; before, there is no RTC."""
         return self._calibration.in_use is not None
 
     @property
     def reconstructor(self) -> Reconstructor:
-        """What multiplies the slopes now."""
+        """The matrix that multiplies the slopes now."""
         in_use = self._calibration.in_use
         if in_use is None:
             raise StreamError("no matrix is known yet")
@@ -331,7 +331,7 @@ class Cacao:
 
     @property
     def has_news(self) -> bool:
-        """Whether a matrix was taken up that nobody has taken note of."""
+        """Whether a matrix was taken up and not reported yet."""
         return bool(self._swaps)
 
     def take_swaps(self) -> list[tuple[str, int]]:
@@ -343,7 +343,7 @@ class Cacao:
         return []
 
     def status(self) -> Status:
-        """Return what is known of the loop."""
+        """Return the loop's status."""
         gains, leak = self._gains_and_leak()
         n_controlled = len(self.reconstructor.matrix)
         gains = (*gains[:n_controlled], *[0.0] * (self._loop.n_modes - n_controlled))
@@ -374,7 +374,7 @@ class Cacao:
         )
 
     def _gains_and_leak(self) -> tuple[tuple[float, ...], float]:
-        """Return gains ``(n_modes,)`` and leak as the contract has them.
+        """Return gains ``(n_modes,)`` and leak in the contract's terms.
 
         cacao's mult is its leak; by the law in which it holds for the sum it is in the gain, too.
         """
@@ -454,7 +454,7 @@ class Cacao:
             player.__exit__()
 
     def close(self) -> None:
-        """End what plays."""
+        """End the dither."""
         self._stop_dither()
 
     def _change_loop(self, request: LoopRequest) -> str:
@@ -472,6 +472,6 @@ class Cacao:
 
 
 def _behind(commands: Stream, inode: int) -> int | None:
-    """Return how far the counter of the newest command is behind that of what it answers."""
+    """Return how far the command's counter is behind that of the slopes it answers."""
     found = commands.made_by(inode)
     return None if found is None else found[1] - found[0]

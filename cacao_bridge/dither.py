@@ -1,4 +1,4 @@
-"""The dither: played frame by frame into a channel of the mirror, and remembered as it was played.
+"""Play the dither frame by frame into a channel of the mirror.
 
 What is written while the newest frame of slopes is k goes onto the mirror together with the loop's
 answer to k. A frame that is seen too late finds the value of the one before still there, and that
@@ -34,7 +34,7 @@ _STANDS_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mirror:
-    """The channel, and what a command of one metre on each mode is there."""
+    """The channel, and the command of one metre on each mode in it."""
 
     channel: Stream
     """Writable, the bridge's own."""
@@ -49,7 +49,7 @@ class Mirror:
 
 
 class Player(Background):
-    """Plays one dither in a thread of its own while a ``with`` block lasts."""
+    """Plays one dither in a thread while a ``with`` block lasts."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Player(Background):
         status: DitherStatus,
         played: Callable[[int, int, Array32], None],
     ) -> None:
-        """Take what is told of it, and who is told which frames were answered with what."""
+        """Take the request, and the receiver of what was played for which frames."""
         super().__init__("dither")
         self._mirror, self._slopes, self.status, self._played = mirror, slopes, status, played
         self.ended = threading.Event()

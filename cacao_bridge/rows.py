@@ -1,4 +1,4 @@
-"""Rows of telemetry: slopes, and the command that was on the mirror while they were exposed.
+"""Pair each frame of slopes with the command on the mirror.
 
 cacao counts each stream by itself. A command answers a frame of slopes; which one its trace tells.
 It is on the mirror ``delay_frames`` exposures later, so row k holds slopes k and the command that
@@ -28,7 +28,7 @@ _NEVER: Final = -(2**62)
 
 
 class Rows:
-    """The last frames of both streams, put together.
+    """The last frames of both streams, paired.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Rows:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew: what comes has nothing to do with what came."""
+        """Begin anew."""
         self._of_slopes, self._of_commands = np.full((2, self._kept), _NEVER)
         self._dither_m[:] = 0.0
         self.next = self._newest = -1
@@ -127,7 +127,7 @@ class Rows:
 
     @property
     def newest(self) -> int:
-        """The last frame of slopes that was taken; -1: none was."""
+        """The last frame of slopes taken; -1: none."""
         return self._newest
 
     def skip(self, to: int) -> None:

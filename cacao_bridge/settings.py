@@ -1,4 +1,4 @@
-"""The bridge's settings, TOML: where the service is, which streams, and what they mean."""
+"""The bridge's settings, TOML."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class StreamsTable(Table):
 
 
 class LoopTable(Table):
-    """What the streams do not tell."""
+    """Facts of the loop that the streams do not contain."""
 
     frame_rate_hz: Positive
     delay_frames: Annotated[float, Field(ge=1.0, le=20.0)]

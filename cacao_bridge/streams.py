@@ -1,4 +1,4 @@
-"""cacao's streams: ImageStreamIO's files in shared memory, format 2.00, checked, read and written.
+"""Read and write cacao's streams (ImageStreamIO, format 2.00).
 
 A file holds, each part rounded up to 8 bytes: 384 bytes of metadata, the data, keywords of 128
 bytes, the semaphores and who waits for them, traces of 64 bytes that say which frame of which
@@ -126,7 +126,7 @@ class Frames(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Where the parts of a file begin."""
+    """Offsets of the parts of a file."""
 
     keywords: int
     semaphores: int
@@ -138,7 +138,7 @@ class _Layout(NamedTuple):
 
 
 def _layout(found: Any) -> _Layout:  # noqa: ANN401  a record of _METADATA
-    """Return the places of a file's parts from its metadata."""
+    """Return the offsets of a file's parts from its metadata."""
     at = _METADATA.itemsize + _eights(int(found["imdatamemsize"]))
     keywords, at = at, at + _KEYWORD.itemsize * int(found["NBkw"])
     n_semaphores = int(found["sem"])
@@ -223,7 +223,7 @@ class Stream:
         self._writers: list[tuple[int, float]] = []
 
     def __del__(self) -> None:
-        """Let go of the file; the mapping goes with the last array that looks into it."""
+        """Close the file; the mapping goes with the last array that views it."""
         if hasattr(self, "_trace"):
             os.close(self._fd)
 
@@ -265,7 +265,7 @@ class Stream:
         raise self._error(f"{told} numbers", f"{n_values} for axes {size.tolist()}")
 
     def here(self) -> None:
-        """Look whether the file is still the one that was opened, and one process writes it.
+        """Check that the file is still the one that was opened, and one process writes it.
 
         Raises
         ------
@@ -293,12 +293,12 @@ class Stream:
 
     @property
     def writer(self) -> int:
-        """Process that wrote it last, as its trace tells; 0: it tells none."""
+        """Process that wrote it last, by its trace; 0: unknown."""
         return int(self._trace["pid"][0]) if len(self._trace) else 0
 
     @property
     def orphaned(self) -> str:
-        """That the process that wrote it last is there no more, for people; empty: it is there."""
+        """Text that the last writer has ended; empty: it runs."""
         try:
             os.kill(self.writer, 0)
         except ProcessLookupError:
@@ -309,7 +309,7 @@ class Stream:
 
     @property
     def written_ns(self) -> int:
-        """When the newest frame was written, nanoseconds since the Unix epoch, UTC; 0: untold."""
+        """Time of the newest frame, nanoseconds since the Unix epoch, UTC; 0: unknown."""
         seconds, ns = self._about["writetime"].tolist()
         return int(seconds * 1_000_000_000 + ns)
 
@@ -319,7 +319,7 @@ class Stream:
         return max(1, len(self._slots) - 1)
 
     def made_by(self, inode: int) -> tuple[int, int] | None:
-        """Return the newest frame's counter, and which frame of another stream has led to it.
+        """Return the newest frame's counter, and the frame of another stream that led to it.
 
         None: its trace does not tell of a stream with that inode, or is being written.
         """
@@ -331,7 +331,7 @@ class Stream:
         return None
 
     def after(self, counter: int | None) -> Frames | None:
-        """Return the frames that came after one, as many as are left; None: there is none.
+        """Return the frames after one, as many as are left; None: there is none.
 
         ``counter`` None is the newest frame alone.
 
@@ -361,7 +361,7 @@ class Stream:
         return Frames(first, values, first - counter - 1) if len(values) else None
 
     def _newest(self, after: int) -> Frames | None:
-        """Return a frame of which nothing was written while it was read, twice the same."""
+        """Return a frame that did not change while it was read, twice the same."""
         for _ in range(_TRIES):
             now, values = self.counter, self._data[0].astype(np.float32)
             same = np.array_equal(values, self._data[0].astype(np.float32), equal_nan=True)
@@ -381,7 +381,7 @@ class Stream:
         return slots
 
     def _turn(self) -> int | None:
-        """Return what a frame's counter is behind its place in the ring; it has to stay.
+        """Return the offset of a frame's counter from its place in the ring; it must stay.
 
         A writer moves the place first: what is seen is believed when it is seen again, and the
         first time when it is the same several times. None: not now; a busy machine may put a
@@ -438,7 +438,7 @@ class Stream:
         self._post()
 
     def _post(self) -> None:
-        """Wake who waits for this stream."""
+        """Wake the processes that wait for this stream."""
         libc, value = ctypes.CDLL(None), ctypes.c_int()
         for k in range(int(self._about["sem"]) + 1):
             place = self._at.semaphores + k * _SEMAPHORE_BYTES
@@ -449,7 +449,7 @@ class Stream:
 
 
 def settled(look: Callable[[], int | None], known: int | None) -> int | None:
-    """Return what is seen of a process that writes its numbers one after the other.
+    """Return a consistent view of numbers that a process writes one after the other.
 
     What was ``known`` is believed when it is seen again, anything else when it is the same several
     times; None: it is never still.

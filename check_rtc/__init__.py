@@ -1,1 +1,1 @@
-"""Whether an RTC keeps the contract: each thing that docs/rtc.md asks, looked at by itself."""
+"""Check whether an RTC keeps the contract of docs/rtc.md."""

@@ -1,4 +1,4 @@
-"""``pyrcal check-rtc``: what it understands. Nothing here takes long to import."""
+"""The arguments of ``pyrcal check-rtc``; quick to import."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ anything says so first and asks; where nobody can be asked it is skipped unless 
 
 
 def check_parser() -> argparse.ArgumentParser:
-    """Return what reads the command line."""
+    """Return the parser of the command line."""
     check = OneLineParser(prog="pyrcal check-rtc")
     check.description = (
         "Listen to an RTC in the service's place, ask it things, and say whether it keeps the "

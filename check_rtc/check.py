@@ -1,4 +1,4 @@
-"""The check of an RTC: one line for each thing that the contract asks."""
+"""Check an RTC and print one line for each requirement."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ NO_FILE = "slopes and commands are held against nothing; name its file with --in
 
 
 def check(options: argparse.Namespace) -> int:
-    """Check, tell, and return the exit status: 0 nothing is wrong, 1 something is.
+    """Check, print, and return the exit status: 0 nothing is wrong, 1 something is.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _whom(options: argparse.Namespace) -> tuple[Endpoint, Instrument | None]:
-    """Return where whose RTC is listened to, and its instrument; None: no file says of it.
+    """Return the system to listen to, and its instrument; None: no file describes it.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def _only_system(endpoint: Endpoint, wait_s: float) -> str:
 
 
 def line(one: Checked) -> str:
-    """Return a check on one line: what was found, what the contract says, where."""
+    """Return a check on one line: finding, requirement, place in the contract."""
     article = one.requirement
     return (
         f"{one.outcome:8}{one.name:12} {one.found} "
@@ -139,7 +139,7 @@ def line(one: Checked) -> str:
 
 
 def as_document(one: Checked) -> dict[str, str]:
-    """Return a check as JSON has it."""
+    """Return a check as JSON."""
     article = one.requirement
     return {
         "check": one.name,
@@ -152,7 +152,7 @@ def as_document(one: Checked) -> dict[str, str]:
 
 
 def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConvention | str:
-    """Return what the matrix in use says of slopes and commands beside the instrument file."""
+    """Return how the matrix in use compares with the instrument file."""
     folder: Path = usual_folder(os.environ)
     try:
         basis = DiskCache(folder).basis(instrument)
@@ -173,7 +173,7 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConven
 
 
 def registering(instrument: Instrument) -> Registered:
-    """Return what makes α of a window of dither as the service does; its model is made once."""
+    """Return a function that fits α to a window of dither as the service does."""
 
     @functools.cache
     def worker() -> OpticsWorker:
@@ -193,7 +193,7 @@ def registering(instrument: Instrument) -> Registered:
 
 
 def _agreed(moved: tuple[str, ...], *, yes: bool) -> bool:
-    """Say what will be moved, and ask."""
+    """Print what will move, and ask."""
     for each in moved:
         say(f"will move: {each}")
     if yes or not sys.stdin.isatty():

@@ -1,4 +1,4 @@
-"""Talking with an RTC: what is asked of it, and what it does; moves nothing but by dither."""
+"""Checks that ask the RTC; they move nothing but a dither."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _STOPS_S: Final = 2.0
 
 
 class RtcClient:
-    """An ear, and what it hears, brought together while something is waited for."""
+    """A connection and an observer of telemetry, pumped while something is awaited."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class RtcClient:
         self._sleep = sleep
 
     def listen(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Listen for so long, or until something is so; return whether it is."""
+        """Listen for so long, or until a condition holds; return whether it does."""
         end_s = self.clock() + seconds
         while not until():
             left_s = end_s - self.clock()
@@ -103,7 +103,7 @@ class _Question:
 
 
 def _questions(client: RtcClient, status: Status) -> list[_Question]:
-    """Return commands none of which can be carried out."""
+    """Return commands that no RTC can carry out."""
     new, n_modes = client.connection.new_id, status.n_modes
     dither = DitherRequest(
         id=new("dither"),
@@ -157,7 +157,7 @@ def _questions(client: RtcClient, status: Status) -> list[_Question]:
 
 
 def replies(client: RtcClient, status: Status) -> Checked:
-    """Ask for what must be refused; for one thing twice, with the same id."""
+    """Send commands that must be refused; one of them twice, with the same id."""
     said, absent, slowest_s, first = [], [], 0.0, b""
     questions = _questions(client, status)
     for question in questions:
@@ -199,7 +199,7 @@ def _wrong_reply(answer: bytes, question: _Question, took_s: float) -> list[str]
 
 
 class _Ledger:
-    """What the frames hold of a dither: fed with blocks."""
+    """The dither in the frames, summed block by block."""
 
     def __init__(
         self, asked: ExpectedDither, matrix: NDArray[np.float32] | None, in_loop: list[int]
@@ -237,7 +237,7 @@ class _Ledger:
 def dither(
     client: RtcClient, status: Status, matrix: NDArray[np.float32] | None, most_m: float = TOTAL_M
 ) -> list[Checked]:
-    """Have a small dither played, stop it, and say what the frames held of it."""
+    """Have a small dither played and stopped, and say what the frames held of it."""
     if status.dither is not None:
         why = f"{status.dither_id} plays: stop it first"
         return [skipped("dither", why), skipped("columns", why)]
@@ -287,7 +287,7 @@ def dither(
 
 
 def stopped(client: RtcClient) -> Reply:
-    """Tell the dither to stop; return what is replied, also where nothing is."""
+    """Stop the dither; return the reply, if there is one."""
     try:
         return client.connection.command(DitherStop(id=client.connection.new_id("stop")))
     except LinkError as error:
@@ -332,7 +332,7 @@ def _listen_to_dither(
 
 
 def _judged(client: RtcClient, request: DitherRequest, start_seq: int, ledger: _Ledger) -> str:
-    """Return what is otherwise than asked for; empty: nothing."""
+    """Return how the dither differs from the request; empty: it does not."""
     if ledger.first_seq is None:
         return f"accepted from frame {start_seq}, and the frames hold none of it"
     late = ledger.first_seq - start_seq
@@ -352,7 +352,7 @@ def _judged(client: RtcClient, request: DitherRequest, start_seq: int, ledger: _
 
 
 def _columns(ledger: _Ledger, modes: tuple[int, ...], status: Status) -> Checked:
-    """Say how slopes and commands of a row lie to each other, by two lines of modes in the loop."""
+    """Say how far slopes and commands of a row are apart, from two lines in the loop."""
     n_lines = ledger.seen_m[0].shape[1] if ledger.seen_m else 0
     if n_lines < 2 or ledger.first_seq is None:
         return skipped("columns", "it takes a dither on two modes of the loop and its matrix")

@@ -1,4 +1,4 @@
-"""The checker's end of the link: keeps what an RTC sends, asks and sends what it is told to."""
+"""The checker's end of the link."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ANSWER_S: Final = 2.0
 
 
 class Topic(StrEnum):
-    """Which key something came on."""
+    """The kind of key a message came on."""
 
     FRAMES = "frames"
     STATUS = "status"
@@ -55,7 +55,7 @@ class Topic(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedMessage:
-    """One message of an RTC's."""
+    """One message of an RTC."""
 
     topic: Topic
     key: str
@@ -72,7 +72,7 @@ class ReceivedMessage:
 
 
 def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
-    """Return the systems whose RTC is at a router, the first to be there within ``wait_s``.
+    """Return the systems whose RTC is at a router, waiting at most ``wait_s``.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
 
 
 class RtcConnection:
-    """A context manager; what zenoh's threads bring waits until it is taken.
+    """The link, a context manager; messages wait until they are taken.
 
     Where no service is there it is one to the RTC: it holds the token, and answers for matrices.
     """
@@ -119,7 +119,7 @@ class RtcConnection:
         self.close()
 
     def open(self) -> None:
-        """Listen, and be there for the RTC.
+        """Subscribe, and declare the service's token.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class RtcConnection:
             session.close()  # type: ignore[no-untyped-call]
 
     def take(self) -> list[ReceivedMessage]:
-        """Return what has come since the last call, oldest first."""
+        """Return the messages since the last call, oldest first."""
         taken: list[ReceivedMessage] = []
         while self._messages:
             taken.append(self._messages.popleft())
@@ -180,7 +180,7 @@ class RtcConnection:
             raise LinkError(f"the reply is unusable: {error}") from error
 
     def ask(self, kind: CommandKind, payload: bytes) -> tuple[bytes | None, float]:
-        """Return what is replied to these bytes, and after how long; None: nothing.
+        """Return the reply to these bytes and its delay; None: there is none.
 
         Raises
         ------
@@ -205,7 +205,7 @@ class RtcConnection:
         return link.fetch_applied(self._opened, self.keys)
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
-        """Answer for a matrix from now on.
+        """Serve a matrix from now on.
 
         Raises
         ------
@@ -220,7 +220,7 @@ class RtcConnection:
         link.put(self._opened, key, data, Encodings.BYTES, urgent=False)
 
     def put_commit(self, matrix_id: str, data: bytes) -> None:
-        """Send a manifest, or what is none."""
+        """Send a manifest, or bytes that are none."""
         key = self.keys.commit(matrix_id)
         link.put(self._opened, key, data, Encodings.COMMIT, urgent=True)
 

@@ -1,4 +1,4 @@
-"""One examination of an RTC: listen, tell, ask whether to move anything, and do that."""
+"""One examination: listen, ask, and move what the user agrees to."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NO_ANSWER: Final = "no answer"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Examination:
-    """What is to be checked, and how."""
+    """Which checks to make, and with what permission."""
 
     only: frozenset[str] = frozenset()
     """Names of checks; empty: all that neither open the loop nor move the image."""
@@ -71,7 +71,7 @@ class Examination:
     """Makes α of a window of dither, by the instrument file."""
 
     def wants(self, name: str) -> bool:
-        """Return whether a check is to be made, if it may."""
+        """Whether a check is wanted."""
         moves = REQUIREMENTS[name].moves
         if self.passive and moves is not Moves.NOTHING:
             return False
@@ -82,7 +82,7 @@ class Examination:
 
 
 def examine(client: RtcClient, examination: Examination) -> Iterator[Checked]:
-    """Yield every check as soon as it is made.
+    """Yield each check when it is made.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _listening(client: RtcClient, examination: Examination) -> Iterator[Checked]
 
 
 def _why_not(client: RtcClient, examination: Examination, status: Status, names: list[str]) -> str:
-    """Return why nothing is to be asked of the RTC; empty: it may be."""
+    """Return why the RTC must not be asked; empty: it may be."""
     if client.connection.other_service:
         return "a service drives this RTC: end it first, or listen with --passive"
     moved = moved_by(names, status)

@@ -1,4 +1,4 @@
-"""What moves more than words: the RTC's matrix, its loop, its link.
+"""Checks that move the RTC's matrix, loop or link.
 
 A matrix that is sent always has the numbers in use already, under a new id.
 """
@@ -70,7 +70,7 @@ class MatrixInUse:
 
 
 def commit(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
-    """Send the matrix again, commit last; return what came of it, and what is applied, if it is."""
+    """Send the matrix again, commit last; return the outcome and the matrix applied."""
     new = before.named(client.connection.new_id("commit"))
     name = new.manifest.id
     client.connection.offer(new.manifest, new.matrix)
@@ -120,7 +120,7 @@ def chunks(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse
 
 
 def rejection(client: RtcClient, in_use: MatrixInUse) -> Checked:
-    """Send what must be rejected; whatever is applied all the same has the numbers in use."""
+    """Send what must be rejected, with the numbers in use."""
     problems, reasons = [], []
     for what, manifest in _bad_manifests(client, in_use):
         name = manifest.id
@@ -164,7 +164,7 @@ def _repeated(client: RtcClient, in_use: MatrixInUse) -> list[str]:
 
 
 def _unreadable(client: RtcClient) -> list[str]:
-    """Send a commit that is none: it must be rejected without id and sum."""
+    """Send an unreadable commit: it must be rejected without id and sum."""
     known = len(client.watch.acknowledgements)
     client.connection.put_commit(client.connection.new_id("unreadable"), b"\xc1 no manifest")
 
@@ -182,7 +182,7 @@ def _unreadable(client: RtcClient) -> list[str]:
 def _answers(
     client: RtcClient, name: str, patience_s: float, n_known: int = 0
 ) -> list[tuple[float, Acknowledgement]]:
-    """Return what is said of a matrix, once that is final or the time is over."""
+    """Return the acknowledgements of a matrix until a final one or the time is over."""
 
     def said() -> list[tuple[float, Acknowledgement]]:
         every = client.watch.acknowledgements[n_known:]
@@ -195,7 +195,7 @@ def _answers(
 def _without(
     client: RtcClient, name: str, acknowledgements: list[tuple[float, Acknowledgement]]
 ) -> str:
-    """Return in words how a matrix fared that was not applied, or nobody said so."""
+    """Return in words why a matrix was not applied, or that no answer came."""
     if acknowledgements and acknowledgements[-1][1].state is AckState.REJECTED:
         return f"rejected: {acknowledgements[-1][1].reason}"
     if acknowledgements and acknowledgements[-1][1].state is AckState.APPLIED:
@@ -329,7 +329,7 @@ def _after_opening(client: RtcClient, before: Status) -> list[str]:
 
 
 def measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> Checked:
-    """Have two modes measured, and compare what comes with the matrix in use."""
+    """Have two modes measured, and compare the result with the matrix in use."""
     n_rows = len(in_use.matrix)
     modes = tuple(sorted({0, n_rows // 3}))
     name = client.connection.new_id("measure")
@@ -356,7 +356,7 @@ def measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> Checked:
 
 
 def _awaited(client: RtcClient, n_known: int) -> MeasuredMatrix | str:
-    """Return the matrix that comes, or why there is none."""
+    """Return the measured matrix, or why there is none."""
     collector, found = MeasuredIntake(client.connection.keys), list[MeasuredMatrix | str]()
     looked_at = n_known
 

@@ -1,4 +1,4 @@
-"""Whether a demand to move the mirror's image moves it: α is measured before and after."""
+"""Check that an offload moves the image: α before and after."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _ALLOWED: Final = ("busy", "range", "unsupported")
 def offload(
     client: RtcClient, matrix: NDArray[np.float32] | None, registered: Registered
 ) -> Checked:
-    """Have the image moved a little and back, while a dither tells where it is."""
+    """Have the image moved a little and back, while a dither measures where it is."""
     status = client.watch.status
     if status is None or matrix is None or status.cm_id is None:
         return skipped("offload", "the matrix in use is not to be had on rtc/cm/applied")

@@ -1,4 +1,4 @@
-"""What is checked of an RTC: what the contract says, where, and what the check moves."""
+"""The table of requirements: what the contract says, where, what a check moves."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 
 class Outcome(StrEnum):
-    """What came of one check."""
+    """Outcome of one check."""
 
     OK = "ok"
     """As the contract says."""
@@ -25,7 +25,7 @@ class Outcome(StrEnum):
 
 
 class Moves(StrEnum):
-    """What a check does to the telescope."""
+    """The part of the telescope that a check moves."""
 
     NOTHING = "nothing"
     """It listens, and reads the matrix in use."""
@@ -48,7 +48,7 @@ class Moves(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One thing the contract asks."""
+    """One requirement of the contract."""
 
     says: str
     """In a line."""
@@ -161,7 +161,7 @@ class Checked:
 
     @property
     def requirement(self) -> Requirement:
-        """What the contract says."""
+        """The requirement that was checked."""
         return REQUIREMENTS[self.name]
 
 

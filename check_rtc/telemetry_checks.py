@@ -1,4 +1,4 @@
-"""What telemetry alone tells of an RTC: each function looks at one article of the contract."""
+"""Checks that need telemetry alone, one function each."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FAR_NS: Final = 86_400 * 10**9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
-    """What is known of an RTC besides what it has sent by itself."""
+    """Context of the telemetry: instrument, matrix, duration."""
 
     keys: Keys
     began_s: float
@@ -61,12 +61,12 @@ class About:
 
     @property
     def span_s(self) -> float:
-        """For how long it was listened."""
+        """Duration of the telemetry, seconds."""
         return self.ended_s - self.began_s
 
 
 def find_all(observer: TelemetryObserver, about: About) -> Iterator[Checked]:
-    """Yield what every check finds in what has come."""
+    """Yield the finding of every check in the telemetry."""
     for look in _LOOKS:
         yield look(observer, about)
 
@@ -187,7 +187,7 @@ def _sequence(observer: TelemetryObserver, _: About) -> Checked:
 
 
 def _started_over(arrivals: list[Arrival]) -> str:
-    """Return where a later frame has a number that had been passed; empty: nowhere."""
+    """Return where the sequence went back; empty: nowhere."""
     head, newest_ns, known = 0, 0, set[int]()
     for arrival in arrivals:
         header = arrival.header

@@ -1,4 +1,4 @@
-"""What has come of an RTC's telemetry, summed as it comes; no clock, no network."""
+"""Sum an RTC's telemetry as it arrives; no clock, no network."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STILL: Final = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrival:
-    """One batch that could be read."""
+    """One readable batch."""
 
     at_s: float
     header: FrameHeader
@@ -53,7 +53,7 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refused:
-    """One message that could not be read."""
+    """One unreadable message."""
 
     at_s: float
     topic: Topic
@@ -61,7 +61,7 @@ class Refused:
 
 
 class TelemetryObserver:
-    """Feed it what is heard with ``take``; the checks look at what it has gathered."""
+    """Sums of everything an RTC has sent; the checks read them."""
 
     def __init__(self, endpoint: Endpoint, clock: Callable[[], float]) -> None:
         self.intake = Intake(endpoint, clock)
@@ -86,7 +86,7 @@ class TelemetryObserver:
         self._last_slopes: NDArray[np.float32] | None = None
 
     def take(self, heard: list[ReceivedMessage]) -> None:
-        """Look at what has come."""
+        """Add new messages."""
         for item in heard:
             try:
                 self._take(item)
@@ -159,7 +159,7 @@ class TelemetryObserver:
 
 
 class LoopWatch:
-    """Whether commands follow from slopes by the loop that the status tells."""
+    """Compares commands with the loop law that the status states."""
 
     def __init__(self) -> None:
         self.matrix: NDArray[np.float32] | None = None
@@ -175,7 +175,7 @@ class LoopWatch:
         self._law = ControlLawCheck()
 
     def use(self, cm_id: str, matrix: NDArray[np.float32]) -> None:
-        """Know the numbers of the matrix in use."""
+        """Take over the numbers of the matrix in use."""
         self.cm_id, self.matrix = cm_id, matrix
 
     def follow_status(self, status: Status) -> None:

@@ -1,4 +1,4 @@
-"""pyrcal, as people import it: the optical model, fits of measured matrices, reconstructors.
+"""The library: optical model, fits of measured matrices, reconstructors.
 
 Nothing is imported before it is asked for.
 """
@@ -47,7 +47,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
-    """Import what is asked for."""
+    """Import a name of the library when it is first used."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_HOMES[name]), name)

@@ -1,4 +1,4 @@
-"""The command line. What a command needs is imported when it is known which is meant."""
+"""The command line; each command imports only what it needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line of ``pyrcal``: help and errors come at once, for nothing here takes long."""
+"""The arguments of ``pyrcal``; quick to import."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OTHER_PROGRAMS = {
 
 
 def command_line() -> argparse.ArgumentParser:
-    """Return what reads ``pyrcal``'s command line; ``command`` names the command that is meant."""
+    """Return the parser of ``pyrcal``'s command line; ``command`` names the command."""
     parser = OneLineParser(
         prog="pyrcal", description="Calibration service of an adaptive telescope."
     )
@@ -47,7 +47,7 @@ def command_line() -> argparse.ArgumentParser:
 
 
 class _Completion(argparse.Action):
-    """Prints the completion of this command line, and ends the program."""
+    """Print the shell completion of this command line, and end the program."""
 
     @override
     def __call__(

@@ -1,4 +1,4 @@
-"""Options and operands of a command line, each said in a line; quickly imported."""
+"""Declare options and operands of a command line; quick to import."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ def add(to: Any, *every: Words) -> None:  # noqa: ANN401 - argparse's own, whose
 
 
 def named(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """Return those of these options that were given."""
+    """Return the given ones of these options."""
     given = {name: getattr(options, name, None) for name in names}
     return {name: value for name, value in given.items() if value is not None}

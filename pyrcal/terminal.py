@@ -1,4 +1,4 @@
-"""What a command prints: answers to standard output, all else to standard error, nothing raw."""
+"""Print answers to standard output, everything else to standard error."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def login() -> str:
 
 
 def show_progress(step: str) -> None:
-    """Tell somebody who watches how far it is; a log needs no such lines."""
+    """Show progress at a terminal; a log gets no such lines."""
     if sys.stderr.isatty():
         say(f"... {step}")
 
 
 def print_document(document: dict[str, Any], indent: int | None = 2) -> None:
-    """Print what REST has answered."""
+    """Print a document of REST."""
     print(json.dumps(document, indent=indent).replace("\x7f", "\\u007f"), flush=True)
 
 

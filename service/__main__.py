@@ -1,4 +1,4 @@
-"""``python -m service``: the service's own commands, run and key; ``pyrcal`` has the rest."""
+"""``python -m service``: the commands ``run`` and ``key``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The REST application: reads snapshots, hands commands on; no science."""
+"""The REST application: read snapshots, hand commands on."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def shown(text: str, keep: str = "") -> str:
 
 
 def say(line: str) -> None:
-    """Tell whoever sits at the terminal something beside the answer."""
+    """Write a line to standard error, beside the answer."""
     sys.stderr.write(f"{shown(line)}\n")
 
 
@@ -85,11 +85,11 @@ class UnknownIdError(CommandError):
 
 
 class StaleError(CommandError):
-    """What somebody has decided on has changed since they saw it."""
+    """The subject of the order has changed since it was shown."""
 
 
 class UntaggedError(CommandError):
-    """Somebody asks for strictness, and does not say what they have decided on."""
+    """An order asks for strictness without an ETag of its subject."""
 
 
 class TooLargeError(CommandError):

@@ -1,4 +1,4 @@
-"""The link to the RTC: telemetry in, reconstructors and commands out, over zenoh.
+"""The link to the RTC over zenoh: telemetry in, commands and matrices out.
 
 Frames walk one way: zenoh's thread checks them into a bounded ring, ``drain`` hands out copies.
 Everything else that happens waits as an event. Nothing here decides anything: what an event means
@@ -250,11 +250,11 @@ class Bridge:
         return await asyncio.to_thread(link.fetch_applied, self._opened(), self._keys)
 
     def publish_state(self, message: wire.StateMessage) -> None:
-        """Tell whoever listens what the service knows; dropped while the network is slow."""
+        """Publish the service's state; dropped while the network is slow."""
         self._tell(self._keys.state, wire.encode(message), wire.Encodings.STATE)
 
     def publish_alarm(self, message: wire.AlarmMessage) -> None:
-        """Tell whoever listens that an alarm came or went; dropped while the network is slow."""
+        """Publish an alarm that began or ended; dropped while the network is slow."""
         self._tell(self._keys.alarm, wire.encode(message), wire.Encodings.ALARM)
 
     def _declare(self, session: zenoh.Session) -> None:

@@ -1,4 +1,4 @@
-"""The simulated real-time computer of an adaptive telescope: its own process, its own truth.
+"""The simulated RTC of an adaptive telescope, a process of its own.
 
 It shares the optics primitives, the instrument file and the wire format with the service, and
 nothing else; its plant differs from the service's model on purpose.

@@ -1,4 +1,4 @@
-"""``python -m sim_rtc``: the simulated RTC as a process of its own."""
+"""``python -m sim_rtc``: run the simulated RTC."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _log = structlog.get_logger("sim_rtc")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the simulated RTC until its time is up or it is told to stop; return the exit status."""
+    """Run the simulated RTC for its time or until a signal; return the exit status."""
     options = parse_options(arguments)
     log_to_terminal(quiet=options.quiet)
     stopped = stop_signal()
@@ -107,7 +107,7 @@ def _replay(path: Path, options: Options, stopped: threading.Event) -> int:
 
 
 class Watch:
-    """Tells the log how the loop is doing: every few seconds, and at once when it falls behind."""
+    """Logs the loop's health every few seconds, and at once when it falls behind."""
 
     def __init__(
         self, computer: RealTimeComputer, pace: Pace, link: Link, options: Options
@@ -125,7 +125,7 @@ class Watch:
         self._behind = False
 
     def look(self, batch: Batch) -> None:
-        """Take note of a batch."""
+        """Count a batch."""
         self._clipped += batch.n_clipped
         self._frames += len(batch.slopes)
         self._seq = batch.seq0 + len(batch.slopes)
@@ -152,7 +152,7 @@ class Watch:
         self._late, self._frames = self._pace.late_frames, 0
 
     def _tell_delay(self, share: float) -> None:
-        """Say how far behind real time the loop is, and when it is so no more."""
+        """Log how far behind real time the loop is, and when it has caught up."""
         behind_s = self._pace.behind_s
         if behind_s > _WORRYING_DELAY_S:
             text = (

@@ -1,4 +1,4 @@
-"""Options of the command line, and their values: text to numbers in range, or what was expected."""
+"""Read and check the values of command-line options."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def several(
 
 
 def as_they_are(*found: float) -> tuple[float, ...]:
-    """Return the numbers themselves."""
+    """Return the numbers unchanged."""
     return found
 
 
@@ -185,7 +185,7 @@ def truth(text: str) -> Path | str:
 
 
 def endpoint(text: str) -> str:
-    """Read a zenoh endpoint; a wrong one would only ever look like a service that does not come."""
+    """Read a zenoh endpoint; a wrong one would only look like a missing service."""
     if _ENDPOINT.fullmatch(text) is None:
         raise refusal(text, "PROTOCOL/ADDRESS like tcp/127.0.0.1:7447")
     return text

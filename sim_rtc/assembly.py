@@ -1,4 +1,4 @@
-"""Puts a simulated RTC together from its options; takes a few seconds."""
+"""Assemble a simulated RTC from its options; takes a few seconds."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ STROKE_M = 10e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Telescope:
-    """Everything but the computer: what feeds it and what is known of it beforehand."""
+    """Everything but the computer: feed, optics, detector."""
 
     feed: Feed
     plant: Plant
@@ -164,7 +164,7 @@ def build_telescope(
 def build_stage(
     options: Options, optics: MovingOptics
 ) -> Callable[[NDArray[np.float64]], float] | None:
-    """Return what moves the mirror's image when it is asked to, as well as it obeys."""
+    """Return the device that moves the mirror's image on request."""
     if options.stage is None:
         return None
     obedience, takes_s = options.stage
@@ -206,7 +206,7 @@ def build_sky(
     plant: Plant,
     rng: np.random.Generator,
 ) -> Sky:
-    """Return what comes to the sensor of this plant, and what is played on its mirror."""
+    """Return the turbulence and vibrations on this plant's sensor and mirror."""
     scene, seeing = options.scene, options.seeing
     layers = frozen_layers(
         options.layers,
@@ -232,7 +232,7 @@ def build_sky(
 
 
 def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> MirrorDrive | None:
-    """Return what limits and slows the mirror; None for a linear plant's ideal one."""
+    """Return the mirror's limits and lag; None for a linear plant's ideal one."""
     if options.plant == "linear" and not options.needs_drive:
         return None
     return MirrorDrive(
@@ -265,7 +265,7 @@ def build_feed(
     rng: np.random.Generator,
     batch_frames: int = BATCH_FRAMES,
 ) -> Feed:
-    """Return what feeds the loop: slopes of a linear plant, phases for any other.
+    """Return the loop's feed: slopes of a linear plant, phases of any other.
 
     ``batch_frames`` are a linear plant's: of any other a frame takes milliseconds.
     """

@@ -1,4 +1,4 @@
-"""Faults on request: what an RTC, a sensor or a network does at its worst, on a schedule.
+"""Faults of RTC, sensor and network, on a schedule.
 
 ``KIND@T[:ARGUMENTS]`` begins a fault at T seconds of loop time. The plan only knows what is to
 happen when; those of the computer and of telemetry on its way are carried out here, those of
@@ -31,7 +31,7 @@ Array32 = NDArray[np.float32]
 
 
 class FaultKind(StrEnum):
-    """What goes wrong."""
+    """Kinds of faults."""
 
     LOST = "lost"
     LATE = "late"
@@ -133,13 +133,13 @@ class Fault:
     """One for each argument of its form, defaults filled in."""
 
     def value(self, name: str) -> float:
-        """Return the argument of this name."""
+        """Return an argument by name."""
         names = [argument.name for argument in FORMS[self.kind][0]]
         return self.values[names.index(name)]
 
     @property
     def end_s(self) -> float:
-        """When it is over; a fault without a duration lasts until the next of its kind."""
+        """End, seconds; a fault without a duration lasts until the next of its kind."""
         names = [argument.name for argument in FORMS[self.kind][0]]
         return self.time_s + (self.value("SECONDS") if "SECONDS" in names else _FOREVER)
 
@@ -294,7 +294,7 @@ class ComputerFaults:
             self._clock.restart(time.time_ns())
 
     def _rest(self, seconds: float, stopped: threading.Event) -> None:
-        """Do nothing, as a computer that hangs: no frame is made up for afterwards."""
+        """Do nothing, as a computer that hangs; no frame is made up for later."""
         stopped.wait(seconds)
         self._clock.step(round(1e9 * seconds))
         self._pace.forgive(seconds)
@@ -308,7 +308,7 @@ _NONSENSE = b"\xc1 no header of frames"
 
 
 class WireFaults:
-    """Turns each batch into what is really sent, in that order; for one thread."""
+    """Turns each batch into the messages really sent, in order; for one thread."""
 
     def __init__(self, plan: FaultPlan, rng: np.random.Generator) -> None:
         self._plan = plan
@@ -321,7 +321,7 @@ class WireFaults:
         self._n_garbled = 0
 
     def messages(self, header: FrameHeader, rows: Array32, time_s: float) -> list[Sendable]:
-        """Return what is sent now: this batch or what has become of it, and what was held."""
+        """Return the messages to send now: this batch or its damaged form, and held ones."""
         due = [message for due_s, message in self._held if due_s <= time_s]
         self._held = [held for held in self._held if held[0] > time_s]
         header, rows = self._damaged(header, rows, time_s)
@@ -363,7 +363,7 @@ class WireFaults:
         return (payload, _NONSENSE) if self._n_garbled % 2 else (payload[:-3], attachment)
 
     def _on_the_way(self, message: Sendable, time_s: float) -> list[Sendable]:
-        """Return what leaves in place of a batch, after one that it has overtaken."""
+        """Return the messages in place of a batch, after one that it has overtaken."""
         late = self._plan.active(FaultKind.LATE, time_s)
         sent: list[Sendable] = []
         if self._struck(FaultKind.LOST, time_s):

@@ -1,4 +1,4 @@
-"""The manual of the simulated RTC: what ``--help`` says besides the options, and how wide."""
+"""The text of ``--help`` besides the options."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ exit status
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage that would push it off the screen."""
+    """A parser that reports an error on one line, without the usage."""
 
     def __init__(self) -> None:
         super().__init__(

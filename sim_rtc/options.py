@@ -1,4 +1,4 @@
-"""The command line of the simulated RTC: every option once, and what they come to together."""
+"""Every option of the simulated RTC."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ USUAL_MODES, FAR_MODES = 400, 120
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the command line asked for: one field an option, then what several come to."""
+    """The command line: one field an option, then properties derived from several."""
 
     instrument: str = option(
         "--instrument NAME|FILE",
@@ -340,13 +340,13 @@ class Options:
 
     @property
     def magnitude(self) -> float:
-        """Of the star, or of the fibre."""
+        """Magnitude of the star or fibre."""
         usual = 7.0 if self._by_day else 8.0
         return usual if self.given_magnitude is None else self.given_magnitude
 
     @property
     def gain(self) -> float:
-        """Of every mode; by day, when a command counts twice, half of it makes the same loop."""
+        """Gain of every mode; by day, when a command counts twice, half of it."""
         usual = 0.2 if self._by_day else 0.4
         return usual if self.given_gain is None else self.given_gain
 
@@ -384,12 +384,12 @@ class Options:
 
     @property
     def scene(self) -> Scene:
-        """What is looked at, and through what."""
+        """The scene: star or fibre, seeing, spider."""
         return Scene(kind=SceneKind(self.scene_kind), spiders=self.spiders)
 
     @property
     def elevation(self) -> Elevation:
-        """Of the telescope over the run."""
+        """Elevation of the telescope over the run."""
         return replace(self.pointing, slews=self.slews)
 
     @property
@@ -399,7 +399,7 @@ class Options:
 
     @property
     def layers(self) -> tuple[Layer, ...]:
-        """Of the turbulence."""
+        """Layers of turbulence."""
         n_own = len(self.wind)
         if n_own and self.profile is not None:
             raise ConfigurationError("--profile: found beside --wind; expected one of them")
@@ -422,7 +422,7 @@ class Options:
 
     @property
     def imperfections(self) -> Imperfections:
-        """A set of them, and those that were given one by one."""
+        """A named set of imperfections, with single ones replaced."""
         sets = (*self.truths, self.imperfection_set)
         named = {given for given in sets if isinstance(given, str)}
         if len(named) > 1:
@@ -449,13 +449,13 @@ class Options:
 
     @property
     def mirror_limits(self) -> MirrorLimits:
-        """How far and how sharply the mirror may be bent."""
+        """Largest stroke and slope of the mirror."""
         stroke_m, bend_m = self.actuator_stroke_um * 1e-6, self.actuator_bend_um * 1e-6
         return MirrorLimits(stroke_m=stroke_m, bend_m=bend_m)
 
     @property
     def needs_drive(self) -> bool:
-        """Whether a linear plant, too, must follow its mirror's movements one by one."""
+        """Whether a linear plant must follow its mirror frame by frame."""
         return self.rise_ms > 0.0 or self.mirror_limits != MirrorLimits()
 
     @property
@@ -466,7 +466,7 @@ class Options:
         )
 
     def complete(self) -> Options:
-        """Return the options with what a preset chooses.
+        """Return the options with those that a preset chooses.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The truth of a run, never sent: lines of a file beside it, or a picture of the loop closing."""
+"""Record the truth of a run, as lines of a file or as a picture."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class TruthRecorder(Background):
         clock: FrameClock,
         options: Options | None = None,
     ) -> None:
-        """Take the pupil's ``weights`` ``(n_points,)``, and the options if they are to be told."""
+        """Take the pupil's ``weights`` ``(n_points,)``, and the options to be recorded."""
         super().__init__("truth")
         self._path = path
         self._options = options
@@ -203,7 +203,7 @@ class TruthRecorder(Background):
 
 
 def setup_of(options: Options) -> dict[str, Any]:
-    """Return what stays as it is for the run, as JSON can hold it."""
+    """Return the constants of the run as JSON can hold them."""
     told = (
         *("scene", "imperfections", "seeing", "layers", "vibrations"),
         *("flexure", "walk", "elevation"),
@@ -224,7 +224,7 @@ def setup_of(options: Options) -> dict[str, Any]:
 
 
 def _json(value: Any) -> Any:  # noqa: ANN401 - a record, or several
-    """Return records as JSON has them."""
+    """Return records as JSON."""
     return [asdict(one) for one in value] if isinstance(value, tuple) else asdict(value)
 
 
@@ -236,7 +236,7 @@ _INCHES = 3.2
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Moment:
-    """One frame of the loop, as maps ``[y, x]``; what is not lit is NaN."""
+    """One frame of the loop, as maps ``[y, x]``; unlit points are NaN."""
 
     frame: int
     """Number of the frame since the loop was closed."""
@@ -307,7 +307,7 @@ def _show(
 
 
 def _moment(telescope: Telescope, batch: Batch, frame: int) -> Moment:
-    """Return what the first frame of a batch looks like."""
+    """Return the maps of the first frame of a batch."""
     optics, plant = batch.optics, telescope.plant
     opd_m = batch.phase_m + optics.opd_per_command @ batch.commands_m[0]
     light = optics.images

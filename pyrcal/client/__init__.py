@@ -1,1 +1,1 @@
-"""A running service, asked over REST: the commands that look at it and give it orders."""
+"""Commands that ask a running service over REST."""

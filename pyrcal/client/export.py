@@ -1,4 +1,4 @@
-"""``pyrcal export``: what a service has kept, to a file that is whole or not there."""
+"""``pyrcal export``: write what a service has archived to a file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def run_command(service: Service, _request: Request, options: argparse.Namespace
 
 
 def _write(file: BinaryIO, content: bytes, target: Path) -> None:
-    """Write to the disk, whose errors are not the connection's."""
+    """Write to the disk; its errors are not the connection's."""
     try:
         file.write(content)
     except OSError as error:
@@ -90,7 +90,7 @@ def _write(file: BinaryIO, content: bytes, target: Path) -> None:
 
 
 def _sent(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
-    """Yield what the service writes itself."""
+    """Yield the bytes that the service sends."""
     asked = f"{path}?{urlencode({'format': form, **query})}"
     with service.answered("GET", asked, within_s=None, silent_s=SENT_WITHIN_S) as response:
         yield from chunks(response)
@@ -124,7 +124,7 @@ def _written(entries: list[Document], form: str, *, head: bool) -> bytes:
 
 
 def _flat(entry: Document, before: str = "") -> Document:
-    """Return the fields, those of a field named after both."""
+    """Return a document as flat keys: a nested field is named after both."""
     found: Document = {}
     for name, value in entry.items():
         inside = isinstance(value, dict)

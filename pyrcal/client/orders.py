@@ -1,4 +1,4 @@
-"""Orders over REST: what is decided on is shown, what came of it printed, long work followed."""
+"""Orders over REST: show, ask, send, follow to the end."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _WELL = {"applied", "superseded", "stored", "made"}
 
 
 class Step(NamedTuple):
-    """How far something is."""
+    """Progress of an order's work."""
 
     text: str
     under_way: bool
@@ -41,7 +41,7 @@ class Step(NamedTuple):
 
 
 def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:
-    """Show what is decided on, give the order, say what came of it; return the exit status.
+    """Show the subject of the order, send it, print the outcome; return the exit status.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
 
 
 def _refuse_early(service: Service, request: Request) -> None:
-    """Refuse what the service would refuse, before somebody is asked for a reason."""
+    """Refuse what the service would refuse, before asking for a reason."""
     if not request.permitted:
         return
     state = service.get("/v1/state").document
@@ -96,12 +96,12 @@ def _refuse_early(service: Service, request: Request) -> None:
 
 
 def path_of(path: str, options: argparse.Namespace) -> str:
-    """Return a path with the id that is meant."""
+    """Return a path with the id filled in."""
     return re.sub(r"{\w+}", quote(str(getattr(options, "id", "")), safe=""), path)
 
 
 def _show(service: Service, request: Request, options: argparse.Namespace) -> str:
-    """Show what an order decides on, and return its ETag; ``options.id`` becomes its own."""
+    """Print the subject of an order, and return its ETag; ``options.id`` becomes its own."""
     document, tag = service.get(path_of(request.decides_on, options))
     options.known = _reconstructors(service) if request.follows == RECONSTRUCTORS else {}
     with understood(service):
@@ -115,14 +115,14 @@ def _show(service: Service, request: Request, options: argparse.Namespace) -> st
 
 
 def _reconstructors(service: Service) -> dict[str, Document]:
-    """Return what is known of each, by id, oldest first."""
+    """Return each reconstructor's document by id, oldest first."""
     document = service.get(RECONSTRUCTORS).document
     with understood(service):
         return {one["id"]: one for one in document["reconstructors"]}
 
 
 def _progress(service: Service, request: Request, options: argparse.Namespace) -> Document:
-    """Return how far the work is; a reconstructor that goes out again does so as a copy."""
+    """Return the progress; a reconstructor that goes out again does so as a copy."""
     if request.follows != RECONSTRUCTORS:
         return service.get(path_of(request.follows, options)).document
     every = _reconstructors(service).items()
@@ -134,7 +134,7 @@ def _progress(service: Service, request: Request, options: argparse.Namespace) -
 
 
 def _asked(request: Request, question: str, option: str) -> str:
-    """Return what somebody at the terminal answers."""
+    """Ask at the terminal and return the answer."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigurationError(
             f"{request.name}: found no {option} and nobody to ask, expected {option}"
@@ -145,7 +145,7 @@ def _asked(request: Request, question: str, option: str) -> str:
 
 
 def _follow(service: Service, request: Request, options: argparse.Namespace) -> int:
-    """Show how far it is until it has ended; return the exit status."""
+    """Show the progress until the work has ended; return the exit status."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -185,7 +185,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
 
 
 def _step(document: Document, lasted_s: float) -> Step:
-    """Return how far the work is that a document tells of."""
+    """Return the progress that a document shows."""
     if "acquisition" in document:
         work = document["acquisition"]
         text = f"acquisition, {work['stage']}: {work['text']}"

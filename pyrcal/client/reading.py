@@ -1,4 +1,4 @@
-"""What a running service knows, as text: the screen of each command that changes nothing."""
+"""Print what a running service knows."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
 
 @contextmanager
 def understood(service: Service) -> Iterator[None]:
-    """Tell of an answer that this version of pyrcal does not understand.
+    """Report an answer that this version of pyrcal does not understand.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def understood(service: Service) -> Iterator[None]:
 
 
 def reconstructor_lines(one: Document) -> Iterator[str]:
-    """Yield all that somebody wants to know who decides about a reconstructor."""
+    """Yield all that an operator needs to decide about a reconstructor."""
     yield f"{one['id']}: {one['state']}, {one['n_modes']} modes, made {clock(one['created_utc'])}"
     if one["reason"]:
         yield f"because      {one['reason']}"

@@ -1,4 +1,4 @@
-"""The commands that ask a running service, in the words of the command line; quickly imported.
+"""The commands that ask a running service, in the words of the command line; quick to import.
 
 Where REST takes an order, what it is decided on and where to look for what becomes of it stands in
 the service's own table, ``service/commands.toml``. What the service answers to an order is printed
@@ -73,12 +73,12 @@ class Request(NamedTuple):
 
     @property
     def method(self) -> str:
-        """Of REST."""
+        """HTTP method."""
         return self.call.partition(" ")[0]
 
     @property
     def path(self) -> str:
-        """Of REST; words in braces are options."""
+        """Path of REST; words in braces are options."""
         return self.call.partition(" ")[2]
 
     @property
@@ -117,7 +117,7 @@ def _records(name: str, purpose: str, call: str, *every: Words, **more: Any) -> 
 
 
 def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's own
-    """Return what reads ``3,5,9``, or one of the words that the service knows."""
+    """Return a reader of ``3,5,9``, or of a word that the service knows."""
 
     def read(text: str) -> object:
         try:

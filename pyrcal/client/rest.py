@@ -1,4 +1,4 @@
-"""A running service, asked over REST; nothing here takes long to import.
+"""A client of the service's REST interface; quick to import.
 
 Whoever answers is a stranger until the answer makes sense: it may be late, cut, endless, or of
 something else than pyrcal.
@@ -32,15 +32,15 @@ _SAYS_PYRCAL = "urn:pyrcal:problem:"
 
 
 class UnreachableError(LinkError):
-    """Nothing answers in time, or something else than this version of pyrcal."""
+    """Nothing answers in time, or something that is not this version of pyrcal."""
 
 
 class RefusedError(CommandError):
-    """The service has answered that it does not do it, or has not got it."""
+    """The service has refused, or does not have it."""
 
 
 class Fetched(NamedTuple):
-    """What was answered."""
+    """An answer of the service."""
 
     document: Document
     tag: str
@@ -97,7 +97,7 @@ class Service:
             return self._read(response)
 
     def order(self, method: str, path: str, body: Document, headers: Mapping[str, str]) -> Fetched:
-        """Return what an order is answered.
+        """Send an order and return the answer.
 
         One whose answer is lost is sent again where its ``Idempotency-Key`` lets it be carried out
         only once.
@@ -132,7 +132,7 @@ class Service:
         within_s: float | None = None,
         silent_s: float | None = None,
     ) -> Iterator[http.client.HTTPResponse]:
-        """Yield the answer to a request, to be read.
+        """Send a request and yield the answer, to be read.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ class Service:
             connection.close()
 
     def _read(self, response: http.client.HTTPResponse) -> Fetched:
-        """Return the JSON object that an answer is."""
+        """Return the JSON object in an answer."""
         raw = response.read(LARGEST + 1)
         if response.length:
             raise http.client.IncompleteRead(raw, response.length)
@@ -199,7 +199,7 @@ class Service:
         return Fetched(document, response.headers.get("ETag", ""))
 
     def _refusal(self, response: http.client.HTTPResponse) -> RefusedError | UnreachableError:
-        """Return what the answer is that is none."""
+        """Return the error for an answer that is a refusal."""
         try:
             problem = self._read(response).document
         except UnreachableError:
@@ -210,7 +210,7 @@ class Service:
         return self.stranger(f"{response.status} {response.reason}")
 
     def stranger(self, found: str) -> UnreachableError:
-        """Return the error that something else answers."""
+        """Return the error for an answer that is not pyrcal's."""
         return UnreachableError(
             f"{self.url}: something answers, but it is not pyrcal, or not this version: {found}"
         )
@@ -221,7 +221,7 @@ class _LostError(UnreachableError):
 
 
 def _cut(sock: socket.socket, late: threading.Event) -> None:
-    """End a connection whoever waits for it."""
+    """End a connection, whether or not somebody waits for it."""
     late.set()
     try:
         sock.shutdown(socket.SHUT_RDWR)
@@ -230,7 +230,7 @@ def _cut(sock: socket.socket, late: threading.Event) -> None:
 
 
 def chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
-    """Yield what an answer holds.
+    """Yield an answer piece by piece.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a running service does, on one screen, for somebody just woken up."""
+"""``pyrcal status``: the whole service on one screen."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ALPHA = {
 
 
 def status_lines(state: Document) -> list[str]:
-    """Return the screen: first whether all is well and what is not, then what there is."""
+    """Return the screen: first whether all is well, then the details."""
     ready = "ready" if state["ready"] else f"NOT READY: {state['ready_reason']}"
     does, up = state["operating"], span(state["uptime_s"])
     doing = f"{does['service_state']}, {does['current_operation']}"
@@ -35,7 +35,7 @@ def status_lines(state: Document) -> list[str]:
 
 
 def worst_first(state: Document) -> list[Document]:
-    """Return the alarms that last and are not muted: the worst first, the unseen before others."""
+    """Return the alarms that are not muted: the worst first, the unseen before others."""
     shown = [alarm for alarm in state["alarms"] if alarm["muted"] is None]
     return sorted(
         shown, key=lambda one: (-_SEVERITIES.index(one["severity"]), one["alarm_state"] != "active")
@@ -46,7 +46,7 @@ _SEVERITIES = ("warning", "serious", "critical")
 
 
 def alarm_line(alarm: Document, state: Document) -> str:
-    """Return what is the matter, how much it matters, for how long, and whether it was seen."""
+    """Return an alarm on one line: text, severity, duration, whether it was seen."""
     lasts = span(max(0.0, (state["now_ns"] - alarm["since_ns_utc"]) / 1e9))
     seen = "" if alarm["acknowledged"] is None else ", acknowledged"
     return f"{alarm['name']} ({alarm['severity']}{seen}) for {lasts}: {alarm['text']}"
@@ -79,7 +79,7 @@ def _alpha(state: Document) -> list[str]:
 
 
 def _refusal(state: Document) -> list[str]:
-    """Return why the last window that was refused was, and when."""
+    """Return when and why the last window was refused."""
     last = state["window_refusal"]
     if last is None:
         return []
@@ -102,7 +102,7 @@ def _matrix(state: Document) -> list[str]:
 
 
 def verdict(margin: Document | None) -> str:
-    """Return what the stability gate says of a reconstructor."""
+    """Return the stability gate's verdict on a reconstructor in words."""
     if margin is None:
         return "not judged"
     said = "accepted" if margin["accepted"] else f"REFUSED: {margin['reason']}"

@@ -1,4 +1,4 @@
-"""``pyrcal watch``: the state and the log in a terminal, live, and never older than they look."""
+"""``pyrcal watch``: state and log in a terminal, live."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _GROWS = {"age_s", "window_age_s", "frame_age_s", "uptime_s"}
 
 @dataclass
 class Latest:
-    """What the stream has told, and when."""
+    """The last state and log from the stream, and when they came."""
 
     state: Document | None = None
     at_s: float = 0.0
@@ -57,7 +57,7 @@ class Latest:
 
 
 def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:
-    """Show what comes until Ctrl-C; return the exit status.
+    """Show state and log until Ctrl-C; return the exit status.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def _print_events(coming: Iterator[Event]) -> None:
 
 
 def _print_log(coming: Iterator[Event]) -> None:
-    """Print the log, and when nothing comes: there is no screen to draw on."""
+    """Print the log without a screen to draw on."""
     for name, data in coming:
         if name == "lost":
             say(f"DISCONNECTED: {data['text']}; trying again")
@@ -150,7 +150,7 @@ def _of_log(line: Document) -> str:
 
 
 def _draw(coming: Iterator[Event], latest: Latest) -> None:
-    """Draw what is known, and how old it is, while it comes in a thread of its own."""
+    """Draw the latest state and its age, while a thread reads the stream."""
     from rich.console import Console
     from rich.live import Live
 
@@ -163,7 +163,7 @@ def _draw(coming: Iterator[Event], latest: Latest) -> None:
 
 
 def screen(latest: Latest, now_s: float) -> Group:
-    """Return what there is to see at a time, the newest lines of the log first."""
+    """Return the screen at a time, the newest lines of the log first."""
     from rich.console import Group
     from rich.text import Text
 

@@ -1,1 +1,1 @@
-"""Files in, answers out, no service: fits of measured matrices, reconstructors, exports."""
+"""Files in, answers out: fits, reconstructors, exports, without a service."""

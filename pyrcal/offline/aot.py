@@ -1,4 +1,4 @@
-"""A night in the AOT FITS standard: telemetry, matrices and α over time, as other tools read them.
+"""Export telemetry, matrices and α in the AOT FITS standard.
 
 The standard is Gomes et al. 2024 (doi:10.1051/0004-6361/202348486), written by ``aotpy``.
 """
@@ -28,7 +28,7 @@ from service.wire import FrameBatch, Manifest, Status, decode, decode_frames
 
 @dataclass(slots=True, kw_only=True)
 class Excerpt:
-    """What a recording holds of some seconds."""
+    """Some seconds of a recording."""
 
     batches: list[FrameBatch] = field(default_factory=list)
     status: Status | None = None
@@ -42,18 +42,18 @@ class Excerpt:
 
     @property
     def first_ns_utc(self) -> int:
-        """When the first frame ended, by the RTC's clock."""
+        """End of the first frame, by the RTC's clock."""
         return self.batches[0].header.t0_ns
 
     @property
     def last_ns_utc(self) -> int:
-        """When the last one did."""
+        """End of the last frame."""
         header = self.batches[-1].header
         return header.t0_ns + (header.n - 1) * header.dt_ns
 
 
 def excerpt(path: Path, first_s: float, seconds: float) -> Excerpt:
-    """Return what a recording holds of a time.
+    """Return some seconds of a recording.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, .
 
 
 def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, ...]) -> Any:  # noqa: ANN401
-    """Return α over time; None: nothing was measured."""
+    """Return α over time; None: there is no estimate."""
     if not estimates:
         return None
     seconds = [entry.t_ns_utc / SECOND_NS for entry in estimates]
@@ -244,7 +244,7 @@ def _time(aotpy: Any, name: str, t_ns: NDArray[np.int64], seqs: NDArray[np.int64
 
 
 def _as_listed(values: NDArray[np.float32], instrument: Instrument) -> NDArray[np.float32]:
-    """Return what the RTC lists as ``(n, n_slopes)``, in our order: ``(n, 2, n_valid)``, or 4."""
+    """Return the RTC's signals ``(n, n_slopes)`` in our order: ``(n, 2, n_valid)``, or 4."""
     recipe = instrument.slopes
     mask = rtc_valid_subapertures(instrument)
     ours = to_conventions(values.T, recipe, mask)

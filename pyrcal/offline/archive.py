@@ -1,4 +1,4 @@
-"""``pyrcal archive``: what lies in a service's folder, whether it is sound, and what may go."""
+"""``pyrcal archive``: list, verify, prune and export a service's archive."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BESIDE_NS = HOUR_NS
 
 
 def main(options: argparse.Namespace) -> int:
-    """Do what is asked of the archive; return the exit status: 0 done, 1 something is damaged.
+    """Run an archive command; return the exit status: 0 done, 1 something is damaged.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
 
 
 def _saved(archive: Archive) -> tuple[str, ...]:
-    """Return what the next service would ask for."""
+    """Return the α that the next service would start with."""
     saved = archive.tracking.read()
     if saved is None:
         return ()

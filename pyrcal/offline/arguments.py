@@ -1,4 +1,4 @@
-"""What the commands understand that read and write files. Nothing here takes long to import.
+"""Arguments of the commands that work on files; quick to import.
 
 What the program calls methods and data sets stands here as text; a test compares it.
 """
@@ -183,7 +183,7 @@ def parse_arms(text: str) -> Arms:
 
 
 def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
-    """Return a function that reads a text; what it refuses argparse prints as it is."""
+    """Return a reader whose refusals argparse prints as they are."""
 
     def read(text: str) -> object:
         try:

@@ -1,4 +1,4 @@
-"""The figures of Heritier et al. 2018 for a fit of anybody's data: drawn, or as numbers.
+"""The figures of Heritier et al. 2018 for any fit, drawn or as numbers.
 
 As numbers they are for a browser; only drawing needs the extra ``plots``.
 """
@@ -40,7 +40,7 @@ _MODES_ACROSS, _SCANS_ACROSS = 2, 5
 
 
 def check_plots(what: str = "--plot") -> None:
-    """Refuse to begin where figures cannot be drawn; ``what`` is what asks for one.
+    """Refuse to begin where figures cannot be drawn; ``what`` asks for one.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def gains(axes: Axes, fit: Fit) -> None:
 
 
 def slopes_rms(axes: Axes, fit: Fit) -> None:
-    """Draw the RMS of every column: measured, synthetic, and what is left."""
+    """Draw the RMS of every column: measured, synthetic, residual."""
     measured = np.sqrt(np.mean(np.square(fit.measured, dtype=np.float64), axis=0)) * 1e-9
     synthetic = np.sqrt(np.mean(np.square(fit.synthetic, dtype=np.float64), axis=0)) * 1e-9
     axes.semilogy(fit.modes, synthetic, color=SYNTHETIC, label="synthetic, gains not applied")
@@ -164,7 +164,7 @@ def _shown(fit: Fit) -> str:
 
 
 def residual(axes: Axes, fit: Fit) -> None:
-    """Draw what is left over in every subaperture."""
+    """Draw the residual of every subaperture."""
     image = axes.imshow(
         100.0 * side_by_side(fit.residual_map), origin="lower", cmap="viridis", vmin=0.0
     )
@@ -173,14 +173,14 @@ def residual(axes: Axes, fit: Fit) -> None:
 
 
 def residual_by_mode(axes: Axes, fit: Fit) -> None:
-    """Draw what is left over of every mode."""
+    """Draw the residual of every mode."""
     axes.semilogy(fit.modes, 100.0 * fit.residual_by_mode, ".", color="0.4", markersize=3.0)
     axes.axhline(100.0 * fit.residual_fraction, color=MEASURED, linewidth=0.8)
     axes.set(title="left over by mode", xlabel="mode", ylabel="% of the mode's own RMS")
 
 
 def _outline(instrument: Instrument) -> tuple[Array, str]:
-    """Return what is known of the mirror's layout, in subapertures, and how to draw it."""
+    """Return the mirror's outline or actuators, in subapertures, and how to draw them."""
     mirror = instrument.mirror
     parity = np.array([1.0, mirror.y_sign])
     if isinstance(mirror, TabulatedModes):
@@ -208,7 +208,7 @@ def slope_maps(figure: SubFigure, fit: Fit) -> None:
 
 
 def _rows(shown: Sized, across: int) -> int:
-    """Return how many rows hold what is shown."""
+    """Return how many rows hold the figures."""
     return math.ceil(len(shown) / across)
 
 
@@ -257,7 +257,7 @@ MAPS = 4
 
 
 def numbers(fit: Fit) -> dict[str, Any]:
-    """Return what a page draws a fit from, as JSON can hold it; null where nothing is known.
+    """Return the figures of a fit as JSON; null where nothing is known.
 
     Maps are lists of rows from the lowest y on, Sx beside Sy, or the four images as they lie on the
     detector, in whole percent: of the measured RMS

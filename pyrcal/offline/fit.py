@@ -1,4 +1,4 @@
-"""``pyrcal fit``: from a measured interaction matrix on disk to a registration and a verdict."""
+"""``pyrcal fit``: from a matrix on disk to a registration and a verdict."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ACCEPTED, REFUSED = 0, 1
 
 
 def main(options: argparse.Namespace) -> int:
-    """Fit, say what was found, and return the exit status.
+    """Fit, print the result, and return the exit status.
 
     Raises
     ------

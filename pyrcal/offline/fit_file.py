@@ -1,4 +1,4 @@
-"""From a file and an instrument to a fit: the same way for the command line and for REST."""
+"""Fit the matrix in a file: one way for command line and REST."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def fit_file(
 
 
 def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference, tuple[str, ...]]:
-    """Return what is fitted, and what was decided on the way.
+    """Return the matrix to be fitted, and the decisions made on the way.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
 def _windows_note(
     instrument: Instrument, frames: FrameWindows, flux_frame: NDArray[np.float64]
 ) -> Iterator[str]:
-    """Yield where the pupil images were found, where the instrument does not tell."""
+    """Yield where the pupil images were found, if the instrument file does not say."""
     if frames.centres_px is None:
         centres = frame_windows(instrument, flux_frame).centres_px.reshape(4, 2)
         words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
@@ -107,7 +107,7 @@ def _windows_note(
 
 
 def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
-    """Return the measured slopes, cut from detector frames where that is what was measured."""
+    """Return the measured slopes, cut from detector frames if need be."""
     found = f"{recorded.where}: found shape {recorded.values.shape}"
     if instrument.frames is None:
         if recorded.values.ndim == 3:

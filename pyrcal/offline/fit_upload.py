@@ -1,4 +1,4 @@
-"""Fits of uploads: what came, which of its files is what, and the fit."""
+"""Fit an uploaded matrix, or an archive with its instrument file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _REFERENCE = re.compile(r"(.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::.*)?|(.+):/.+", re
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Upload:
-    """What was uploaded, on disk."""
+    """The files of an upload, on disk."""
 
     reference: Path
     """The measured matrix."""
@@ -44,7 +44,7 @@ class Upload:
 
 
 def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: int) -> Upload:
-    """Return what an upload consists of; a zip archive is unpacked into the empty ``folder``.
+    """Return the files of an upload; a zip archive is unpacked into the empty ``folder``.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, max_bytes: int) -> list[str]
 
 
 def _referred(instrument: Path) -> Iterator[str]:
-    """Yield the file of everything in an instrument file that refers to one."""
+    """Yield every file that an instrument file refers to."""
     try:
         tables = tomllib.loads(instrument.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError):
@@ -150,7 +150,7 @@ def _texts(value: object) -> Iterator[str]:
 
 
 def fit_upload(folder: Path, request: FitRequest) -> None:
-    """Fit what was uploaded into the folder, and write there what came of it.
+    """Fit the upload in the folder, and write the result there.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
 
 
 def _instrument_of(upload: Upload, request: FitRequest) -> tuple[Instrument, tuple[str, ...]]:
-    """Return the instrument that is meant, and what whoever reads the fit should know of it."""
+    """Return the instrument to fit with, and a note for the reader of the fit."""
     if request.asked["instrument"] is not None:
         return packaged_instrument(request.asked["instrument"]), ()
     if upload.instrument is not None:

@@ -1,7 +1,7 @@
-"""What a matrix says of its instrument: the other stop, the coupling of the mirror, the modulation.
+"""Fit coupling and modulation, and try the other stop and normalisation.
 
-The registration is fitted together with the last two; what is found is held against the file. Of
-what is the one or the other (stop, normalisation, kind of influence) the other is tried as well,
+The registration is fitted together with coupling and modulation, and both are compared with the
+file. Of a stop, a normalisation or a kind of influence the other one is tried as well,
 and so are other pupils.
 """
 
@@ -72,7 +72,7 @@ class FoundOptic:
 
     @property
     def found_sigma(self) -> float:
-        """1 σ of what was found, in its own unit; of a width as its logarithm."""
+        """1 σ of the value found, in its own unit; of a width as its logarithm."""
         if self.found is None:
             return self.sigma
         if self.optic is Optic.MODULATION:
@@ -81,12 +81,12 @@ class FoundOptic:
 
     @property
     def key(self) -> str:
-        """Of the instrument file."""
+        """Its key in the instrument file."""
         return FITTED_KEYS[self.optic is Optic.MODULATION]
 
     @property
     def found_words(self) -> str:
-        """What was found, as the file would say it."""
+        """The value found, as the file would write it."""
         if self.found is None:
             wider = np.expm1(self.change)
             side = "wider" if wider > 0.0 else "narrower"
@@ -95,14 +95,14 @@ class FoundOptic:
 
     @property
     def told_words(self) -> str:
-        """What the file says."""
+        """The value in the file."""
         if self.reported is None:
             return "than the instrument file's" if self.found is None else "the file does not say"
         return f"the instrument file says {self.reported:.3g}"
 
     @property
     def notable(self) -> bool:
-        """Whether the file is wrong, as far as the matrix tells."""
+        """Whether the file is wrong, as far as the matrix shows."""
         unknown = self.found is not None and self.reported is None
         return not unknown and abs(self.change) > max(NOTABLE, NOTABLE_SIGMA * self.sigma)
 
@@ -162,7 +162,7 @@ def doubt_of_width(settled: Settled) -> Array:
 
 
 def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple[FoundOptic, ...]:
-    """Return what was found of the instrument; ``models`` are of the one in the file."""
+    """Return coupling and modulation as fitted; ``models`` are of the file's instrument."""
     nuisances = settled.nuisances
     changes = nuisances.changes(settled.solution.nuisances)
     radius = models.instrument.wfs.modulation_lambda_over_d
@@ -185,7 +185,7 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
 
 
 def as_told(models: FitModels, settled: Settled) -> AsTold:
-    """Return the fit with the instrument that the file describes: ``models`` are its."""
+    """Return the fit with the instrument that the file describes; ``models`` are its."""
     nothing = replace(settled.nuisances, optics=())
     there = refine(models, settled.target, settled.solution.vector, nothing)
     return AsTold(

@@ -1,4 +1,4 @@
-"""The light on the four pupil images, from a file: how even it is, where it lies, how turned."""
+"""The light on the four pupil images, read from a file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLUX = "flux"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Light:
-    """What the light tells."""
+    """The pupil images' light: evenness, place, rotation."""
 
     illumination: Illumination
     """For the model's pupil amplitude."""
@@ -41,7 +41,7 @@ class Light:
 
     @property
     def note(self) -> str:
-        """What somebody who fits should know of it, one sentence."""
+        """A note for the reader of the fit, one sentence."""
         (x, y), (sigma_x, sigma_y) = self.position.at, self.position.sigma
         return (
             f"the model is lit as the flux map says; by its light alone the pupil images lie at "

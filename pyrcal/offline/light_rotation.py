@@ -1,4 +1,4 @@
-"""How far the light on the pupil is turned against a reference: a coarse rotation.
+"""A coarse rotation from the light on the pupil.
 
 Only what is not round tells: the shadows of spider arms, or unevenness of the beam. Whether these
 turn with the mirror is the instrument's business: at an adaptive secondary hung from its arms, they

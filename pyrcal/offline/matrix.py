@@ -1,4 +1,4 @@
-"""From a measured interaction matrix to the registration it was measured at."""
+"""From a measured interaction matrix to its registration."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitOptions:
-    """What may be asked of a fit."""
+    """Options of a fit."""
 
     method: Method = Method.JOINT
     """How the registration is found."""
@@ -82,7 +82,7 @@ class FitOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fit(Determination):
-    """Where the mirror is, how sure that is, and whether to believe it.
+    """A fitted registration with its σ and verdict.
 
     The covariance is of noise, the disagreement of subsets and the model-error floor.
     """
@@ -303,7 +303,7 @@ def _axes(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Found:
-    """What one of the methods came to."""
+    """Result of one of the methods."""
 
     settled: Settled
     landing: Landing | None = None

@@ -1,4 +1,4 @@
-"""Three ways from a start to the registration that explains a matrix.
+"""Three methods from a start to the registration of a matrix.
 
 **joint**: all four parameters together (:mod:`service.estimation.solver`), from one start or
 from many.
@@ -123,7 +123,7 @@ class ScanStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Landing:
-    """Where the starts led."""
+    """End of the steps from one or many starts."""
 
     best: Approach
     rivals: tuple[Approach, ...]
@@ -155,7 +155,7 @@ def land(models: FitModels, target: Target, start: Array) -> Landing:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Settled:
-    """Where the fine grid came to rest, and with which models."""
+    """Minimum on the fine grid, and the models used."""
 
     solution: Solution
     target: Target
@@ -169,14 +169,14 @@ class Settled:
 
     @property
     def by_mode(self) -> Array:
-        """``(n_modes,)`` RMS of what is left over, over the RMS of the measurement."""
+        """``(n_modes,)`` RMS of the residual over the RMS of the measurement."""
         left = np.sum(self.solution.projection.residual**2, axis=0)
         power = np.sum(self.target.matrix[self.target.rows] ** 2, axis=0)
         return np.asarray(np.sqrt(left / power))
 
     @property
     def share(self) -> float:
-        """RMS of what is left over, each mode counted alike."""
+        """RMS of the residual, each mode counted alike."""
         return float(np.sqrt(np.mean(self.by_mode**2)))
 
 
@@ -242,7 +242,7 @@ def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
 
 
 def spread(n_modes: int) -> NDArray[np.intp]:
-    """Return the columns that are compared where a few will do, spread over all."""
+    """Return a few columns, spread over all."""
     return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
 
 
@@ -270,7 +270,7 @@ def settle_at(models: FitModels, target: Target, vector: Array, nuisances: Nuisa
 def project_on_sensitivities(
     models: FitModels, target: Target, start: Array, nuisances: Nuisances
 ) -> Settled:
-    """Return where the sensitivities lead from a start, without any search for a better one."""
+    """Return the end of projections on sensitivities from one start."""
     for _ in range(MAX_REPEATS):
         settled = settle(models, target, start, nuisances)
         vector = settled.solution.vector
@@ -281,7 +281,7 @@ def project_on_sensitivities(
 
 
 def scan(models: FitModels, target: Target, start: Array) -> tuple[Array, tuple[ScanStep, ...]]:
-    """Return where the scans lead from a start, and each of them.
+    """Return the end of the scans from a start, and each of them.
 
     ``start`` is ``(4,)`` in numeric units.
     """
@@ -312,7 +312,7 @@ def _known(models: FitModels, target: Target, vector: Array) -> Target:
 
 
 def _other_starts(start: Array) -> list[Array]:
-    """Return starts about one that led nowhere: corners of the range, and turns."""
+    """Return other starts: corners of the range, and turns."""
     corners = [np.array([x, y, 0.0, 0.0]) for x, y in product(_SHIFTS, _SHIFTS)]
     turns = [np.array([0.0, 0.0, turn, 0.0]) for turn in _TURNS_RAD]
     nominal = np.array([0.0, 0.0, start[2], 1.0])

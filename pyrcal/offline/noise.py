@@ -1,4 +1,4 @@
-"""How much of what a fit leaves over is noise, and how much is something that the model has not.
+"""Split what a fit leaves over into noise and structure.
 
 Noise is another in every element; what an instrument does that its file does not say is the same
 thing in many of them. So the singular values of pure noise are spread as Marchenko and Pastur say,
@@ -24,7 +24,7 @@ _POINTS = 4001
 
 
 def structure(residual: Array, power: Array, noise: Array | None) -> float:
-    """Return the RMS of what is left over and is no noise, over the RMS of the measurement.
+    """Return the RMS of the residual that is no noise, over the RMS of the measurement.
 
     What is spread evenly over all directions cannot be told from noise and counts as such.
 
@@ -49,7 +49,7 @@ def structure(residual: Array, power: Array, noise: Array | None) -> float:
 
 
 def noise_sigma(matrix: Array) -> float:
-    """Return 1 σ of the noise in each element of a matrix that holds something else beside it."""
+    """Return 1 σ of the noise in each element of a matrix that holds structure, too."""
     few, many = sorted(matrix.shape)
     values = np.linalg.svd(matrix, compute_uv=False)
     return float(np.median(values) / np.sqrt(many * _median_square(few / many)))

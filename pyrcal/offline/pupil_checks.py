@@ -1,4 +1,4 @@
-"""What a matrix says of the pupil that its instrument file describes: its obscuration, its size.
+"""Try another obscuration and pupil size.
 
 Neither is fitted beside the registration: a pupil that is told wrong shows at its edges only, and
 there uneven light looks alike. What would explain the matrix far better is named instead.
@@ -29,7 +29,7 @@ _STEPS = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PupilNumber:
-    """A number of the instrument file that says what the pupil is."""
+    """A number of the instrument file that describes the pupil."""
 
     key: str
     """In the file."""

@@ -1,4 +1,4 @@
-"""``pyrcal reconstruct``: from a registration to a reconstructor that says what it is made of."""
+"""``pyrcal reconstruct``: from a registration to a reconstructor."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _oriented(instrument: Instrument, fit: KnownFit) -> Instrument:
 
 
 def _modulated(instrument: Instrument, fit: KnownFit) -> Instrument:
-    """Return the instrument with the modulation that the fit found; say what is as it found it."""
+    """Return the instrument with the modulation that the fit found; say so."""
     for key, value in fit.instrument_found.items():
         say(f"note: made with {key} = {value:.3g}, as {fit.origin} found; correct the instrument")
     radius = fit.instrument_found.get(MODULATION_KEY)
@@ -168,7 +168,7 @@ def _basis(instrument: Instrument, fit: KnownFit) -> Basis:
 def _inverted(
     options: argparse.Namespace, fit: KnownFit, model: RtcInteractionModel, matrix: NDArray[Any]
 ) -> tuple[Provenance, NDArray[Any]]:
-    """Return the reconstructor with how it was made, and the matrix that it inverts."""
+    """Return the reconstructor, how it was made, and the matrix that it inverts."""
     gains = None
     if fit.gains is not None and fit.modes is not None and not options.no_gains:
         gains = CalibrationGains.of_modes(fit.gains, fit.modes, model.basis.n_modes)

@@ -1,4 +1,4 @@
-"""What should be known beside the verdict on a fit: what was overruled, and what looks odd."""
+"""Notes beside the verdict: what was overruled, what looks odd."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def remarks(
     found: SlopeRecipe,
     about: Instrument,
 ) -> tuple[str, ...]:
-    """Return what should be known, one sentence each.
+    """Return the notes on a fit, one sentence each.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def _order(reported: SlopeOrder, found: SlopeOrder) -> Iterator[str]:
 
 
 def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
-    """Yield that the sensor sees the mirror's drawing as in a looking-glass."""
+    """Yield that the sensor sees the mirror's drawing mirrored."""
     axes = found.assumed_orientation
     flags = [f"{name} = true" for name in FLIPS if getattr(axes, name)]
     if reported.orientation is None and len(flags) % 2:
@@ -95,7 +95,7 @@ def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
 
 
 def _optics(findings: FitFindings) -> Iterator[str]:
-    """Yield what of the instrument is another than told, or was found because it was unknown."""
+    """Yield coupling and modulation that differ from the file, or that it left unknown."""
     for optic in findings.optics:
         if optic.found is not None and optic.reported is None:
             yield (
@@ -115,7 +115,7 @@ def _optics(findings: FitFindings) -> Iterator[str]:
 
 
 def _light(findings: FitFindings) -> Iterator[str]:
-    """Yield that uneven light explains what is left over."""
+    """Yield that uneven light explains the residual."""
     if findings.structure > MOST_STRUCTURE >= findings.after_light:
         yield (
             f"{findings.structure:.0%} of the signal is left over and no noise; a smooth gain over "

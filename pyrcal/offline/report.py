@@ -1,4 +1,4 @@
-"""A fit together with what it was made from: as a JSON document, as a table, as an HDF5 file."""
+"""A fit and its inputs as JSON, as a table, as HDF5."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from service.model.slopes import FLIPS, Orientation
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitReport:
-    """What was found, from which file, for which instrument."""
+    """A fit with its file and instrument."""
 
     fit: Fit
     method: Method
@@ -93,7 +93,7 @@ def document(report: FitReport) -> dict[str, Any]:
 
 
 def verdict_line(fit: Fit) -> str:
-    """Return the verdict and what was left out, in one line."""
+    """Return the verdict and the columns left out, on one line."""
     if not fit.left_out:
         return fit.verdict
     return f"{fit.verdict}; left out: {'; '.join(fit.left_out)}"
@@ -111,7 +111,7 @@ def _parameters(values: NDArray[np.float64]) -> dict[str, float | None]:
 
 
 def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nested as the array
-    """Return numbers or nested lists of them, None for what is not finite."""
+    """Return numbers or nested lists of them, None for one that is not finite."""
     return np.ma.masked_invalid(np.asarray(values, dtype=np.float64)).tolist()
 
 
@@ -280,7 +280,7 @@ def _provenance(report: FitReport) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KnownFit:
-    """What a reconstructor needs of an earlier fit."""
+    """The part of an earlier fit that a reconstructor needs."""
 
     alpha: Misregistration
     covariance: NDArray[np.float64] | None = None
@@ -319,7 +319,7 @@ class KnownFit:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Provenance:
-    """What a reconstructor was made of: whoever finds it years later can make it again."""
+    """The inputs of a reconstructor, complete enough to make it again."""
 
     recipe: Recipe
     inversion: Inversion
@@ -402,7 +402,7 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
 
 
 def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
-    """Return what was found and is not what the instrument file says."""
+    """Return values that differ from the instrument file's."""
     otherwise = {}
     for key, one in found.items():
         value, told, sigma = one["found"], one["told"], one["sigma"] or 0.0

@@ -1,4 +1,4 @@
-"""How sure a registration is: noise, the disagreement of modes, and errors of the model.
+"""σ of a registration: noise, disagreement of modes, model error.
 
 Noise and everything else that differs from mode to mode shows in how the modes disagree: each is a
 cluster of a sandwich estimate. Errors of the model (uneven light, another mirror) are common to
@@ -61,7 +61,7 @@ MIN_PER_SET = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Uncertainty:
-    """How sure the registration is, and how far sets of modes agree."""
+    """σ of the registration, and how far sets of modes agree."""
 
     covariance: Array
     """``(4, 4)`` of the registration, everything included."""
@@ -103,7 +103,7 @@ def uncertainty(
     residual_fraction: float,
     doubt: Array,
 ) -> Uncertainty:
-    """Return how sure the first four unknowns of a projection at its solution are.
+    """Return the uncertainty of the first four unknowns of a projection at its solution.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""``python -m pyrcal.offline.uploaded FOLDER``: the fit of an upload, as the service starts it.
+"""``python -m pyrcal.offline.uploaded FOLDER``: the process of an uploaded fit.
 
 Nothing large is imported before the process is nice and knows how much memory it may have.
 """
@@ -18,7 +18,7 @@ DONE, FAILED = 0, 2
 
 
 def main(folder: Path) -> int:
-    """Fit what was uploaded into the folder, and return the exit status."""
+    """Fit the upload in the folder, and return the exit status."""
     request = read_request(folder)
     _keep_within(request)
     try:

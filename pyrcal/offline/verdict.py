@@ -1,4 +1,4 @@
-"""Whether to believe a fit: what is asked of it, what to do when it fails, what to know besides.
+"""Decide whether to believe a fit, and say what to do if not.
 
 The residual alone does not decide. Uneven light leaves a third of the signal although the
 registration is right, and a wrong stop leaves a tenth although it is wrong. So sets of modes must
@@ -48,7 +48,7 @@ _PASSES = 0.12
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitFindings:
-    """All that a verdict rests on."""
+    """All that a verdict is based on."""
 
     solution: Solution
     residual_fraction: float
@@ -81,7 +81,7 @@ class FitFindings:
 
 
 def judged(findings: FitFindings) -> tuple[bool, str]:
-    """Return whether the registration is accepted, and the verdict in one line."""
+    """Return whether the registration is accepted, and the verdict on one line."""
     for refusal in (
         findings.axes,
         _unsettled(findings),

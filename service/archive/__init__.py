@@ -1,4 +1,4 @@
-"""Products and their history: immutable HDF5 files, an SQLite index and audit trail.
+"""The archive: immutable HDF5 files, an SQLite index and audit trail.
 
 ::
 

@@ -1,4 +1,4 @@
-"""The archive as the rest of the service sees it."""
+"""The archive as the rest of the service uses it."""
 
 from __future__ import annotations
 

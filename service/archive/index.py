@@ -1,4 +1,4 @@
-"""Where each product is on its way, and who did what, when: SQLite."""
+"""The SQLite index of products, and the audit trail."""
 
 from __future__ import annotations
 
@@ -292,7 +292,7 @@ class Index:
         return done.lastrowid or 0
 
     def asked(self, question: str, values: Values) -> list[Any]:
-        """Return the rows there are, on a connection that only reads: nobody who writes waits."""
+        """Return rows over a connection that only reads; no writer waits."""
         name = f"{self._path.absolute().as_uri()}?mode=ro"
         with self._explained(), closing(sqlite3.connect(name, uri=True)) as connection:
             return connection.execute(question, values).fetchall()

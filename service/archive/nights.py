@@ -1,4 +1,4 @@
-"""What was measured over the nights: every estimate of α, and what happened beside it."""
+"""Every estimate of α over the nights, and the events beside it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MAX_DOWNSAMPLED = 300_000
 
 
 class MarkKind(StrEnum):
-    """What a mark in a chart of α stands for."""
+    """Kinds of marks in a chart of α."""
 
     SWAP = "swap"
     """The RTC uses another reconstructor."""
@@ -96,7 +96,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Night:
-    """What there is of one night."""
+    """Summary of one night."""
 
     date: str
     """UTC, of the noon at which it begins, such as 2026-03-01."""

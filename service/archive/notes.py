@@ -1,4 +1,4 @@
-"""What operators have noted about a moment of the night: it stays beside the measurements."""
+"""Operators' notes about a moment of the night."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies in the archive: reconstructors, measured and noisy interaction matrices."""
+"""The kinds of products: reconstructors, measured and noisy matrices."""
 
 from __future__ import annotations
 

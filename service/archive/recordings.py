@@ -1,4 +1,4 @@
-"""Telemetry that somebody has asked to be kept: recordings, and what is known of each."""
+"""Recordings of telemetry, and what is known of each."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STORED: Final = "stored"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingRecord:
-    """What is known of a recording."""
+    """The record of a recording."""
 
     id: str
     state: str

@@ -1,4 +1,4 @@
-"""What lies in the archive, what of it is kept for ever, and what may go, oldest first."""
+"""Decide what is kept for ever and what may go."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _IN_USE = "the RTC has it, and goes on; it could not be sent again to one that r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RetentionPolicy:
-    """What the user has decided to keep; 0 stands for no limit."""
+    """The user's limits on what is kept; 0: no limit."""
 
     keep_days: float = 0.0
     keep_gb: float = 0.0
@@ -103,7 +103,7 @@ def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
 
 
 def _item(store: Folder, product_id: str, records: Mapping[str, Any]) -> Item:
-    """Return a product; one that somebody has to look at is kept until then."""
+    """Return a product; a damaged one is kept until somebody has seen it."""
     record = records.get(product_id)
     path, fault = store.path_of(product_id), "" if record else "its record is not understood"
     try:
@@ -145,7 +145,7 @@ def due(
 
 
 def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
-    """Remove the numbers of a product, unless it has been pinned meanwhile; return what to tell.
+    """Remove the numbers of a product unless it was pinned meanwhile; return a log line.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]
 
 
 def low_on_space(directory: Path, retention: RetentionPolicy, *, low: bool) -> str | None:
-    """Return what to tell of a disk with little room, None where there is enough.
+    """Return a warning if the disk has little room, else None.
 
     Where it was told of (``low``) a tenth more has to be free before it is over.
 

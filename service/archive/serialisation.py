@@ -1,4 +1,4 @@
-"""Records on the disk as JSON: of products, and of the registration for the next service."""
+"""Records as JSON on disk: products, and α for the next service."""
 
 from __future__ import annotations
 

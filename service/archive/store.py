@@ -1,4 +1,4 @@
-"""What is kept, a folder for each kind; products: immutable HDF5 files, and rows of the index."""
+"""The folders of products: files, and rows of the index."""
 
 from __future__ import annotations
 

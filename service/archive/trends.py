@@ -1,4 +1,4 @@
-"""How the night went between measurements: a sample every few seconds for as long as it ran."""
+"""A sample of the service's state every few seconds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TREND_S = 15.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrendSample:
-    """What the service knew at one moment; where there is no sample there was no service."""
+    """The service's state at one moment; without a sample no service ran."""
 
     t_ns_utc: int
     """When, the service's clock."""

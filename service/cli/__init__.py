@@ -1,1 +1,1 @@
-"""The service's own commands: ``run`` and ``key``, and how a program of pyrcal ends."""
+"""The service's own commands: ``run`` and ``key``."""

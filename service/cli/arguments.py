@@ -1,4 +1,4 @@
-"""What the service's own commands understand: ``run`` and ``key``. Nothing here takes long.
+"""The arguments of ``run`` and ``key``; quick to import.
 
 What the program calls modes and scopes stands here as text; a test compares it.
 """
@@ -76,7 +76,7 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
 
 
 def check_settings(options: argparse.Namespace) -> None:
-    """Refuse an instrument that nobody has, and settings that are not there.
+    """Refuse an unknown instrument, and missing settings.
 
     Raises
     ------

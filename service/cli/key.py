@@ -1,4 +1,4 @@
-"""``pyrcal key``: make, list and revoke the keys of those who may ask a service."""
+"""``pyrcal key``: make, list and revoke API keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a program that ``pyrcal`` starts ends, logs and tells of errors; quickly imported."""
+"""How a program of ``pyrcal`` ends, logs and reports errors."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def imported_and_run(
 
 
 def stop_signal() -> threading.Event:
-    """Return what is set from now on when somebody asks this process to end."""
+    """Return an event that is set when this process is asked to end."""
     stopped = threading.Event()
 
     def stop(_signal: int, _frame: FrameType | None) -> None:

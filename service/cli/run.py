@@ -1,4 +1,4 @@
-"""``pyrcal run``: what the user decides, read and checked before the service is put together."""
+"""``pyrcal run``: read and check the settings, then start."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
 
 
 def _check_keys(settings: Settings) -> None:
-    """Refuse to be asked by other machines before somebody has a key to give orders with.
+    """Refuse to serve other machines before there is a key to give orders with.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which services run on this machine, and where each has its folder: for commands beside them.
+"""Find the services that run on this machine, and their folders.
 
 A service leaves a note for as long as it runs, locked: what is locked by nobody is of one that has
 ended, however it did.
@@ -22,7 +22,7 @@ from service.errors import ConfigurationError
 
 
 class RunningService(NamedTuple):
-    """A service that runs, as its note tells."""
+    """A running service, by its note."""
 
     data_dir: Path
     url: str
@@ -36,7 +36,7 @@ def notes_folder() -> Path:
 
 @contextlib.contextmanager
 def announced(data_dir: Path, url: str) -> Iterator[None]:
-    """Leave a note while the block lasts; a machine that takes none is told in the log."""
+    """Leave a note while the block lasts; log if the machine takes none."""
     folder = notes_folder()
     path = folder / f"{os.getpid()}.json"
     try:
@@ -94,7 +94,7 @@ def data_dir_of_the_one() -> Path | None:
 
 
 def _is_own(folder: Path) -> bool:
-    """Return whether a folder is there that nobody else can have written into."""
+    """Return whether a folder exists that only this user can write into."""
     try:
         known = folder.stat()
     except OSError:

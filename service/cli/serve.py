@@ -1,4 +1,4 @@
-"""The running service: the only place that wires its parts together."""
+"""Wire the parts of the running service together."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def _explain(outcome: BaseException | None) -> None:
 
 
 class _Ending:
-    """Hears SIGINT and SIGTERM, once, and sees to it that the end comes."""
+    """Takes SIGINT and SIGTERM once, and makes sure that the service ends."""
 
     def __init__(self) -> None:
         self.asked = asyncio.Event()

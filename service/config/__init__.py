@@ -1,4 +1,4 @@
-"""What the user decides: the service's settings and the description of the instrument.
+"""Settings and instrument files.
 
 Both are TOML, read strictly: an unknown key, a wrong type or a number out of range is one
 ``ConfigurationError`` of one line that names the file and the key.

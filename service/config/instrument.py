@@ -1,4 +1,4 @@
-"""The instrument file: from TOML to ``service.model.instrument.Instrument``."""
+"""From the instrument file to ``service.model.instrument.Instrument``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every key an instrument file may hold, with its type, range and default."""
+"""Every key of an instrument file: type, range, default."""
 
 from __future__ import annotations
 

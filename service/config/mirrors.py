@@ -1,4 +1,4 @@
-"""The mirror of an instrument file: analytic or measured, with modes of its own or of its user."""
+"""The mirror and modes of an instrument file."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ MirrorSection = Section[MirrorTable]
 
 
 class Pupil(NamedTuple):
-    """What a mirror is seen in."""
+    """Grid and stop of the pupil for a mirror."""
 
     diameter_m: float
     subaperture_m: float
@@ -63,7 +63,7 @@ class Pupil(NamedTuple):
 def read_mirror(
     file: MirrorSection, pupil: Pupil
 ) -> tuple[Mirror | TabulatedModes, tuple[str, ...]]:
-    """Return the mirror of a pupil, and what its owner should be told about it.
+    """Return the mirror of a pupil, and notes for its owner.
 
     Raises
     ------

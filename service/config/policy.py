@@ -1,4 +1,4 @@
-"""The tracker's policy, how far the model leads astray, what the worker may use, what is kept."""
+"""Policies derived from settings: tracker, model error, worker, retention."""
 
 from __future__ import annotations
 

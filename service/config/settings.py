@@ -1,4 +1,4 @@
-"""The service's settings: command line > environment > TOML file > defaults."""
+"""The settings: command line > environment > TOML file > defaults."""
 
 from __future__ import annotations
 

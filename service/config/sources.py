@@ -1,4 +1,4 @@
-"""What the user has written: TOML held against a pydantic schema, and the arrays it refers to.
+"""Read TOML against a pydantic schema, and the arrays it refers to.
 
 Whatever is wrong with either is one line that says where, what was found and what was expected.
 """

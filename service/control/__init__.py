@@ -1,1 +1,1 @@
-"""Registration to reconstructor: inversion, stability, gate. Pure numerics."""
+"""From registration to reconstructor: inversion, stability, gate. Pure numerics."""

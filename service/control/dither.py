@@ -1,4 +1,4 @@
-"""Which modes to dither, how much, how often, and on which lines.
+"""Choose a dither: modes, amplitude, length of windows, lines.
 
 **Which**: a mode whose waves are long answers a mirror that is far out of place almost as it
 should, so that steps lead home from afar; one whose waves are short says precisely where the
@@ -32,7 +32,7 @@ NEARLY_BEST = 1.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DitherRequirement:
-    """What is asked of the dither, and what it may cost."""
+    """The σ asked of the dither, and its budget."""
 
     sigma: Array
     """``(4,)`` 1 σ of α to be kept at all times, numeric units, model error not included."""
@@ -222,7 +222,7 @@ SPAN = 100
 
 
 def information(linearisation: Linearisation) -> Array:
-    """Return what each mode tells of α, ``(n_modes, 4, 4)``, per metre² of dither and unit noise.
+    """Return the information of each mode on α, ``(n_modes, 4, 4)``, per metre² and unit noise.
 
     The Fisher information of white slope noise, a free gain of the mode taken out:
     ``J^T J`` with ``J_k = (I - P) dD/dα_k``, P the projection on the mode's own response.

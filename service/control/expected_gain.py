@@ -1,4 +1,4 @@
-"""What a reconstructor for the present registration would win over the one in use.
+"""Predict what a new reconstructor would win.
 
 The linear model of the loop: turbulence ``φ`` on every mode of the basis, slopes
 ``s = D(α) G (φ + c) + n``, integrator ``c = -H g R s`` with ``H = z^-d / (1 - leak z^-1)``. With
@@ -47,7 +47,7 @@ _STEEPNESS = 17.0 / 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sky:
-    """What the loop works against."""
+    """Turbulence and noise that the loop works against."""
 
     variance_m2: Array
     """``(n_basis,)`` variance of the turbulence on each mode, metres² OPD."""
@@ -64,7 +64,7 @@ class Sky:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExpectedGain:
-    """What is lost with the reconstructor in use, by the linear model of the loop."""
+    """Loss with the reconstructor in use, by the linear model of the loop."""
 
     loss_m: float
     """Wavefront error above that with a new reconstructor, metres RMS; infinite: unstable."""

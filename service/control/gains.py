@@ -1,4 +1,4 @@
-"""Gains of the modes, each kind kept apart from the others.
+"""Calibration gain, optical gain and passes, kept apart.
 
 Three factors stand between the model's D and what a sensor shows, and none may hide in another:
 
@@ -38,7 +38,7 @@ _NEIGHBOURS = 25
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CalibrationGains:
-    """How much of the model's response a measured matrix shows, for every mode of the basis."""
+    """Measured over modelled response, for every mode of the basis."""
 
     values: Array
     """``(n_basis,)`` measured over the model's, passes divided out; near 1."""

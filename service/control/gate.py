@@ -1,4 +1,4 @@
-"""The stability gate: what keeps a bad matrix off the telescope.
+"""The stability gate: refuse a matrix that may be unstable.
 
 It asks two things of a loop, over the whole range in which α may be. Its poles must stay inside
 the unit circle with a margin. And slope noise must not move the outer ring of the mirror too far:

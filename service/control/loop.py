@@ -1,4 +1,4 @@
-"""The loop that a reconstructor runs in, and its poles."""
+"""The poles of the loop that a reconstructor runs in."""
 
 from __future__ import annotations
 

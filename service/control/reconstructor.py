@@ -102,7 +102,7 @@ def checked_columns(interaction_matrix: NDArray[Any], n_modes: int) -> NDArray[n
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Prior:
-    """What is known before any slope is: how large the modes are, and how noisy the slopes."""
+    """Sizes of the modes and noise of the slopes, known beforehand."""
 
     variance_m2: Array
     """``(n_basis,)`` expected variance of each mode, metres² OPD; a KL basis knows it."""
@@ -168,7 +168,7 @@ def invert_with_prior(interaction_matrix: NDArray[Any], n_modes: int, prior: Pri
 
 
 class InversionMethod(StrEnum):
-    """How an interaction matrix is inverted."""
+    """Ways to invert an interaction matrix."""
 
     SVD = "svd"
     """Least squares; singular values too weak are left out."""
@@ -192,7 +192,7 @@ class Recipe:
 
     @property
     def method(self) -> InversionMethod:
-        """How it is done: what is known beforehand is used."""
+        """The method: MAP if there is a prior."""
         return InversionMethod.SVD if self.prior is None else InversionMethod.MAP
 
 

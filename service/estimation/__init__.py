@@ -1,1 +1,1 @@
-"""Telemetry to registration. Pure numerics: no clock, log, file or thread."""
+"""From telemetry to registration. Pure numerics: no clock, log, file or thread."""

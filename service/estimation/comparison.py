@@ -1,4 +1,4 @@
-"""Two stretches of telemetry compared, each under a matrix of its own.
+"""Compare telemetry before and after a swap.
 
 Numbers are from docs/results/probation.md.
 """
@@ -45,7 +45,7 @@ SLOPES, OUTER, INNER = -3, -2, -1
 
 
 class Verdict(StrEnum):
-    """What came of a comparison."""
+    """Outcome of a comparison."""
 
     AS_GOOD = "as-good"
     WORSE = "worse"
@@ -127,7 +127,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Before:
-    """What there is of the matrix before."""
+    """Telemetry under the matrix before."""
 
     id: str
     modes: NDArray[np.intp]

@@ -1,4 +1,4 @@
-"""Which loop the commands show: ``c[k+1] = leak c[k] - sum_d h_d (R s)[k+1-d]``.
+"""Fit the loop to the commands: ``c[k+1] = leak c[k] - sum_d h_d (R s)[k+1-d]``.
 
 A few modes are followed, on every frame. An RTC that does what it says leaves nothing over: its
 commands follow from slopes and commands before them to the last digit. So the leak, the gain and
@@ -129,7 +129,7 @@ class ControlLawCheck(Detector):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentifiedLaw:
-    """What the frames say of the loop, and what was told."""
+    """The loop that the frames show, and the one in the status."""
 
     leak: float
     gain: float
@@ -250,7 +250,7 @@ def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> Iden
 
 
 def _hint(gain: float) -> str:
-    """Return what a gain that no loop has looks like."""
+    """Return a likely cause of a gain that no loop has."""
     if gain < 0.0:
         return ": slopes or commands have the other sign than the matrix that the RTC names"
     unit = unit_like(max(gain, 1.0 / max(gain, 1e-30)), 1.0)

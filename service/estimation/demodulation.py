@@ -1,4 +1,4 @@
-"""Sums of telemetry at lines and at many frequencies beside each, by way of a few smooth shapes.
+"""Demodulate telemetry at lines and at frequencies beside them.
 
 Against its line every bin beside it turns slowly: within a stretch of frames the window's weight
 ``h_k``, ``h_k cos(v k)`` and ``h_k sin(v k)``, whatever the offset v, are combinations of a few

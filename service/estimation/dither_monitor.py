@@ -1,4 +1,4 @@
-"""What the frames hold of a dither: whether it is what was asked for, whether the slopes answer.
+"""Measure the dither in the frames, and the slopes' answer to it.
 
 The telemetry has the dither's part of every command in columns of its own, and modes outside the
 loop move by nothing else. Once a second the strength of each mode, on its line, is compared with
@@ -58,7 +58,7 @@ _nothing = partial(np.zeros, (), np.float32)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherMeasurement:
-    """What a second of frames holds of a dither."""
+    """The dither in one second of frames."""
 
     found_m: float
     """RMS of all modes together, metres OPD."""
@@ -274,7 +274,7 @@ def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
 
 
 def _unanswered(powers: tuple[float, float, float], asked: ExpectedDither) -> str | None:
-    """Return how the slopes do not answer the dither; empty: they do; None: nobody can tell."""
+    """Return how the slopes fail to answer the dither; empty: they answer; None: unknown."""
     beyond, variance, expected = powers
     if not expected:
         return None
@@ -337,7 +337,7 @@ def _outside_tolerance(
 
 
 def _strays(stray: Array, wanted_m: float) -> list[str]:
-    """Return which modes carry a dither that nobody asked for."""
+    """Return the modes that carry a dither without a request."""
     together = float(np.sqrt(np.sum(stray**2)))
     if together <= STRAY * wanted_m:
         return []

@@ -1,4 +1,4 @@
-"""What telemetry says of the registration, whichever way it was looked at.
+"""One estimate of the registration, from any estimator.
 
 Every estimator cuts telemetry into windows, or forgets the old of it, in constant memory. Its fit
 says what it found of α, how sure it is by the scatter of the data themselves, and how well the
@@ -33,7 +33,7 @@ turns it, too: by up to 1 deg at a scatter of 0.4, in OOPAO's loops."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimate(Determination):
-    """What one look at telemetry says of the registration.
+    """One estimate of the registration from telemetry.
 
     The covariance is of the scatter of the data; no model error is in it.
     """

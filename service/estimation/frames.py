@@ -1,4 +1,4 @@
-"""Telemetry as the estimators see it: frames of one session, contiguous, of one reconstructor."""
+"""Telemetry as estimators take it: contiguous frames of one session and matrix."""
 
 from __future__ import annotations
 

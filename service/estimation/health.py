@@ -1,4 +1,4 @@
-"""Whether the loop holds, whether the mirror's edge is where it was, and what vibrates.
+"""Watch the loop, the mirror's edge, and vibrations.
 
 **The loop** is watched on the commands of the highest controlled modes: a mis-registered loop goes
 unstable there first, while slopes and wavefront error look healthy almost to the end.
@@ -96,7 +96,7 @@ class LoopHealth(Detector):
 
     @property
     def unit(self) -> str:
-        """What the unit of absurd commands looks like."""
+        """The likely unit of absurd commands."""
         unit = unit_like(max(self.ratio, 1.0), 2.1)
         if not unit:
             return "they are in another unit than metres of OPD, or decoded wrongly"
@@ -201,7 +201,7 @@ class EdgeHealth(Detector):
 
 
 def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> EdgeHealth:
-    """Return the health after one more block, of which a frame now and then is looked at."""
+    """Return the health after one more block, of which some frames are used."""
     n_frames = np.diff([*range(0, block.n_frames, LOOK_FRAMES), block.n_frames])
     moved = block.commands_m[np.cumsum(n_frames) - 1][:, watch.modes]
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
@@ -316,7 +316,7 @@ class SlopeSpectra:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class VibrationMonitor(Detector):
-    """What vibrates while no dither plays, and under one.
+    """Finds vibrations with and without a dither: feed it blocks with ``update``.
 
     Apart, because only a pause tells a vibration from a dither that plays on it.
     """

@@ -1,4 +1,4 @@
-"""The registration and the bias of its passive estimate, followed together.
+"""One Kalman filter for α and the bias of passive estimates.
 
 Under frozen flow the passive watchdog reads ``α + b``: a look scatters by 0.3 to 0.5 % of a
 subaperture and is wrong by up to 9 % on the diffractive telescope, 24 % on the linear plant
@@ -72,7 +72,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drift:
-    """How fast what is followed may change."""
+    """Rates of change of α and bias."""
 
     alpha_rate: Array
     """``(4,)`` random walk σ after one second, numeric units."""
@@ -102,7 +102,7 @@ def forget(joint: Joint, excess: Array | None = None) -> Joint:
 
 
 def allowing(joint: Joint, excess: Array) -> Joint:
-    """Return the estimate as a look finds it whose scatter tells of so much excess.
+    """Return the estimate with its covariance enlarged by so much excess scatter.
 
     Only what is more than looks before have told is added: a steady wind adds it once, and what
     has been learnt of the bias stays learnt.
@@ -153,7 +153,7 @@ def corrected(prior: Joint, measured: Array, noise: Array, sees: Array = DITHERE
 
 
 def scattered(joint: Joint, innovation: float) -> Joint:
-    """Return the estimate after a look that lay so far, 4 expected, with ``scatter`` allowed for.
+    """Return the estimate after an innovation, 4 expected, with ``scatter`` learnt from it.
 
     In fast wind the bias swings from look to look, and looks scatter by more than they say.
     """
@@ -175,7 +175,7 @@ def learnt(scatter: float, innovation: float) -> float:
 
 
 def widened(prior: Joint, noise: Array) -> Joint:
-    """Return what is known when α has moved at once, by how much the next measurement must tell.
+    """Return the state after a jump of α; the next measurement must say how far.
 
     The bias is kept: the wind has not moved with the mirror.
     """

@@ -1,4 +1,4 @@
-"""The mean light of the four pupil images: where they lie, how evenly lit, where a fit starts.
+"""Find the pupil images in their mean light.
 
 With the mirror as stop the outline and the obscuration move with the shift, so their edges are a
 start for a fit, before any matrix is looked at. The light inside the outline may be uneven: it is
@@ -62,7 +62,7 @@ _FLOOR_SUBAP = 0.02
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PupilPosition:
-    """Where the pupil images lie, all four alike."""
+    """Position of the pupil images, all four alike."""
 
     at: tuple[float, float]
     """x and y of their centre from that of the sensor's grid, subapertures."""

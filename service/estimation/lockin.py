@@ -1,4 +1,4 @@
-"""Registration from windows of sines: demodulation at the lines, then a fit of what stands there.
+"""Registration from windows of sines.
 
 Telemetry is demodulated, as it comes, at the dither's frequencies and beside them, where the noise
 is read off. The command carries turbulence, so regressing slopes on commands is biased (by 6 % of a
@@ -39,7 +39,7 @@ parts per million. The Hann window keeps what that costs below 1e-4 of the ampli
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LockInPlan(WindowPlan):
-    """What is demodulated: one sinusoid on each of a few modes.
+    """The lines to demodulate: one sinusoid on each of a few modes.
 
     A window is an integer number of periods of every frequency.
     """
@@ -78,7 +78,7 @@ class LockInPlan(WindowPlan):
 
     @property
     def demodulation(self) -> DemodulationBank:
-        """What a window is summed with."""
+        """The demodulation of a window."""
         return DemodulationBank(
             lines_hz=self.frequencies_hz, frame_rate_hz=self.frame_rate_hz, n_frames=self.n_frames
         )
@@ -220,7 +220,7 @@ MAX_LAG_FRAMES = 0.2
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LockInEstimate(DitheredEstimate):
-    """What one window of sines says of the registration.
+    """Registration from one window of sines.
 
     Gains and lags are of the lines: complex, for a lag turns a line's phase. The misfit is the
     residual power at the lines over that at the side bins.

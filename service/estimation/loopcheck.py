@@ -1,4 +1,4 @@
-"""Whether the commands obey the loop that the RTC tells: ``c[k+d] = leak c[k+d-1] - g R s[k]``.
+"""Compare commands with the RTC's loop law ``c[k+d] = leak c[k+d-1] - g R s[k]``.
 
 Telemetry holds the commands after clipping, and names the reconstructor, gains and delay that made
 them. Where they do not follow from the slopes the mirror is saturated, or the RTC's account of
@@ -186,7 +186,7 @@ class _Batch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CommandResidual:
-    """How far each mode follows the loop."""
+    """How far each mode departs from the loop law."""
 
     share: NDArray[np.float64]
     """``(n_controlled,)`` of the steps asked for; 1: obeys, NaN: was asked for none."""
@@ -280,7 +280,7 @@ def last_samples(check: LoopCheck, before_seq: int) -> tuple[int, int] | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Products:
-    """All that samples tell of how modes obey: sums of their products over the samples."""
+    """Sums of products over the samples, enough to judge every mode."""
 
     n_samples: int
     asked: Array

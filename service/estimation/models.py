@@ -1,4 +1,4 @@
-"""The models of one fit: from coarse and cheap to as fine as the answer needs.
+"""The models of one fit, from coarse to fine.
 
 The smoothest shapes that a set of modes can make lead from afar. The lowest Karhunen-Loeve modes
 are such shapes already; a user's own modes, or single actuators, must be combined. The combination
@@ -60,7 +60,7 @@ MODULATION_STEP = 0.05
 
 
 class Optic(StrEnum):
-    """A number of the instrument that the matrix itself can tell, by its logarithm."""
+    """A number of the instrument that a matrix can determine, by its logarithm."""
 
     WIDTH = "width"
     """Of the influence functions: their coupling, where they have one."""
@@ -152,7 +152,7 @@ class FitModels:
 
     @property
     def optics(self) -> tuple[Optic, ...]:
-        """What of the instrument is fitted beside the registration."""
+        """Numbers of the instrument fitted beside the registration."""
         found = []
         if self.coupling is not None:
             found.append(Optic.WIDTH)
@@ -162,13 +162,13 @@ class FitModels:
 
     @property
     def unknown(self) -> frozenset[Optic]:
-        """What of it the instrument file says to be unknown."""
+        """Numbers that the instrument file calls unknown."""
         keys = {Optic.WIDTH: "mirror.coupling", Optic.MODULATION: "wfs.modulation_lambda_over_d"}
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
 
     @property
     def coupling(self) -> float | None:
-        """Of the influence functions; None: they have none."""
+        """Coupling of the influence functions; None: they have none."""
         surface = self.basis.surface if isinstance(self.basis, ModalBasis) else None
         return surface.coupling if isinstance(surface, Gaussian) else None
 

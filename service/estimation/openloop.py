@@ -1,4 +1,4 @@
-"""Registration from nothing known: a few smooth modes dithered with the loop open.
+"""Registration from far away: smooth modes dithered with the loop open.
 
 With the loop open a dithered line is a measured column of the interaction matrix, so that no loop
 has to be known, let alone be stable, and the fit is that of a small matrix: Gauss-Newton steps,
@@ -41,7 +41,7 @@ LARGEST_GAIN = 3.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WideCaptureEstimate:
-    """Where the mirror is, from one window with the loop open."""
+    """Registration from one window with the loop open."""
 
     estimate: LockInEstimate
     """Its covariance is the noise's alone."""
@@ -55,7 +55,7 @@ class WideCaptureEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WideCaptureSearch:
-    """Where to look, and with what."""
+    """Range and models of the search."""
 
     coarse: InteractionModel
     """Of the dithered modes alone, columns in the order of the lines. Coarse: leads."""

@@ -1,4 +1,4 @@
-"""Axes and signs of an RTC's slopes, and the rough rotation of the mirror, from its lowest orders.
+"""Find axes and signs of slopes, and a rough rotation, from the lowest modes.
 
 Which way the RTC counts rows and columns, which light it counts as positive and how the mirror is
 turned all show in tip, tilt and the few shapes after them. The gains of all shapes share one sign
@@ -57,7 +57,7 @@ class Pose:
 
     @property
     def turned_class(self) -> tuple[SlopeOrder, int, int, bool]:
-        """What remains of it when quarter turns of everything do not count."""
+        """The class of poses that differ by quarter turns of everything."""
         axes = self.slopes.assumed_orientation
         return self.slopes.order, axes.sign_x, axes.sign_y, self.mirrored
 
@@ -93,7 +93,7 @@ def sign_written(axes: Orientation) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
-    """What the lowest orders say."""
+    """Result of the search over orientations."""
 
     best: Pose
     ties: tuple[Pose, ...]
@@ -101,7 +101,7 @@ class Search:
 
     @property
     def refusal(self) -> str:
-        """Why no orientation can be told; empty: one can."""
+        """Why no orientation is clear; empty: one is."""
         if self.best.correlation < MIN_CORRELATION:
             return (
                 f"no orientation of the slopes explains the lowest orders (correlation "
@@ -225,7 +225,7 @@ def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Turned:
-    """What a coarse model says of the lowest orders at every rotation."""
+    """A coarse model's lowest modes at every rotation."""
 
     lowest: LowOrder
     columns: Array

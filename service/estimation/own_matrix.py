@@ -1,4 +1,4 @@
-"""Which modes the RTC's own matrix controls, in which order, with which sign and how strongly.
+"""Recognise the modes in the RTC's own matrix: order, sign, strength.
 
 An RTC whose mode 10 has the other sign, or whose modes 3 and 40 are exchanged, closes its own loop
 as well as any other: its matrix knows. A matrix made by the model would drive that one mode apart.
@@ -66,7 +66,7 @@ LineariseAt = Callable[[Misregistration], Linearisation]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OwnMatrix:
-    """What the RTC's own matrix says of each mode that it controls."""
+    """The modes that the RTC's own matrix controls, as the model recognises them."""
 
     alpha: Misregistration
     """Registration at which the model explains most of its columns."""
@@ -125,7 +125,7 @@ class OwnMatrix:
 
     @property
     def text(self) -> str:
-        """What an operator should know of it, in one sentence."""
+        """A sentence for the operator."""
         if self.wrong:
             return self.wrong
         size = self.typical_response

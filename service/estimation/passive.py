@@ -1,4 +1,4 @@
-"""What ordinary telemetry, without a dither, says of the registration.
+"""Registration from ordinary telemetry, without a dither.
 
 Turbulence sits below a tenth of the frame rate, and there commands and slopes have it in common: a
 regression of one on the other is biased, by a third of a subaperture on a bright star in 20 m/s.
@@ -340,7 +340,7 @@ def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveMatrix:
-    """What the telemetry makes of the interaction matrix."""
+    """The interaction matrix that ordinary telemetry shows."""
 
     matrix: NDArray[np.float64]
     """``(n_slopes, n_modes)`` of the controlled modes, slope per metre OPD."""

@@ -1,4 +1,4 @@
-"""Whether the loop is worse with a matrix than with the one before, seeing taken into account.
+"""Decide whether the loop is worse than before the swap.
 
 A matrix at the edge of stability makes a few modes ring near a tenth of the frame rate, while
 slopes and wavefront error hardly change: a pyramid that saturates holds what runs away. So every
@@ -191,7 +191,7 @@ def _reader(reader: Reader | None, matrix: NDArray[np.float32] | None) -> Reader
 
 
 def _note_runaway(state: Comparison, block: FrameBlock) -> Comparison:
-    """Look at the slopes frame by frame: a loop that is lost at once waits for no part."""
+    """Check the slopes frame by frame: a loop that is lost at once waits for no part."""
     before = state.before
     if before is None or not before.peak or block.cm_id is None or state.returned:
         return state

@@ -1,4 +1,4 @@
-"""Registration from windows of random signs, by way of a noisy interaction matrix.
+"""Registration from random signs, by a noisy interaction matrix.
 
 White dither on some modes, or on all: what the slopes have in common with it is the interaction
 matrix (DO-CRIME, Lai et al. 2021). It is a measurement to fit a model to, never one to control
@@ -49,7 +49,7 @@ LATE_MODES = 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomPlan(WindowPlan):
-    """What is correlated: the same amplitude, a random sign per frame, on each mode."""
+    """The random dither to correlate with: one amplitude, a random sign per frame and mode."""
 
     def __post_init__(self) -> None:
         """Refuse a window that is too short for its modes.
@@ -256,7 +256,7 @@ class NoisyMatrix:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RandomEstimate(DitheredEstimate):
-    """What one window of random dither says of the registration.
+    """Registration from one window of random signs.
 
     Its lag ``(1,)`` is the share of the response that comes one frame late.
     """

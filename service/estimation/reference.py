@@ -1,4 +1,4 @@
-"""A measured interaction matrix: as it came, checked, and turned into what a fit is fitted to."""
+"""Check a measured interaction matrix and prepare it for a fit."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Reference:
 
     @property
     def passes(self) -> int:
-        """How often the light met the mirror."""
+        """Number of times the light met the mirror."""
         return 2 if self.double_pass else 1
 
 

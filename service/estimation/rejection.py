@@ -1,4 +1,4 @@
-"""How much a closed loop leaves of what it follows: whether it holds well, whatever α may be."""
+"""How well a closed loop rejects turbulence."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Rejection(Detector):
 
     @property
     def holds(self) -> bool | None:
-        """Whether the loop holds well; None: too little has come to tell."""
+        """Whether the loop holds well; None: too little telemetry."""
         if self.residual is None or self.commanded is None or self.lasts_s < MEMORY_S:
             return None
         commanded = np.maximum(self.commanded, 1e-40)

@@ -1,4 +1,4 @@
-"""How large the residual is that a loop leaves, with the seeing taken out.
+"""The size of the loop's residual, seeing taken out.
 
 A matrix that is believed reads the residual from the slopes, whichever matrix closes the loop. With
 the command taken off, it is the turbulence itself; how far that moves in a few hundredths of a
@@ -89,7 +89,7 @@ class Reader:
         return cls(matrix=matrix, seq=np.zeros(0, np.int64), turbulence_m=none)
 
     def read(self, block: FrameBlock) -> tuple[Reader, Residual | None]:
-        """Return what a block holds; None: none of its frames is looked at."""
+        """Return the residual in a block; None: it uses none of its frames."""
         rows = np.arange(-block.first_seq % STRIDE, block.n_frames, STRIDE)
         if not len(rows):
             return self, None
@@ -122,7 +122,7 @@ class ResidualLevel:
 
     @classmethod
     def of(cls, parts: tuple[Residual, ...]) -> ResidualLevel | None:
-        """Return what these parts come to; None: they are too few to tell."""
+        """Return the level of these parts; None: they are too few."""
         total = total_of(parts)
         groups = [total_of(parts[k : k + GROUP]) for k in range(0, len(parts) - GROUP + 1, GROUP)]
         if total is None or not total.n_moved or len(groups) < 2:

@@ -1,4 +1,4 @@
-"""Whether an RTC's slopes and commands are what the instrument file says they are.
+"""Check the RTC's slopes and commands against the instrument file.
 
 An RTC whose slopes have the other sign, other axes or another order, or whose commands are in
 nanometres, closes its own loop as well as any other: what it says agrees with itself. Only beside
@@ -66,7 +66,7 @@ _UNIT_DECADES = 1.4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeConvention:
-    """What was found of an RTC's slopes and commands."""
+    """The RTC's order, signs and unit as its matrix shows them."""
 
     wrong: str = ""
     """What was found, what was told, and what to write; empty: they are as told."""
@@ -195,7 +195,7 @@ def _reported(instrument: Instrument) -> SlopeRecipe:
 
 
 def _n_changes(setting: SlopeRecipe, reported: SlopeRecipe) -> int:
-    """Return how much of what was told a setting contradicts."""
+    """Return how many stated keys a setting contradicts."""
     axes, told_axes = setting.assumed_orientation, reported.assumed_orientation
     names = (*FLIPS, "sign_x", "sign_y")
     changed = sum(bool(getattr(axes, name) != getattr(told_axes, name)) for name in names)
@@ -205,7 +205,7 @@ def _n_changes(setting: SlopeRecipe, reported: SlopeRecipe) -> int:
 
 
 def _axes_named(witness: str, found: SlopeRecipe, reported: SlopeRecipe) -> str:
-    """Return which of the axes, signs and orders are others than told, and what to write."""
+    """Return which axes, signs and orders differ from the file, and what to write."""
     axes, told_axes = found.assumed_orientation, reported.assumed_orientation
     differ = []
     if found.order != reported.order:

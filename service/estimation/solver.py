@@ -1,4 +1,4 @@
-"""The registration that explains measured columns: variable projection, step by step.
+"""Fit the registration to measured columns: variable projection.
 
 Every mode has a gain of its own, which is linear and therefore known once the rest is:
 ``g_j = D_j·Y_j / D_j·D_j``. What remains is a problem in the registration alone, with the Jacobian
@@ -151,7 +151,7 @@ class Projection:
 
     @property
     def chi_at_best(self) -> float:
-        """What is left of it at the best step to first order."""
+        """χ² at the best step to first order."""
         return self.chi - float(self.scores.sum(axis=1) @ self.best_step)
 
     @property
@@ -182,7 +182,7 @@ class Projection:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Approach:
-    """Where a start led on the coarse grid."""
+    """Minimum on the coarse grid."""
 
     vector: Array
     """``(4,)`` numeric units."""
@@ -345,7 +345,7 @@ def nuisances_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
-    """Where the fine grid came to rest."""
+    """Minimum on the fine grid."""
 
     vector: Array
     """``(4,)`` numeric units."""

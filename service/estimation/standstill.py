@@ -1,4 +1,4 @@
-"""Whether the slopes stand still: a camera that repeats its last image, or gives none."""
+"""Detect slopes that stand still."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Standstill(Detector):
 
     @property
     def text(self) -> str | None:
-        """What is the matter, since when, and what to do; None: nothing, or not for long."""
+        """Text of the alarm: what stands still, since when, what to do; None: nothing."""
         if self.lasts_s < ALARM_S:
             return None
         what = "are the same in every frame" if self.slopes.any() else "are all zero"

@@ -1,4 +1,4 @@
-"""Windows: equal runs of telemetry in a closed loop, cut as a dither allows; why one is refused."""
+"""Cut telemetry into windows, and say why one is refused."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ AMPLITUDE_RATIO = (0.5, 1.5)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindowPlan:
-    """What is known of the windows of a dither before they begin."""
+    """Length and conditions of a dither's windows."""
 
     modes: tuple[int, ...]
     """0-based basis indices."""

@@ -1,4 +1,4 @@
-"""Measured matrices in files, and what was found in them as JSON, text and figures.
+"""Measured matrices and telemetry in files.
 
 The fit itself is ``pyrcal.offline``; nothing here decides anything about it. This module looks at
 what a user asks of one, in the words of the command line and of REST, and at what a file cannot be,

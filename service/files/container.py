@@ -1,4 +1,4 @@
-"""HDF5, FITS and NumPy files as one thing, and the measured interaction matrix in one.
+"""Read HDF5, FITS and NumPy files alike.
 
 Their arrays have names and can be looked at before they are read.
 """
@@ -116,7 +116,7 @@ class Container:
 
 
 class _ImageHdu(Protocol):
-    """What is used of astropy's, which has no type information."""
+    """The used part of astropy's HDU, which has no type information."""
 
     shape: tuple[int, ...]
     header: Mapping[str, Any]
@@ -305,7 +305,7 @@ FLUX_FRAME = "flux_frame"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recorded:
-    """What was read; nothing has been turned, scaled or left out."""
+    """The arrays as read; nothing is turned, scaled or left out."""
 
     values: Array
     """``(n_slopes, n_modes)`` in the RTC's own order, or ``(n_modes, ny, nx)`` detector frames."""

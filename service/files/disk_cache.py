@@ -1,4 +1,4 @@
-"""What takes seconds to compute and is always the same, kept on disk: modes, a linearisation.
+"""Cache on disk what takes seconds: modes, a linearisation.
 
 A file is found by a digest of all that its numbers depend on, the code of the model included, so
 that none is ever out of date; one that is damaged is made again. Several processes may share the
@@ -41,7 +41,7 @@ _ABANDONED_S = 3600.0
 
 
 def usual_folder(environment: Mapping[str, str]) -> Path:
-    """Return where things are kept unless somebody says otherwise."""
+    """Return the default cache folder."""
     told = environment.get(VARIABLE)
     if told:
         return Path(told)

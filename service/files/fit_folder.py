@@ -1,4 +1,4 @@
-"""The folder of a fit: what the service asks of ``pyrcal fit``, and what that answers, as files.
+"""The folder of an uploaded fit: request and answer as files.
 
 The service writes :data:`UPLOAD` and :data:`REQUEST` and starts the program with the folder as its
 only word. While it runs it names its stage in :data:`STAGE`. When it ends with status 0 there are
@@ -34,7 +34,7 @@ FIGURES = "figures.json"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitRequest:
-    """What is to be fitted, how, and with how much of this machine."""
+    """A fit to run, its options, and its limits on this machine."""
 
     asked: Mapping[str, Any]
     """As ``POST /v1/fits`` names it: dataset, method, modes, start, gain_map, anamorphosis,

@@ -1,4 +1,4 @@
-"""Recordings of telemetry: the wire's messages, byte for byte, written, held in memory, read back.
+"""Recordings of telemetry: write, hold in memory, read back, byte for byte.
 
 Layout (version 1), HDF5. Everything grows by appending; nothing is ever rewritten::
 
@@ -67,7 +67,7 @@ OVERHEAD_BYTES = 200
 
 
 class RecordedKind(IntEnum):
-    """What a recorded message is."""
+    """Kinds of recorded messages."""
 
     FRAMES = 0
     STATUS = 1
@@ -88,7 +88,7 @@ class Message(NamedTuple):
 
     @property
     def n_bytes(self) -> int:
-        """Of payload and attachment."""
+        """Size of payload and attachment."""
         return len(self.payload) + len(self.attachment)
 
 

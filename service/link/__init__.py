@@ -1,4 +1,4 @@
-"""Parts of the link to the RTC: everything ``service.rtc_bridge`` puts together.
+"""Parts of the link that ``service.rtc_bridge`` puts together.
 
 ``session`` is the only module that calls zenoh; the rest can be tried without a network. The
 callbacks of zenoh's threads end in :class:`~service.link.intake.Intake`, which takes a lock for

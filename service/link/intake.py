@@ -1,4 +1,4 @@
-"""Everything the RTC sends, judged, counted and put where the consumer finds it."""
+"""Judge and count what the RTC sends, and queue it for the service."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ PLACED: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Arrived:
-    """A batch of telemetry that nobody has looked at."""
+    """A batch of telemetry, not decoded yet."""
 
     payload: bytes
     attachment: bytes | None
@@ -69,7 +69,7 @@ class _Arrived:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Put:
-    """An event that nobody has fetched."""
+    """An event that waits to be fetched."""
 
     event: LinkEvent
     ring: FrameRing | None
@@ -83,7 +83,7 @@ class Intake:
     """Takes what zenoh's threads bring; every method may be called from any thread."""
 
     def __init__(self, endpoint: Endpoint, clock: Callable[[], float] = time.monotonic) -> None:
-        """Keep the settings; memory for frames is taken when the first batch tells their size.
+        """Keep the settings; memory for frames is allocated with the first batch.
 
         Parameters
         ----------
@@ -143,7 +143,7 @@ class Intake:
         recoverable: bool = False,
         latency_s: float | None = None,
     ) -> None:
-        """Take a batch of telemetry; whether it is sound is seen when somebody asks what has come.
+        """Take a batch of telemetry; it is checked when the consumer drains.
 
         Parameters
         ----------

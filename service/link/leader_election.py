@@ -1,4 +1,4 @@
-"""Who counts of several: which RTC session is the RTC's, and which service drives it."""
+"""Which RTC session counts, and which service drives it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ REMEMBERED: Final = 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionDecision:
-    """What to do with a message of some session."""
+    """Verdict on a message of a session."""
 
     accepted: bool
     """Whether it belongs to the session that counts."""
@@ -75,7 +75,7 @@ class SessionWatch:
         self._other_sessions: dict[str, float] = {}
 
     def admit(self, session: str, now_s: float) -> SessionDecision:
-        """Judge a message by its session, and remember that it was heard."""
+        """Judge a message by its session, and remember the session."""
         if session == self.current:
             self._received_s, self._left, self.other = now_s, False, None
             return SessionDecision(accepted=True, other_session=self._other_session(now_s))
@@ -105,7 +105,7 @@ class SessionWatch:
         return SessionDecision(accepted=True, changed=True)
 
     def _other_session(self, now_s: float) -> str | None:
-        """Return a session heard so long ago that this message is no straggler; forget it."""
+        """Return a session so old that this message is no straggler; forget it."""
         for session, first_s in self._other_sessions.items():
             if now_s - first_s > GRACE_S:
                 del self._other_sessions[session]
@@ -247,7 +247,7 @@ class Standby:
             self._driving.clear()
 
     def look_again(self) -> None:
-        """See whether one has gone that nobody hears go."""
+        """Check whether a service has gone without its token's end being received."""
         if self._met[1]:
             self._settle()
 

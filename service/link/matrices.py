@@ -1,4 +1,4 @@
-"""Matrices on both ways: reconstructors an RTC may ask for, interaction matrices it sends."""
+"""Send and receive matrices in parts."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Offer:
 
     @classmethod
     def of(cls, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> Self:
-        """Return a matrix in the parts its manifest tells, offered from now on."""
+        """Return a matrix in the parts of its manifest, offered from now on."""
         parts = tuple(wire.split(matrix, manifest.layout.chunk_bytes))
         return cls(
             manifest=manifest, commit=wire.encode(manifest), parts=parts, offered_s=time.monotonic()

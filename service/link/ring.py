@@ -1,4 +1,4 @@
-"""The last seconds of one session's telemetry, each frame in its place."""
+"""A ring of the last seconds of telemetry."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class FrameRing:
 
     @property
     def undelivered(self) -> int:
-        """Frames held that nobody has drained."""
+        """Frames that wait to be drained."""
         slots = np.arange(self._cursor, self._head) % self._capacity
         return int(np.count_nonzero(self._state[slots] == HELD))
 

@@ -1,4 +1,4 @@
-"""The only module that calls zenoh: how pyrcal opens, subscribes, serves, asks and puts.
+"""The only module that calls zenoh.
 
 The advanced publisher and subscriber are marked unstable by zenoh; their version is pinned to the
 minor and their use is confined to this page.

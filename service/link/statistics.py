@@ -1,4 +1,4 @@
-"""Counters of the link, as one record for REST and metrics, and what came in the last seconds."""
+"""Counters of the link."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MALFORMED: Final = "malformed"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disposition:
-    """What has become of messages of one kind, or of frames, in the last seconds."""
+    """Outcome of messages of one kind, or of frames, in the last seconds."""
 
     kind: str
     """frames, status, ack, im, reply."""
@@ -88,7 +88,7 @@ class Counters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStatistics:
-    """What has passed since the service started; counts are of all sessions together."""
+    """Counts since the service started, of all sessions together."""
 
     rtc_alive: bool
     """Whether the RTC's liveliness token is there."""

@@ -1,1 +1,1 @@
-"""The optics: pupil, mirror, modes, pyramid, registration, interaction matrix. Pure numerics."""
+"""The optics: pupil, mirror, modes, pyramid, registration, D(α). Pure numerics."""

@@ -1,4 +1,4 @@
-"""What an instrument file says in numbers and names: read straight from it, quick to import.
+"""Names and numbers of an instrument file; quick to import.
 
 What needs arrays, or more than one table of the file, is in ``service.model.instrument``.
 """
@@ -52,7 +52,7 @@ class Telescope(Read):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PyramidNumbers(Read):
-    """The modulated pyramid wavefront sensor, and how finely it looks."""
+    """The modulated pyramid wavefront sensor and its sampling."""
 
     n_subapertures: Annotated[int, Ge(4), Le(1000)]
     """Subapertures across the sensor grid."""

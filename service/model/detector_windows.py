@@ -1,4 +1,4 @@
-"""Four windows cut out of full detector frames, at sub-pixel places, and the slopes they give.
+"""Cut pupil images out of detector frames at sub-pixel places.
 
 The four pupil images of a real pyramid are whole pixels wide by accident and seldom sit on a
 rectangle. A window that starts between two pixels is cut from the running sum of the light, with a

@@ -1,4 +1,4 @@
-"""What pyrcal knows of an instrument: frozen records, filled from a TOML file elsewhere.
+"""An instrument as frozen records.
 
 What the file says as it is comes from ``service.model.described``; arrays are added here.
 """
@@ -40,7 +40,7 @@ class Pyramid(PyramidNumbers):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Mount:
-    """How a mirror is built in, as far as its owner says.
+    """Nominal rotation and parity of a mirror, if its owner states them.
 
     A point ``p`` of the mirror's drawing lies at ``diag(1, parity) p`` before α acts on it.
     """
@@ -97,7 +97,7 @@ class TabulatedModes(Mount):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameWindows:
-    """Where the four pupil images lie on full detector frames."""
+    """Positions of the four pupil images on full detector frames."""
 
     centres_px: NDArray[np.float64] | None = None
     """``(4, 2)`` row and column of the images' centres, one in each quadrant of the four, in any
@@ -140,7 +140,7 @@ class Instrument(Telescope):
 
     @property
     def start(self) -> Misregistration:
-        """Where a fit starts: the mirror's nominal rotation, nothing else."""
+        """Start of a fit: the mirror's nominal rotation, nothing else."""
         return Misregistration(rotation_rad=self.mirror.nominal_rotation_rad or 0.0)
 
     @property

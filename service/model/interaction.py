@@ -1,4 +1,4 @@
-"""The interaction matrix D(α) = K(shift) Φ(rotation, magnification), and how it moves with α.
+"""The interaction matrix D(α) = K(shift) Φ(rotation, magnification), and its derivatives.
 
 Rows stand in the order and signs of conventions.md, or as one RTC lists its slopes: what travels to
 and from the RTC (telemetry, measured matrices, reconstructors) stays as it is, and only the model

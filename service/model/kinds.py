@@ -1,4 +1,4 @@
-"""What kinds of telescope, mirror and signals there are, by the names of an instrument file."""
+"""Names of kinds of telescope, mirror and signals."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class BasisKind(StrEnum):
 
 
 class SignalKind(StrEnum):
-    """What the RTC makes of the four pupil images of a frame."""
+    """Kinds of signals that an RTC makes of the four pupil images."""
 
     XY = "xy"
     """Two slopes for each subaperture."""
@@ -53,12 +53,12 @@ class SignalKind(StrEnum):
 
     @property
     def orders(self) -> tuple[SlopeOrder, ...]:
-        """In which they may be listed; the first one where none is told."""
+        """Orders in which they may be listed; the first is the default."""
         return tuple(order for order in SlopeOrder if order.kind is self)
 
 
 class SlopeOrder(StrEnum):
-    """How the signals of the subapertures follow one another in the RTC's vector.
+    """Order of the signals in the RTC's vector.
 
     Subapertures always follow one another row by row.
     """
@@ -89,13 +89,13 @@ class SlopeOrder(StrEnum):
 
     @property
     def kind(self) -> SignalKind:
-        """What is listed in this order."""
+        """Kind of the signals in this order."""
         slopes = {SlopeOrder.XY, SlopeOrder.YX, SlopeOrder.INTERLEAVED}
         return SignalKind.XY if self in slopes else SignalKind.INTENSITY
 
 
 class Normalisation(StrEnum):
-    """What the intensities and their differences are divided by."""
+    """Divisor of the intensities and their differences."""
 
     GLOBAL = "global"
     """The mean flux per valid subaperture."""
@@ -105,7 +105,7 @@ class Normalisation(StrEnum):
 
 
 class Method(StrEnum):
-    """How the registration is found."""
+    """Methods of finding the registration."""
 
     JOINT = "joint"
     """All four parameters together, by variable projection over a free gain per mode."""

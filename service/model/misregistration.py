@@ -1,4 +1,4 @@
-"""Mis-registration: where the mirror's image falls on the sensor."""
+"""The mis-registration α."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Misregistration:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Determination:
-    """A registration as something tells it, and how sure that is."""
+    """A registration and its covariance."""
 
     alpha: Misregistration
     """The registration."""

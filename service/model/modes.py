@@ -1,4 +1,4 @@
-"""The modes of a mirror, Karhunen-Loeve or its user's own, and its surface between actuators."""
+"""The mirror's modes and its surface between actuators."""
 
 from __future__ import annotations
 

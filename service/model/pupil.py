@@ -1,4 +1,4 @@
-"""The pupil: where the phase lives, and how much light passes at each point."""
+"""The pupil: points and how much light passes at each."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EDGE_NODES = 32
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Illumination:
-    """How evenly the beam is lit, seen from its own centre: it moves with the pupil images."""
+    """Evenness of the beam, seen from its own centre; it moves with the pupil images."""
 
     coordinates: NDArray[np.float64]
     """``(n,)`` rising positions along either axis, in subapertures from the beam's centre."""

@@ -1,4 +1,4 @@
-"""The modulated pyramid, without an FFT: separable, exact at any sub-pixel shift.
+"""The modulated pyramid without an FFT.
 
 The four-face pyramid's transmission is separable, so the detector field is ``Wy X Wx^T`` with X
 the modulated pupil field and W the one-dimensional "roof" operator. Unit of length: a subaperture.

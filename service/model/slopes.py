@@ -1,4 +1,4 @@
-"""The signals as the RTC lists them, and the way to conventions.md's order, axes, signs and back.
+"""From the RTC's list of signals to our order, axes and signs, and back.
 
 An RTC has its own order of components, its own corner of the detector where rows and columns begin,
 and its own idea of which half of the light counts as positive. All of it is one permutation of the
@@ -37,7 +37,7 @@ _PLANE_PLACES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orientation:
-    """How the RTC's axes and signs lie in the axes of conventions.md.
+    """The RTC's axes and signs in the axes of conventions.md.
 
     Applied from the RTC's slopes to ours in the order of the fields, bottom to top of the optics:
     signs of the components on the RTC's own grid, then the flips of the grid, then the swap. A
@@ -81,7 +81,7 @@ FLIPS = ("swap_xy", "flip_x", "flip_y")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeRecipe:
-    """How the RTC makes and lists its signals."""
+    """Kind, order, orientation and normalisation of an RTC's signals."""
 
     order: SlopeOrder = SlopeOrder.XY
     """Order of the signals; it says of which kind they are, too."""
@@ -94,12 +94,12 @@ class SlopeRecipe:
 
     @property
     def kind(self) -> SignalKind:
-        """What the signals are."""
+        """Kind of the signals."""
         return self.order.kind
 
     @property
     def assumed_orientation(self) -> Orientation:
-        """What holds until a measurement says otherwise: the axes of conventions.md."""
+        """The stated orientation, else the axes of conventions.md."""
         return self.orientation or Orientation()
 
 
@@ -194,7 +194,7 @@ def _listing(
 
 
 def likely_kind(n_found: int, n_expected: int) -> str:
-    """Return what so many signals instead of those expected look like; empty: like neither."""
+    """Return what a wrong number of signals looks like; empty: nothing known."""
     words = {
         2.0: '; they look like pixels: is it slopes.kind = "intensity"?',
         0.5: '; they look like x and y slopes: is it slopes.kind = "xy"?',

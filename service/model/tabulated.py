@@ -1,4 +1,4 @@
-"""Modes measured on a grid: a cubic spline, evaluated wherever the registration puts them.
+"""Modes given on a grid, evaluated by a cubic spline.
 
 Tables of shapes end somewhere. A cubic spline cannot stop at an edge: a table that falls to zero
 outside its pupil is wrong by 20 % inside it. So a smooth surface is put where the table knows

@@ -1,4 +1,4 @@
-"""Von Karman turbulence: what of it shapes on the pupil hold, and what its rest does to a pyramid.
+"""Von Karman turbulence on modes and on a pyramid.
 
 A long exposure sees each star point spread over the residual's halo. To the pyramid that is an
 incoherent extended source: a core, the modulation circle itself, weakened by the residual's

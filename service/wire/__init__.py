@@ -1,4 +1,4 @@
-"""Bytes <-> records: version 1 of the contract between the RTC and the service.
+"""Bytes <-> records: version 1 of the contract with an RTC.
 
 ``encode(record)`` turns a frozen record into bytes, ``decode(kind, data)`` does the reverse and
 refuses whatever breaks the contract with a :class:`~service.errors.WireError`. The refusal's text

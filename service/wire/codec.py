@@ -1,4 +1,4 @@
-"""Records <-> msgpack maps: each key is present, of its type and in its range.
+"""Records <-> msgpack maps, checked for keys, types and ranges.
 
 The types of a record's fields say what its keys may hold; a refusal names the key, what was found
 and what was expected. A :class:`Form` says what else a kind of message asks for. Here are the types
@@ -126,7 +126,7 @@ def _no_more(_record: object, _where: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Form(Generic[_R]):
-    """How one kind of message travels, as far as the fields of its record do not say it."""
+    """Further rules for one kind of message, beyond the fields of its record."""
 
     kind: type[_R]
     """Of the record: its fields are the keys."""

@@ -1,4 +1,4 @@
-"""Commands of the service to the RTC, and the RTC's replies."""
+"""Commands to the RTC, and its replies."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class CommandKind(StrEnum):
 
 
 class Loop(StrEnum):
-    """What the RTC's loop does."""
+    """States of the RTC's loop."""
 
     OPEN = "open"
     CLOSED = "closed"
@@ -69,7 +69,7 @@ class DitherKind(StrEnum):
 
 
 class Pattern(StrEnum):
-    """How an interaction matrix is measured."""
+    """Patterns of measuring an interaction matrix."""
 
     PUSH_PULL_MODAL = "push-pull-modal"
     """One mode after the other, loop open."""
@@ -286,7 +286,7 @@ def _check_measurement(command: MeasureRequest, where: str) -> None:
 
 
 def _check_modes(command: Strokes, where: str) -> None:
-    """Refuse modes that are none or twice the same, and what is not one for each of them."""
+    """Refuse missing or repeated modes, and lists that have not one value for each."""
     modes = command.modes
     if not modes or len(set(modes)) != len(modes):
         raise refusal("modes", modes, "at least one mode, none twice", where)

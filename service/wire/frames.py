@@ -1,4 +1,4 @@
-"""Batches of telemetry frames: a msgpack attachment that describes raw float32 rows."""
+"""Batches of frames: a msgpack attachment and raw float32 rows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMN_LIMIT: Final = BATCH_LIMIT // 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameHeader:
-    """What the attachment of a batch says about its rows."""
+    """Description of a batch's rows."""
 
     session: Opaque
     """New when the RTC starts, or its sequence or integrator starts over."""

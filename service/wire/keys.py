@@ -1,4 +1,4 @@
-"""Names on the wire: key expressions, ids and encodings."""
+"""Key expressions, ids and encodings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def checked_id(value: object, where: str) -> str:
 
 
 class Role(StrEnum):
-    """Who holds a liveliness token."""
+    """Holders of a liveliness token."""
 
     RTC = "rtc"
     SERVICE = "service"
@@ -119,7 +119,7 @@ class Keys:
         return key.split("/")[2]
 
     def rank(self, name: str) -> str:
-        """Liveliness token of one of several services; its name tells who was first."""
+        """Liveliness token of one of several services; its name has the starting time."""
         return f"{self.root}/alive/{Role.SERVICE}/{name}"
 
     def matrix_id_of(self, key: str) -> str:

@@ -1,4 +1,4 @@
-"""Matrices on the wire: manifests, and the parts they travel in, which arrive in any order."""
+"""Matrices as manifests and parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the RTC says about itself and its reconstructors, and what the service tells everyone."""
+"""Status of RTC, reconstructors and service."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ class Status(ControlLaw):
 
 
 class AckState(StrEnum):
-    """How far a reconstructor has come in the RTC."""
+    """Progress of a reconstructor in the RTC."""
 
     STAGED = "staged"
     APPLIED = "applied"
@@ -208,7 +208,7 @@ class Acknowledgement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateMessage:
-    """What the service knows, for whoever listens; an RTC ignores it."""
+    """The service's state for all subscribers; an RTC ignores it."""
 
     system: Id
     """The ``{system}`` of the keys."""
@@ -242,7 +242,7 @@ class StateMessage:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmMessage:
-    """One alarm that came or went, for whoever listens."""
+    """One alarm that began or ended, for all subscribers."""
 
     system: Id
     """The ``{system}`` of the keys."""

@@ -1,1 +1,1 @@
-"""The real-time computer: the loop, what is done with it on request, and its telemetry."""
+"""The real-time computer: loop, operations on request, telemetry."""

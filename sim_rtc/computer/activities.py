@@ -1,4 +1,4 @@
-"""What is done with a loop besides closing it: dithers, measurements of its matrix, gain ramps.
+"""Operations that occupy the loop: dithers, measurements, gain ramps.
 
 At most one of each at a time. What may be on the mirror together is decided here.
 """
@@ -29,7 +29,7 @@ _MOST_ENDED = 4
 
 
 class Activities:
-    """What is under way; not for two threads at once."""
+    """Operations under way; for one thread at a time."""
 
     def __init__(self, *, n_modes: int, frame_rate_hz: float) -> None:
         self._n_modes = n_modes
@@ -45,30 +45,30 @@ class Activities:
 
     @property
     def dither(self) -> DitherStatus | None:
-        """The dither that is on, as a status tells it."""
+        """The dither that plays, as a status has it."""
         if self._dither is None:
             return None
         return DitherStatus(request=self._dither.request, start_seq=self._dither.start_seq)
 
     @property
     def telemetry_dithers(self) -> bool:
-        """Whether what is added to commands is told as a dither; strokes in open loop are not."""
+        """Whether added commands count as a dither; strokes in open loop do not."""
         return self._measurement is None or not self._measurement.needs_open_loop
 
     def in_the_loops_way(self) -> str:
-        """Return what needs the loop as it is, in the wire's words; empty: nothing."""
+        """Return the operation that needs the loop unchanged, in the wire's words; empty: none."""
         if self._ramp is not None:
             return f"busy: gain ramp {self._ramp.name} is under way; open the loop to end it"
         return self._measuring()
 
     def forbids(self, request: LoopRequest) -> str:
-        """Return why the loop is not to be changed so now; a ramp lets it be opened."""
+        """Return why the loop must not be changed so now; a ramp lets it be opened."""
         if request.loop is Loop.OPEN:
             return self._measuring()
         return self.in_the_loops_way()
 
     def on_the_mirror(self) -> str:
-        """Return what occupies the mirror, in the wire's words; empty: nothing."""
+        """Return the operation that occupies the mirror, in the wire's words; empty: none."""
         if self._dither is not None:
             return (
                 f"busy: dither {self._dither.request.id} is on until frame "
@@ -83,7 +83,7 @@ class Activities:
         return f"busy: matrix {name} is being measured until frame {stop_seq}"
 
     def begin_dither(self, request: DitherRequest, start_seq: int) -> None:
-        """Let a dither begin at this frame."""
+        """Begin a dither at this frame."""
         self._dither = Dither(
             request,
             start_seq=start_seq,
@@ -93,20 +93,20 @@ class Activities:
         )
 
     def end_dither(self) -> None:
-        """Let the dither, if any, end now."""
+        """End the dither, if any."""
         self._dither = None
 
     def begin_measurement(self, measurement: Measurement, *, closes_again: bool) -> None:
-        """Let a measurement begin at its frame; the loop may have to be closed after it."""
+        """Begin a measurement at its frame; the loop may have to be closed after it."""
         self._measurement, self._closes_again = measurement, closes_again
 
     def begin_ramp(self, ramp: GainRamp, settings: LoopSettings) -> LoopSettings:
-        """Let a gain ramp begin; return the settings that it asks for."""
+        """Begin a gain ramp; return the settings that it asks for."""
         self._ramp = ramp
         return replace(settings, gains=ramp.gains)
 
     def end_ramp(self, settings: LoopSettings, reason: str) -> LoopSettings:
-        """Give up the ramp, if any; return settings with what it has chosen so far."""
+        """Give up the ramp, if any; return settings with the gains chosen so far."""
         ramp, self._ramp = self._ramp, None
         if ramp is None:
             return settings
@@ -114,7 +114,7 @@ class Activities:
         return replace(settings, gains=ramp.settled)
 
     def end_all(self, settings: LoopSettings, session: str) -> LoopSettings:
-        """End everything, for the loop starts over; return the settings that are left."""
+        """End everything, for the loop starts over; return the remaining settings."""
         self._end_measurement(session, "the loop started over during the measurement")
         self._dither = None
         return self.end_ramp(settings, "the loop started over")
@@ -126,7 +126,7 @@ class Activities:
             self.ended.append(measurement)
 
     def commands(self, seq0: int, n_frames: int) -> Array32 | None:
-        """Return what is added to the commands of the batch ``(n_frames, n_modes)``, metres."""
+        """Return the commands added to the batch, ``(n_frames, n_modes)``, metres."""
         dither, measuring = self._dither, self._measurement
         commands = None
         if dither is not None:
@@ -136,7 +136,7 @@ class Activities:
         return commands if measuring is None else measuring.commands(seq0, n_frames)
 
     def look(self, batch: Batch, matrix: Array32, settings: LoopSettings) -> LoopSettings:
-        """Read a batch back; return the settings of the next one.
+        """Take a batch; return the settings of the next one.
 
         ``matrix`` is what multiplied its slopes.
         """

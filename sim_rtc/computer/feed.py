@@ -1,4 +1,4 @@
-"""What the sensor would see without the mirror, block by block and ahead of the loop.
+"""Compute what the sensor will see without the mirror, ahead of the loop.
 
 Of a linear telescope it is slopes, half a second at a time: frames are interpolated between the
 steps of the screens. Of a diffractive one it is the phase of every frame; slopes follow one frame
@@ -87,7 +87,7 @@ class Block(ABC):
 
 
 class OpenModes:
-    """What the reconstructor makes of a block's slopes, computed for all that are left of it.
+    """The reconstructor times a block's slopes, computed for all that are left of it.
 
     For ten frames the library's copy of the matrix costs four times the product.
     """
@@ -163,7 +163,7 @@ class PhaseBlock(Block):
 
 
 class Source(TypedDict):
-    """What a feed is made of."""
+    """The sources of a feed."""
 
     sky: Sky
     optics: MovingOptics
@@ -252,7 +252,7 @@ class OpenLoopFeed(Feed):
         )
 
     def _look(self, optics: LinearOptics) -> None:
-        """See vibrations and static wavefronts through these optics."""
+        """Project vibrations and static wavefronts through these optics."""
         if optics is not self._seen:
             self._seen, self._source_slopes = optics, optics.slopes_of(self._sources).T
             if optics.stuck_opd_m.any():
@@ -317,7 +317,7 @@ class Ahead:
         self._thread.shutdown(cancel_futures=True)
 
     def __iter__(self) -> Iterator[Block]:
-        """Yield the blocks; re-raise what has kept one from being made."""
+        """Yield the blocks; re-raise the error that kept one from being made."""
         while True:
             block = self._coming.popleft().result()
             self._coming.append(self._next())

@@ -1,4 +1,4 @@
-"""The gain ramp: one group of modes after the other, the gain of least residual slopes is kept.
+"""The gain ramp: try gains group by group, keep the best.
 
 A group tries its gains in turn while the others stay; once the residual has clearly grown it
 tries no higher one, which is well before the loop is lost. The residual slopes are judged
@@ -52,12 +52,12 @@ def by_group(gains: tuple[float, float, float], n_modes: int) -> tuple[float, ..
 
 
 class GainRamp:
-    """The ramp itself: shown a closed loop, it says which gains are to be tried next."""
+    """The ramp: given a closed loop, it says which gains to try next."""
 
     def __init__(
         self, gains: tuple[float, ...], request: RampRequest, *, frame_rate_hz: float
     ) -> None:
-        """Take the gains as they are, one per mode; what settles is at most half of its frames."""
+        """Take the present gains, one per mode; at most half of the frames settle."""
         self.name = request.id
         """Of the request."""
         self._settled = np.array(gains)
@@ -84,12 +84,12 @@ class GainRamp:
 
     @property
     def settled(self) -> tuple[float, ...]:
-        """One per mode: what has been chosen so far, and else what was there before."""
+        """One per mode: the gain chosen so far, else the one before."""
         return tuple(self._settled.tolist())
 
     @property
     def gains(self) -> tuple[float, ...]:
-        """One per mode: what is to be in force now, and once done what was chosen."""
+        """One per mode: the gain in force now, once done the one chosen."""
         gains = self._settled.copy()
         if not self.done:
             gains[self.modes] = self._waiting[0]
@@ -134,13 +134,13 @@ class GainRamp:
         return True
 
     def again(self) -> None:
-        """Forget what the present group has shown: the loop is no longer the same."""
+        """Forget the present group's residuals: the loop is no longer the same."""
         if not self.done:
             self.steps = tuple(step for step in self.steps if step.group != self._group)
             self._begin_group()
 
     def give_up(self, reason: str) -> None:
-        """Tell the log why it ends before its time."""
+        """Log why the ramp ends early."""
         _log.warning("gains.given-up", ramp=self.name, reason=reason)
 
     def _tell(self) -> None:

@@ -27,7 +27,7 @@ Sense = Callable[[int, Array32], Array32]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopTerms:
-    """What the integrator needs, constant during a block."""
+    """The integrator's terms, constant during a block."""
 
     reconstructor: Array32
     """R ``(n_controlled, n_slopes)``, metres per slope."""
@@ -63,7 +63,7 @@ class LoopTerms:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class LoopBlock:
-    """What a block of frames comes to; at first, what is added to the integrator's commands."""
+    """Commands and slopes of a block; at first, the part added to the integrator's commands."""
 
     slopes: Array32
     """``(n_frames, n_slopes)``."""
@@ -81,7 +81,7 @@ class LoopBlock:
     def of(
         cls, slopes: Array32, dither_m: Array32 | None, played_m: Array32 | None, n_modes: int
     ) -> LoopBlock:
-        """Return what dither and played commands add; the arrays become the mirror's in place."""
+        """Return the sum of dither and played commands; the arrays become the mirror's in place."""
         commands = np.zeros((len(slopes), n_modes), dtype=np.float32)
         for part in (dither_m, played_m):
             if part is not None:

@@ -1,4 +1,4 @@
-"""Measuring an interaction matrix: what is accepted, played, read back and sent."""
+"""Measure an interaction matrix and send it."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeasurementRules:
-    """What a measurement works with."""
+    """Limits and shapes that measurements use."""
 
     n_modes: int
     """Of the whole basis."""
@@ -136,7 +136,7 @@ class MeasurementRules:
     def measurement(
         self, request: MeasureRequest, reconstructor: Array32 | None = None
     ) -> Measurement:
-        """Return the measurement of a request that :meth:`refusal` has nothing against.
+        """Return the measurement of a request that :meth:`refusal` accepts.
 
         Only system modes need the ``reconstructor`` in use, ``(n_controlled, n_slopes)``.
         """
@@ -218,7 +218,7 @@ class MeasurementRules:
 def product(
     measured: Measurement, identity: Identity, created_ns: int
 ) -> tuple[MeasuredManifest, Array32 | None]:
-    """Return what is sent of a measurement that has ended: its manifest, and the matrix or None.
+    """Return a finished measurement's manifest, and the matrix or None.
 
     ``created_ns`` is nanoseconds since the Unix epoch, UTC.
     """

@@ -1,4 +1,4 @@
-"""The real-time computer itself: one batch of frames after the other, and what may change between.
+"""The real-time computer, batch by batch.
 
 Everything that may change (matrix, gains, dither, loop state) changes between two batches, under
 one lock, so a batch has one reconstructor and one session, and no frame is ever skipped.
@@ -165,13 +165,13 @@ class RealTimeComputer:
             self._activities.late_dither_frames = n_frames
 
     def hide_dithers(self, *, hidden: bool = True) -> None:
-        """Tell of dithers in the telemetry that never reach the mirror."""
+        """Report dithers in the telemetry that never reach the mirror."""
         with self._lock:
             self._hides_dithers = hidden
 
     @property
     def has_news(self) -> bool:
-        """Whether a matrix has been swapped in or measured that nobody has taken note of."""
+        """Whether a matrix was swapped in or measured and not reported yet."""
         return bool(self._swaps or self._activities.ended)
 
     def take_swaps(self) -> list[tuple[str, int]]:
@@ -206,17 +206,17 @@ class RealTimeComputer:
 
     @property
     def session(self) -> str:
-        """Of the frames to come."""
+        """Session of the frames to come."""
         return self._session
 
     @property
     def settings(self) -> LoopSettings:
-        """How the loop is run now."""
+        """The loop's settings."""
         return self._settings
 
     @property
     def reconstructor(self) -> Reconstructor:
-        """What multiplies the slopes now."""
+        """The matrix that multiplies the slopes now."""
         return self._active
 
     @property
@@ -225,7 +225,7 @@ class RealTimeComputer:
         return self._optics.images
 
     def status(self) -> Status:
-        """Return what the computer knows of itself; time, light and pointing are not its own."""
+        """Return the computer's part of the status; time, light and pointing follow later."""
         with self._lock:
             settings = self._settings
             return Status(
@@ -418,7 +418,7 @@ def loop_refusal(request: LoopRequest, n_modes: int) -> str:
 
 
 def changed(settings: LoopSettings, request: LoopRequest) -> LoopSettings:
-    """Return the settings after a request that :func:`loop_refusal` has nothing against."""
+    """Return the settings after a request that :func:`loop_refusal` accepts."""
     return replace(
         settings,
         closed=settings.closed if request.loop is None else request.loop is not Loop.OPEN,

@@ -1,4 +1,4 @@
-"""Reconstructors: the first one, and the two-phase way of others into the loop.
+"""Stage reconstructors and swap them into the loop.
 
 Collect, check, stage, swap, acknowledge.
 """
@@ -45,7 +45,7 @@ _SMALLEST_SINGULAR_RATIO = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Terms:
-    """What a reconstructor must fit."""
+    """Conditions that a reconstructor must fit."""
 
     session: str
     identity: Identity
@@ -78,7 +78,7 @@ class _Collection:
 
 @dataclass(slots=True, kw_only=True)
 class Outcome:
-    """What is to be done after something has arrived or time has passed."""
+    """Acknowledgements and queries that follow from an arrival or from elapsed time."""
 
     said: list[Acknowledgement] = field(default_factory=list)
     """To be sent, in order."""
@@ -91,7 +91,7 @@ class Outcome:
 
 
 class Staging:
-    """Reconstructors on their way in. Time is given, nothing is sent: the link does both."""
+    """Reconstructors on their way in; time is an argument, the link sends."""
 
     def __init__(self, terms: Callable[[], Terms], *, limit_bytes: int) -> None:
         self._terms = terms
@@ -141,14 +141,14 @@ class Staging:
         return outcome
 
     def applied(self, matrix_id: str, frame_seq: int) -> Acknowledgement | None:
-        """Note that the loop has swapped; return what to say of it, None if it was voided."""
+        """Note that the loop has swapped; return the acknowledgement, None if it was voided."""
         staged = self._said.get(matrix_id)
         if staged is None:
             return None
         return self._remember(replace(staged, state=AckState.APPLIED, frame_seq=frame_seq))
 
     def void(self) -> None:
-        """Forget what has not been applied: a new session begins."""
+        """Forget matrices not applied yet: a new session begins."""
         self._collected.clear()
         for matrix_id, acknowledgement in list(self._said.items()):
             if acknowledgement.state is AckState.STAGED:
@@ -184,14 +184,14 @@ class Staging:
         return Outcome(said=[self._remember(self.answer(manifest, AckState.REJECTED, reason))])
 
     def _repeated(self, manifest: Manifest, known: Acknowledgement) -> Outcome:
-        """Say the same of the same matrix again; an id that is used for another is refused."""
+        """Repeat the answer for the same matrix; refuse an id that is used for another."""
         if manifest.layout.sha256 == known.sha256:
             return Outcome(said=[replace(known, session=self._terms().session)])
         reason = f"id: {manifest.id} was used with sha256 {known.sha256}, expected a new id"
         return Outcome(said=[self.answer(manifest, AckState.REJECTED, reason)])
 
     def answer(self, manifest: Manifest, state: AckState, reason: str = "") -> Acknowledgement:
-        """Return what is said of a matrix in the present session."""
+        """Return the acknowledgement of a matrix in the present session."""
         return Acknowledgement(
             session=self._terms().session,
             id=manifest.id,
@@ -202,7 +202,7 @@ class Staging:
         )
 
     def unreadable(self, reason: str) -> Acknowledgement:
-        """Return what is said of a commit that cannot be read: nobody knows of which matrix."""
+        """Return the answer to an unreadable commit: it names no matrix."""
         return Acknowledgement(
             session=self._terms().session,
             id=None,
@@ -232,7 +232,7 @@ def truncated_inverse(interaction: Array32) -> Array32:
 def initial_reconstructor(
     instrument: Instrument, basis: ModalBasis, identity: Identity, n_controlled: int
 ) -> Reconstructor:
-    """Return what an observatory has before any flexure: the nominal model's inverse."""
+    """Return the matrix before any flexure: the nominal model's inverse."""
     aligned = instrument.start
     interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
     matrix = truncated_inverse(interaction[:, :n_controlled])

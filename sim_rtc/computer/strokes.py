@@ -1,4 +1,4 @@
-"""What a measurement puts on the mirror frame by frame, and the matrix in what is read back.
+"""The strokes of a measurement, and the matrix from their answers.
 
 Nothing here knows the plant, and the commands that count are not those that were asked for but
 those in the telemetry: a slow, clipped or otherwise disturbed mirror measures as well as a

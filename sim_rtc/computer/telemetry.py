@@ -1,4 +1,4 @@
-"""What leaves the computer: batches of frames, what it says of itself, and when frames happen."""
+"""Batches of frames, status, and time of each frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopSettings:
-    """How the loop is run; replaced as a whole."""
+    """The loop's settings; replaced as a whole."""
 
     frame_rate_hz: float
     delay_frames: int
@@ -66,7 +66,7 @@ class Reconstructor:
         created_ns: int,
         alpha: Mapping[str, float] | None = None,
     ) -> Self:
-        """Return a matrix that no service has sent: the RTC had it before, or somebody wrote it."""
+        """Return a matrix that no service has sent."""
         manifest = Manifest(
             id=name,
             layout=layout_of(matrix, CHUNK_LIMIT),
@@ -84,7 +84,7 @@ class Reconstructor:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Batch:
-    """One batch of frames as it leaves the loop, and what only the simulator knows of it."""
+    """One batch of frames as it leaves the loop, with the simulator's own truth."""
 
     session: str
     seq0: int

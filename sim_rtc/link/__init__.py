@@ -1,1 +1,1 @@
-"""The link to the service: what is sent, answered, taken in, recorded and replayed."""
+"""The link to the service."""

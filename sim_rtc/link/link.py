@@ -1,4 +1,4 @@
-"""The RTC's side of the wire: telemetry and status out, commands and reconstructors in.
+"""Telemetry and status out, commands and reconstructors in.
 
 One thread publishes, another looks after reconstructors; the loop only drops batches into a
 bounded queue. The service may come before, after or in the middle.
@@ -56,7 +56,7 @@ class Link(Background):
         plan: FaultPlan,
         recorder: RecordingWriter | None = None,
     ) -> None:
-        """Take the plan of the faults, and where everything that is sent is written, too."""
+        """Take the plan of faults, and the recorder of everything sent."""
         super().__init__("link")
         self._plan = plan
         self._recorder = recorder

@@ -1,4 +1,4 @@
-"""Matrices on the wire: reconstructors into the loop, acknowledgements and measured ones out."""
+"""Matrices on the wire: reconstructors, acknowledgements, measurements."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Event = Callable[[], None]
 
 
 class Matrices(Background):
-    """Looks after matrices in a thread of its own while its ``with`` block lasts.
+    """Handles matrices in a thread while its ``with`` block lasts.
 
     Asking for a matrix, solving one and sending it wait for the network or take up to half a
     second: telemetry must not wait with them.
@@ -94,7 +94,7 @@ class Matrices(Background):
         self._enqueue(lambda: self._commit(key, data))
 
     def look(self) -> None:
-        """Have swaps acknowledged and measured matrices sent now."""
+        """Send acknowledgements of swaps and measured matrices now."""
         self._enqueue(self._report)
 
     def _on_service(self, sample: zenoh.Sample) -> None:
@@ -121,7 +121,7 @@ class Matrices(Background):
             self._swap_late()
 
     def _report(self) -> None:
-        """Say what the loop has done since the last time."""
+        """Report the loop's swaps and measurements since the last time."""
         for matrix_id, seq in self._computer.take_swaps():
             acknowledgement = self._staging.applied(matrix_id, seq)
             if acknowledgement is not None:
@@ -130,7 +130,7 @@ class Matrices(Background):
             self._send(measured)
 
     def _follow_session(self) -> None:
-        """Void what was on its way when the computer has started a new session."""
+        """Void matrices on their way when the computer has started a new session."""
         current = self._computer.session
         if current != self._rtc_session:
             self._rtc_session = current
@@ -171,7 +171,7 @@ class Matrices(Background):
         return True
 
     def _ask_current(self) -> None:
-        """Ask what the service wants in use, once, and take it if it fits."""
+        """Ask once for the matrix that the service wants in use, and take it if it fits."""
         if self._asked_current:
             return
         self._asked_current = True

@@ -1,4 +1,4 @@
-"""A recorded night played again, as the RTC it was.
+"""Replay a recorded night as the RTC it was.
 
 Session, sequence numbers and timestamps are the recorded ones: what depends on them (where a window
 begins, when it ends) comes out as it did that night, and so do the estimates. Nothing that the
@@ -139,7 +139,7 @@ class Replay:
         self._refused.append((manifest.id, manifest.layout.sha256))
 
     def _acknowledge_refusals(self, session: zenoh.Session) -> None:
-        """Reject what the service has sent, in the name of the session that is being played."""
+        """Reject the service's matrices in the name of the session being played."""
         while self._refused and self._status is not None:
             matrix_id, sha256 = self._refused.popleft()
             refused = Acknowledgement(

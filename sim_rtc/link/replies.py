@@ -1,4 +1,4 @@
-"""What the RTC answers when it is asked.
+"""Reply to the service's queries.
 
 A command is carried out once, however often it is sent.
 """
@@ -33,18 +33,18 @@ _log = structlog.get_logger("sim_rtc")
 
 
 class Computer(Protocol):
-    """What the link asks of an RTC, be it simulated or another program."""
+    """An RTC as the link needs it, simulated or another program."""
 
     identity: Identity
     """Names the telemetry carries."""
 
     @property
     def session(self) -> str:
-        """Of the frames to come."""
+        """Session of the frames to come."""
 
     @property
     def reconstructor(self) -> Reconstructor:
-        """What multiplies the slopes now."""
+        """The matrix that multiplies the slopes now."""
 
     @property
     def largest_matrix_bytes(self) -> int:
@@ -102,7 +102,7 @@ class Replies:
 def answer_commands(
     session: zenoh.Session, keys: Keys, reply: Callable[[CommandKind, bytes], Reply]
 ) -> None:
-    """Let a session answer commands of every kind with what ``reply`` makes of them."""
+    """Let a session answer commands of every kind by ``reply``."""
 
     def answering(kind: CommandKind) -> Callable[[zenoh.Query], None]:
         def answer(query: zenoh.Query) -> None:
@@ -120,7 +120,7 @@ def answer_commands(
 def answer_applied(
     session: zenoh.Session, keys: Keys, applied: Callable[[], tuple[bytes, list[bytes]] | None]
 ) -> None:
-    """Let a session tell the matrix in use: the manifest, or a chunk that is asked for."""
+    """Let a session serve the matrix in use: its manifest, or one chunk."""
 
     def answer(query: zenoh.Query) -> None:
         with query:

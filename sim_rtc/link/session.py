@@ -1,4 +1,4 @@
-"""An RTC's end of the link, whatever the RTC is: its session, its publishers, its token."""
+"""An RTC's zenoh session: publishers, queryables, token."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def client_config(endpoint: str) -> zenoh.Config:
 def frames_publisher(
     session: zenoh.Session, keys: Keys, batches_per_s: float
 ) -> zenoh.ext.AdvancedPublisher:
-    """Return the publisher of telemetry: what the service missed it can ask for again."""
+    """Return the publisher of telemetry; the service can ask it for missed frames."""
     return zenoh.ext.declare_advanced_publisher(
         session,
         keys.frames,
@@ -136,7 +136,7 @@ class Token:
         self.show(visible=False)
 
     def show(self, *, visible: bool) -> None:
-        """Declare or withdraw the token, unless that is how it is."""
+        """Declare or withdraw the token, unless that is done already."""
         if visible is (self._token is not None):
             return
         if self._recorder is not None:

@@ -1,1 +1,1 @@
-"""The telescope: sky, pupil, mirror, sensor, and all that is not as it was drawn."""
+"""The telescope: sky, pupil, mirror, sensor, imperfections."""

@@ -1,4 +1,4 @@
-"""Turbulence in frozen layers: endless screens, and what the pupil sees of them as they pass.
+"""Turbulence in frozen layers on endless screens.
 
 Screens of von Karman phase are extruded row by row and never repeat. A layer moves along its wind
 by whole rows. The pupil sees a square window of the newest rows through one constant
@@ -243,7 +243,7 @@ class FrozenLayer:
 
     @property
     def _n_steps(self) -> int:
-        """Steps that are kept."""
+        """Number of stored steps."""
         return len(self._rows) - self._n_rows + 1
 
     def reach(self, first_step: int, last_step: int) -> None:
@@ -272,7 +272,7 @@ class FrozenLayer:
         return self._read(near @ windows) if apart else np.asarray(near @ self._read(windows))
 
     def responses(self, first_step: int, response: PhaseResponse) -> Array32:
-        """Return what a response makes of the phase ``(n_steps, n_outputs)`` from a step on."""
+        """Return a response to the phase ``(n_steps, n_outputs)`` from a step on."""
         known = self._answers.get(response)
         n_known = 0 if known is None else len(known)
         if n_known < self._n_steps:
@@ -289,14 +289,14 @@ class FrozenLayer:
         return np.asarray(scipy.fft.rfft(filters, self._length, axis=0))
 
     def _windows(self, step: NDArray[np.intp]) -> Array32:
-        """Return what lies before the pupil at these steps, ``(n_steps, n_rows²)``, mean 0."""
+        """Return the windows over the pupil at these steps, ``(n_steps, n_rows²)``, mean 0."""
         newest = step - self._first_step + self._n_rows - 1
         windows = self._rows[newest[:, None] - np.arange(self._n_rows)].reshape(len(step), -1)
         windows -= windows.mean(axis=1, keepdims=True)
         return np.asarray(windows)
 
     def _read(self, windows: Array32) -> Array32:
-        """Return what the pupil's points see in windows, ``(n_windows, n_points)``."""
+        """Return the phase at the pupil's points, of windows, ``(n_windows, n_points)``."""
         return np.asarray((self._reading @ windows.T).T)
 
     def _filtered(self, rows: Array32, spectra: Complex64) -> Array32:

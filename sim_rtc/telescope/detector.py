@@ -1,4 +1,4 @@
-"""The detector: how many photons a star gives, and what they do to pixels and slopes.
+"""Photon noise, read noise and pixels.
 
 Also how a bright-star sensor is set up for a faint star: slower, and with its pixels binned, which
 makes larger subapertures of them.
@@ -104,7 +104,7 @@ class Detector:
         return electrons.transpose(0, 2, 1, 3).reshape(4, n, n).astype(np.float32)
 
     def flux(self, images: Array) -> bytes:
-        """Return the same as a status tells it."""
+        """Return the same in the units of a status."""
         return self.counts(images).astype("<f4").tobytes()
 
     def noise(self, n_frames: int, rng: np.random.Generator) -> Array32:
@@ -134,7 +134,7 @@ _MANY = 30.0
 
 
 class PixelDetector:
-    """Turns the light on the pixels into what is read from them."""
+    """Turns the light on the pixels into read-out counts."""
 
     def __init__(self, *, electrons_per_light: float, camera: Camera | None = None) -> None:
         """Take the electrons that a frame collects from a unit of light."""
@@ -163,7 +163,7 @@ class PixelDetector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Preset:
-    """How the sensor is run for stars down to a magnitude."""
+    """Settings of the sensor for stars down to a magnitude."""
 
     faintest: float
     """R magnitude of the faintest star it is for."""
@@ -187,7 +187,7 @@ FLAO_PRESETS = (
 
 
 def preset_for(magnitude: float) -> Preset:
-    """Return the way FLAO would look at a star of this magnitude.
+    """Return FLAO's settings for a star of this magnitude.
 
     Raises
     ------

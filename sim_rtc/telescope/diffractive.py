@@ -1,4 +1,4 @@
-"""A telescope whose pyramid is not linear: every frame is an exposure of the whole field.
+"""A telescope that propagates the whole field for every frame.
 
 Its optical gain is what the residual wavefront makes of it. It shares nothing of the service's
 model but the drawing: another pupil grid, other influence functions, uneven light, actuators out
@@ -122,7 +122,7 @@ class DiffractiveOptics(Optics):
 
 
 class DiffractivePlant(Plant):
-    """A pyramid and a mirror with everything that linear algebra leaves out."""
+    """A pyramid and a mirror with all that linear algebra leaves out."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ def _quadrature(wfs: Pyramid, binning: int) -> Quadrature:
 
 
 class _AtRest(TypedDict):
-    """The fields of the optics that tell what a flat wavefront looks like."""
+    """Fields of the optics that describe a flat wavefront."""
 
     images: Array
     light_at_rest: float
@@ -186,7 +186,7 @@ class _AtRest(TypedDict):
 def _at_rest(
     sensor: DiffractivePyramid, valid: NDArray[np.bool_], errors: SlopeErrors, n_points: int
 ) -> _AtRest:
-    """Look at a flat wavefront."""
+    """Propagate a flat wavefront."""
     light = sensor.images(np.zeros(n_points, dtype=np.float32))
     total = float(light.sum())
     light = errors.read(light)
@@ -206,7 +206,7 @@ _SIDES = np.array([-1.0, 1.0])
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quadrature:
-    """How finely the sensor is computed."""
+    """Number of points that sample modulation and detector."""
 
     n_nodes: int = 2
     """Gauss-Legendre nodes per axis in a subaperture."""

@@ -1,4 +1,4 @@
-"""How far the telescope is from the drawing, and what that does to light and slopes.
+"""How the telescope departs from its drawing.
 
 One record for every plant. A calibration must survive all of it, so each is an option with a
 default, and ``realistic`` is a mix of them all.
@@ -26,7 +26,7 @@ _NCPA_FIRST_SHAPE = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imperfections:
-    """How far the plant is from the drawing."""
+    """Departures of the plant from the drawing."""
 
     unevenness: float = 0.10
     """Largest departure of the illumination from its mean, ratio of the flux."""
@@ -82,7 +82,7 @@ SETS = {
 
 
 class SlopeErrors:
-    """What becomes of light and slopes: dark pixels, silent subapertures, turned axes.
+    """Errors of light and slopes: dark pixels, silent subapertures, turned axes.
 
     The flux that dead pixels lack is missing in the mean that normalises every other slope, too.
     """
@@ -117,11 +117,11 @@ class SlopeErrors:
         return bool(self._sine == 0.0 and not self.silent.any())
 
     def read(self, light: NDArray[Any]) -> NDArray[Any]:
-        """Return what reaches the detector's electronics of ``light`` ``(2, n, 2, n)``."""
+        """Return the part of ``light`` ``(2, n, 2, n)`` that the electronics read."""
         return np.where(self.dark, 0, light) if self.silent.any() else light
 
     def applied(self, slopes: Array32) -> Array32:
-        """Return what is read instead of ``slopes``, whose first axis is ``n_slopes``."""
+        """Return the slopes with these errors; the first axis of ``slopes`` is ``n_slopes``."""
         if self.absent:
             return slopes
         along_x, along_y = before = slopes_of(slopes, self.recipe.kind)

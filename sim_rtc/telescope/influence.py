@@ -1,4 +1,4 @@
-"""Influence functions from a file: a mirror as somebody measured or computed it.
+"""Influence functions from a file.
 
 The cube holds one map for each actuator. Between its points the surface is a cubic B-spline;
 beyond its edge, where nobody knows the mirror, it goes on at the height of the edge.
@@ -28,7 +28,7 @@ _REACH = np.arange(-1, 3)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InfluenceCube:
-    """What the mirror does for each actuator, its middle in the middle of the arrays."""
+    """The mirror's surface for each actuator, centred in the arrays."""
 
     maps: Array
     """``(n_actuators, ny, nx)`` OPD per OPD asked of the actuator; a row lies along x."""

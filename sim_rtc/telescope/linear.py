@@ -1,4 +1,4 @@
-"""A telescope that is linear: the slopes are ``K_eff turbulence + D G command``.
+"""A linear telescope: slopes are ``K_eff turbulence + D G command``.
 
 It differs from the service's model by its grid (q = 4), its quadrature and modulation points, by
 everything in ``Imperfections``, and by an optical gain for every mode.

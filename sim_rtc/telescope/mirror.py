@@ -1,4 +1,4 @@
-"""The deformable mirror: its shape between actuators, those that do not obey, limits and lag.
+"""The deformable mirror: shape, dead actuators, limits, lag.
 
 A diffractive telescope's influence functions are of another kind than the service's: a plate under
 tension on springs, where the service has a bare thin plate.
@@ -172,7 +172,7 @@ def misplaced(mirror: Mirror, position_error: float, rng: np.random.Generator) -
 def disobedient(
     surface: PlantSurface, mode_to_actuator: Array, faults: MirrorFaults
 ) -> tuple[Array, Array]:
-    """Return weights ``(n_basis, n_modes)`` of the modes and ``(n_basis,)`` of what is stuck.
+    """Return weights ``(n_basis, n_modes)`` of the modes and ``(n_basis,)`` of stuck actuators.
 
     A dead actuator goes where the surface takes it; a stuck one stays at its place whatever the
     modes ask for.
@@ -212,7 +212,7 @@ def heights(mirror: Mirror, strokes: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MirrorLimits:
-    """How far and how sharply the mirror may be bent, in OPD."""
+    """Largest stroke and slope of the mirror, in OPD."""
 
     stroke_m: float = 30e-6
     """Largest stroke of an actuator either way."""
@@ -222,7 +222,7 @@ class MirrorLimits:
 
 
 class MirrorDrive:
-    """Turns the modes asked for into those on the mirror: limits first, then the lag.
+    """Turns the commanded modes into those on the mirror: limits first, then the lag.
 
     A first-order response spends part of every exposure on its way: what counts, and what the
     telemetry tells, is the mean over the exposure.
@@ -250,7 +250,7 @@ class MirrorDrive:
         self._dither = np.zeros(n_modes, dtype=np.float32)
 
     def follow(self, command_m: Array32, dither_m: Array32 | None) -> int:
-        """Replace a command and its dither part by what the mirror makes of them.
+        """Replace a command and its dither part by the mirror's response.
 
         Both are ``(n_modes,)``. Returns the number of actuators that met a limit.
         """

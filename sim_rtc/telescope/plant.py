@@ -1,4 +1,4 @@
-"""What every simulated telescope is made of: a pupil, a mirror, and errors of both and the sensor.
+"""The base of every simulated telescope: pupil, mirror, sensor, errors.
 
 It differs from the service's model of it by its grid and by everything in ``Imperfections``.
 """
@@ -38,7 +38,7 @@ _RENDER_ROWS = 512
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Optics(ABC):
-    """What the telescope does to a wavefront at one registration."""
+    """The telescope's effect on a wavefront at one registration."""
 
     alpha: Misregistration
     """Where the mirror truly lies on the sensor."""
@@ -70,7 +70,7 @@ class Optics(ABC):
 
 
 class Departures(TypedDict, total=False):
-    """How a telescope departs from the drawing; only the random numbers must be given."""
+    """Departures of a telescope from the drawing; only the random numbers are needed."""
 
     rng: Required[np.random.Generator]
     imperfections: Imperfections
@@ -136,7 +136,7 @@ class Plant(ABC):
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _render(self, alpha: Misregistration) -> tuple[Array32, Array32]:
-        """Return the modes ``(n_points, n_modes)`` and what is stuck ``(n_points,)``, seen once."""
+        """Return modes ``(n_points, n_modes)`` and stuck actuators ``(n_points,)``, seen once."""
         points = self._points
         if self._instrument.stop is Stop.TELESCOPE:
             points = points - alpha.vector[:2]

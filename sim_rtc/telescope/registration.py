@@ -1,4 +1,4 @@
-"""The true registration in motion, and the optics that go with it.
+"""The true registration over time, and the optics for it.
 
 It is constant, drifts, flexes, wanders, jumps. A new registration takes seconds to compute: a
 jump's optics are prepared in the background from the moment the previous one is in place; if they
@@ -118,7 +118,7 @@ class Walk(Change):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Schedule:
-    """Where the mirror lies on the sensor at any time of the run."""
+    """The mirror's place on the sensor at any time of the run."""
 
     start: Misregistration
     """At time 0."""
@@ -221,7 +221,7 @@ class MovingOptics:
         executor: Executor,
         prepare: Callable[[Optics], None] | None = None,
     ) -> None:
-        """Take what else is to be done with new optics before the loop sees them."""
+        """Take a function that prepares new optics before the loop uses them."""
         self._plant = plant
         self._prepare = prepare
         self._schedule = schedule

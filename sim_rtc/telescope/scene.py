@@ -1,4 +1,4 @@
-"""Where the light comes from: a star through the atmosphere, or a fibre in the dome.
+"""The light source: a star through the atmosphere, or a fibre in the dome.
 
 By night (``onsky``) a star is seen through turbulence, once over the mirror, past the spider. By
 day (``daytime``) a fibre's light goes over the mirror, to a retro-reflector and back over the
@@ -29,7 +29,7 @@ _CELL_SAMPLES = 4
 
 
 class SceneKind(StrEnum):
-    """What is looked at."""
+    """Kinds of scenes."""
 
     ONSKY = "onsky"
     """A star: atmosphere, the mirror seen once, spider arms if any."""
@@ -49,13 +49,13 @@ class Spiders:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """What is looked at, and through what."""
+    """The light source and the air before it."""
 
     kind: SceneKind = SceneKind.ONSKY
     spiders: Spiders | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what no dome has.
+        """Refuse settings that no dome allows.
 
         Raises
         ------
@@ -69,7 +69,7 @@ class Scene:
 
     @property
     def passes(self) -> int:
-        """How often the light meets the mirror: a command's slopes are so many times larger."""
+        """Number of times the light meets the mirror; a command's slopes grow by it."""
         return 2 if self.kind is SceneKind.DAYTIME else 1
 
     def light(self, pupil: PupilGrid, subaperture_m: float) -> PupilGrid:
@@ -83,7 +83,7 @@ class Scene:
 
 
 class PlayedTurbulence:
-    """Turns turbulence over the pupil into the modal commands that play it on the mirror.
+    """Turns turbulence over the pupil into modal commands that play it on the mirror.
 
     The sensor meets the mirror twice, so half of it is played: what the sensor sees has the seeing
     that was asked for. The commands are those of an aligned mirror, as a file of them would be.
@@ -134,7 +134,7 @@ class Elevation:
     azimuth_deg: float = 180.0
 
     def at(self, time_s: float) -> Pointing:
-        """Return where the telescope looks at this time; it goes no further than the zenith."""
+        """Return the pointing at this time; it goes no further than the zenith."""
         elevation = self.start_deg + self.rate_deg_per_minute * time_s / 60.0
         for begin_s, by_deg in self.slews:
             done_deg = min(max(time_s - begin_s, 0.0) * SLEW_DEG_PER_S, abs(by_deg))

@@ -1,4 +1,4 @@
-"""What comes to the sensor besides the mirror's doing: turbulence, vibrations, played commands."""
+"""Turbulence, vibrations and played commands on the sensor."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FRAMES_TOGETHER = 100
 
 
 class TurbulentFrames:
-    """Consecutive frames of turbulence: phases, or what a linear response makes of them."""
+    """Consecutive frames of turbulence: phases, or a linear response to them."""
 
     def __init__(self, parts: list[_Between]) -> None:
         """Take where the frames lie in each layer."""
@@ -71,7 +71,7 @@ class Sky:
     """By day: the turbulence is played on the mirror and nothing of it is in the air."""
 
     def seen(self, time_s: Array) -> tuple[Array32, Array32 | None]:
-        """Return what comes in, ``(n_frames, n_points)`` OPD, and the played commands, metres.
+        """Return the incoming OPD ``(n_frames, n_points)`` and the played commands, metres.
 
         The commands are ``(n_frames, n_modes)``; None: nothing is played.
         """
@@ -185,7 +185,7 @@ class SeeingSchedule:
 
 
 class Shape(StrEnum):
-    """What vibrates."""
+    """Shapes of vibrations."""
 
     TIP = "tip"
     """Tilt of the wavefront along +x."""

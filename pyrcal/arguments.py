@@ -16,11 +16,11 @@ from service.cli import arguments as service_arguments
 from service.cli.arguments import OneLineParser
 
 OTHER_PROGRAMS = {
-    "demo": ("studies.demo", "the main job, end to end, on a simulated telescope"),
+    "demo": ("studies.demo", "service and simulated telescope, end to end"),
     "sim": ("sim_rtc", "the simulated RTC"),
-    "check-rtc": ("check_rtc", "whether an RTC keeps the contract"),
+    "check-rtc": ("check_rtc", "check whether an RTC keeps the contract"),
     "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
-    "campaign": ("studies.campaign", "many simulated nights"),
+    "campaign": ("studies.campaign", "play many simulated nights"),
 }
 """Module and purpose of what is run in this program's place, with options of its own."""
 

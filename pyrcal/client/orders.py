@@ -129,7 +129,7 @@ def _progress(service: Service, request: Request, options: argparse.Namespace) -
     copies = [
         one for name, one in every if name not in options.known and one["parent"] == options.source
     ]
-    judged = {"id": options.source, "state": "proposed", "reason": "judged before it is sent again"}
+    judged = {"id": options.source, "state": "proposed", "reason": "judged again before it is sent"}
     return copies[-1] if copies else judged
 
 
@@ -175,7 +175,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
                 told = step.text
                 time.sleep(LOOK_S)
     except KeyboardInterrupt:
-        say("it goes on; pyrcal watch shows how far it is")
+        say("the work goes on; pyrcal watch shows it")
         raise
     if options.json:
         print_document(document)

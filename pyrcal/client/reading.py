@@ -74,7 +74,7 @@ def _reconstructors(document: Document) -> Iterator[str]:
         for one in document["reconstructors"]
     ]
     yield from table(rows)
-    yield "* in use" if any(row[0] for row in rows) else "which is in use is not known"
+    yield "* in use" if any(row[0] for row in rows) else "the one in use is unknown"
 
 
 def _alpha(document: Document) -> Iterator[str]:
@@ -97,7 +97,7 @@ def _alarms(state: Document) -> Iterator[str]:
     for note in muted:
         who, until = note["muted"]["by"] or "nobody named", clock(note["muted"]["until_utc"])
         yield f"{note['name']} is muted until {until} by {who}"
-    counts = ((lasting, "to be seen to"), (gone, "over, unseen"), (muted, "muted"))
+    counts = ((lasting, "active"), (gone, "over, unseen"), (muted, "muted"))
     yield ", ".join(f"{len(some)} {word}" for some, word in counts if some) or "no alarm lasts"
 
 

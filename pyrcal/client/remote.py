@@ -21,7 +21,7 @@ from service import errors
 from service.errors import ConfigurationError, say
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
-"""Exit statuses; 2 is that of a command line that makes no sense."""
+"""Exit statuses; 2 is that of a command 2 a command."""
 
 USUAL_URL = "http://127.0.0.1:8080"
 ORDERS: Final = tomllib.loads(
@@ -34,7 +34,7 @@ URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
 
 _EPILOG = """
 Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a command
-line that makes no sense, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for
+2 a command, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for
 --url and the key's file.
 """
 
@@ -130,17 +130,17 @@ def _numbers(kind: type[int] | type[float]) -> Any:  # noqa: ANN401 - argparse's
     return read
 
 
-_ID = words("id ID", "a reconstructor, or in-use, previous, candidate")
-_ALARM = words("id ALARM", "its name: pyrcal alarms")
+_ID = words("id ID", "id of a reconstructor, or in-use, previous, candidate")
+_ALARM = words("id ALARM", "name of an alarm, as in pyrcal alarms")
 _CANDIDATE = words("id ID", "default: the one proposed last", nargs="?", default="candidate")
-_MODES = words("--modes N,...|controlled|all", "of the basis", type=_numbers(int))
-_RECORDING = words("id ID", "of a recording: pyrcal archive list")
-_LASTS = words("--duration-s S", "how long", type=float)
+_MODES = words("--modes N,...|controlled|all", "modes of the basis", type=_numbers(int))
+_RECORDING = words("id ID", "id of a recording, as in pyrcal archive list")
+_LASTS = words("--duration-s S", "duration, seconds", type=float)
 _EACH = words("--amplitude-m M", "RMS of each mode, metres OPD", type=float)
-_LINES = words("--frequency-hz HZ,...", "a line for each", type=_numbers(float))
+_LINES = words("--frequency-hz HZ,...", "line of each mode", type=_numbers(float))
 _TOTAL = words("--total-amplitude-m M", "RMS of all random signs", type=float)
-_OVER = words("--over-budget", "more than it is meant", default=None)
-_NO_WAIT = words("--no-wait", "do not wait for its end")
+_OVER = words("--over-budget", "allow more than the budget", default=None)
+_NO_WAIT = words("--no-wait", "do not wait for the end")
 _SINCE = words("--since TIME", "RFC 3339, like 2026-03-01T20:00:00Z")
 _UNTIL = words("--until TIME", "up to this time")
 
@@ -148,46 +148,46 @@ RECONSTRUCTORS = "/v1/reconstructors"
 _RESUMES = "pyrcal mode propose, or auto, ends it"
 
 REQUESTS = (
-    _reads("status", "what the service does, on one screen", "/v1/state"),
-    _reads("alpha", "where the mirror is, and how sure that is", "/v1/alpha"),
+    _reads("status", "show what the service does, on one screen", "/v1/state"),
+    _reads("alpha", "show where the mirror lies, with 1 sigma", "/v1/alpha"),
     _reads(
         "reconstructors",
-        "the reconstructors, or all about one",
+        "list the reconstructors, or show one",
         "/v1/reconstructors",
-        words("id ID", "one, or in-use, previous, candidate", nargs="?"),
+        words("id ID", "id of one; or in-use, previous, candidate", nargs="?"),
     ),
-    _reads("alarms", "the alarms that last, and what to do", "/v1/state"),
+    _reads("alarms", "list the alarms, with what to do", "/v1/state"),
     _reads(
         "audit",
-        "who ordered what, why, and what came of it",
+        "list who ordered what, why, and the outcome",
         "/v1/audit",
-        *(_SINCE, _UNTIL, words("--limit N", "newest entries; 200", type=int)),
+        *(_SINCE, _UNTIL, words("--limit N", "number of newest entries; default 200", type=int)),
     ),
-    _reads("watch", "what it does, live, until Ctrl-C", "/v1/stream", by="watch"),
+    _reads("watch", "show state and log live, until Ctrl-C", "/v1/stream", by="watch"),
     _reads(
         "export",
-        "the history of alpha, the audit trail or a matrix, to a file",
+        "write the history of alpha, the audit trail or a matrix to a file",
         "",
         words(
             "what",
-            "alpha: what the service remembers of it; the others: from its archive",
+            "alpha: its history; the others: from the archive",
             choices=("alpha", "audit", "reconstructor", "measurement", "noisy-matrix", "recording"),
         ),
-        words("id ID", "of a matrix; or in-use, previous", nargs="?"),
+        words("id ID", "id of a matrix; or in-use, previous", nargs="?"),
         words("--format F", "alpha, audit: csv, jsonl; matrices: npy, hdf5..."),
-        words("--output FILE", "default: a name of its own, here", type=Path),
+        words("--output FILE", "default: a new name in this folder", type=Path),
         *(_SINCE, _UNTIL),
         by="export",
     ),
     _orders(
         "approve",
-        "send the reconstructor that is proposed",
+        "send the proposed reconstructor",
         *(_CANDIDATE, _NO_WAIT),
         asks="send it to the RTC",
     ),
     _orders(
         "reject",
-        "discard the reconstructor that is proposed",
+        "discard the proposed reconstructor",
         _CANDIDATE,
         needs_why=True,
     ),
@@ -199,7 +199,7 @@ REQUESTS = (
     ),
     _orders(
         "rollback",
-        "go back to the reconstructor before; mode becomes hold",
+        "send the previous reconstructor again; mode becomes hold",
         words("--anyway", "even if the gate refuses it: alpha may be what is wrong", default=None),
         _NO_WAIT,
         asks="go back to the one before; mode becomes hold",
@@ -208,14 +208,14 @@ REQUESTS = (
     ),
     _orders(
         "hold",
-        "only measure: make and send nothing by itself",
+        "set mode hold: measure, make and send nothing",
         operation="mode",
         always={"mode": "hold"},
         then=_RESUMES,
     ),
     _orders(
         "mode",
-        "how much it may do by itself",
+        "set how much the service may do by itself",
         words("mode", choices=("auto", "propose", "hold")),
     ),
     _orders(
@@ -225,16 +225,16 @@ REQUESTS = (
     ),
     _orders(
         "resume",
-        "release what pyrcal stop has stopped (hold is ended by pyrcal mode)",
+        "end pyrcal stop (pyrcal mode ends hold)",
     ),
     _orders(
         "acknowledge",
-        "say that an alarm is known of; it stays for as long as it lasts",
+        "acknowledge an alarm; it stays until it is over",
         _ALARM,
     ),
     _orders(
         "mute",
-        "show an alarm no more for a time; it is counted",
+        "hide an alarm for a time; it is still counted",
         *(_ALARM, words("for_s SECONDS", "twelve hours at most", type=float)),
     ),
     _orders("unmute", "show an alarm again", _ALARM),
@@ -247,15 +247,13 @@ REQUESTS = (
     ),
     _orders(
         "refit",
-        "compute a reconstructor for the alpha of now",
+        "compute a reconstructor for the present alpha",
         *(words("--n-modes N", "to control; default: as many as now", type=int), _NO_WAIT),
     ),
-    _orders(
-        "abort", "end an acquisition under way", operation="acquisition", always={"action": "abort"}
-    ),
+    _orders("abort", "end the acquisition", operation="acquisition", always={"action": "abort"}),
     _orders(
         "acquire",
-        "find alpha from nothing: open the loop, look, close it step by step",
+        "find alpha from nothing: open the loop, dither, close it step by step",
         _NO_WAIT,
         operation="acquisition",
         always={"action": "start"},
@@ -264,9 +262,9 @@ REQUESTS = (
     ),
     _orders(
         "measure",
-        "have the RTC measure an interaction matrix; all but a sine open the loop",
+        "have the RTC measure an interaction matrix; all patterns but sine open the loop",
         words("--pattern NAME", "push-pull-modal, hadamard, sine, ..."),
-        words("--n-average N", "pushes, and pulls, of each", type=int),
+        words("--n-average N", "pushes and pulls of each", type=int),
         *(_MODES, _EACH, _LINES, _LASTS, _NO_WAIT),
         asks="have the RTC measure; all patterns but sine open the loop",
     ),
@@ -277,28 +275,32 @@ REQUESTS = (
     ),
     _records(
         "record",
-        "keep the telemetry that comes from now on, byte for byte; a minute if not told otherwise",
+        "record telemetry from now on, byte for byte; default one minute",
         "POST /v1/recordings",
-        *(_LASTS, words("--before-s S", "of what came before, 60 at most", type=float), _NO_WAIT),
+        *(
+            _LASTS,
+            words("--before-s S", "include the last S seconds, 60 at most", type=float),
+            _NO_WAIT,
+        ),
         follows="/v1/recordings/{id}",
     ),
     _records(
         "end-recording",
-        "keep no more of it; what there is stays",
+        "end a recording; its file stays",
         "POST /v1/recordings/{id}/end",
         _RECORDING,
     ),
     _records(
         "remove-recording",
-        "remove telemetry that was kept, for good",
+        "remove a recording for good",
         "DELETE /v1/recordings/{id}",
         _RECORDING,
         asks="remove it for good",
     ),
     _orders(
         "give-up",
-        "wait no longer for a matrix that is measured",
-        words("id ID", "of the measurement"),
+        "stop waiting for a measured matrix",
+        words("id ID", "id of the measurement"),
     ),
 )
 """What there is, in the order of ``pyrcal --help``."""
@@ -313,15 +315,17 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         parser.set_defaults(request=request, module=__name__)
         add(parser, *request.words)
         if request.module == "orders":
-            add(parser, words("--why WHY", "kept in the audit trail", default=""))
+            add(parser, words("--why WHY", "reason, kept in the audit trail", default=""))
             add(parser, words("--who WHO", "your name; default: the login name"))
         if request.asks:
             add(parser, words("--yes", "do it without asking"))
         add(
             parser,
             words("--json", "print what REST answers"),
-            words("--url URL", f"of the service, default {URL}, else {USUAL_URL}"),
-            words("--key-file FILE", f"default {KEY}", type=Path),
+            words("--url URL", f"address of the service; default {URL}, else {USUAL_URL}"),
+            words(
+                "--key-file FILE", f"file with the API key; default: the key in {KEY}", type=Path
+            ),
         )
 
 

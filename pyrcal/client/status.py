@@ -24,7 +24,7 @@ def status_lines(state: Document) -> list[str]:
     lines = [f"{state['system']}: {doing}; mode {state['mode']}, up {up}: {ready}"]
     lines += [f"ALARM {alarm_line(alarm, state)}" for alarm in worst_first(state)]
     gone = ", ".join(alarm["name"] for alarm in state["stale_alarms"])
-    lines += [f"gone, and nobody has acknowledged: {gone}; pyrcal alarms has them"] if gone else []
+    lines += [f"over and not acknowledged: {gone}; see pyrcal alarms"] if gone else []
     alarms = {alarm["name"] for alarm in state["alarms"]}
     lines += [
         f"waits for the {wait['responsible']}: {wait['text']}"
@@ -54,7 +54,7 @@ def alarm_line(alarm: Document, state: Document) -> str:
 
 def _rtc(state: Document) -> list[str]:
     rtc, link = state["rtc"], state["link"]
-    loop = "none has been heard, or it has vanished"
+    loop = "none seen yet, or it has vanished"
     if rtc is not None:
         loop = (
             f"loop {rtc['loop']} at {rtc['frame_rate_hz']:g} Hz, {rtc['n_controlled']} of "

@@ -26,10 +26,12 @@ seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 36
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
-    _describe_archive(commands.add_parser("archive", help="what is kept, and is it sound?"))
-    _describe_fit(commands.add_parser("fit", help="the registration in a measured matrix"))
+    _describe_archive(
+        commands.add_parser("archive", help="list, verify, prune or export what is archived")
+    )
+    _describe_fit(commands.add_parser("fit", help="fit the registration to a measured matrix"))
     _describe_reconstruct(
-        commands.add_parser("reconstruct", help="a reconstructor for a known registration")
+        commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
     )
 
 
@@ -50,17 +52,17 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
     aot = (
         words("output FILE.fits", type=Path),
         words("--instrument NAME|FILE", "default: that of the settings"),
-        words("--recording FILE", "of pyrcal sim --record", type=Path),
-        words("--skip S", "of the recording", type=seconds, default=0.0),
-        words("--seconds S", "of it, default %(default)g", type=seconds, default=10.0),
-        words("--night DATE", "of the evening, UTC; else of the recording"),
+        words("--recording FILE", "a file of pyrcal sim --record", type=Path),
+        words("--skip S", "seconds of the recording to skip", type=seconds, default=0.0),
+        words("--seconds S", "seconds to take, default %(default)g", type=seconds, default=10.0),
+        words("--night DATE", "date of the evening, UTC; default that of the recording"),
     )
     actions = archive.add_subparsers(dest="action", required=True)
     for action, purpose, more in (
-        ("list", "all, oldest first, and why one stays", ()),
-        ("show", "what is known of one", (words("id ID"),)),
-        ("verify", "read all of them and compare checksums", ()),
-        ("aot", "α and telemetry as an AOT FITS file", aot),
+        ("list", "list all, oldest first, and why one stays", ()),
+        ("show", "show one", (words("id ID"),)),
+        ("verify", "read all and compare checksums", ()),
+        ("aot", "write α and telemetry as AOT FITS", aot),
         ("prune", "remove what [archive] lets go", (words("--dry-run", "only say what would go"),)),
     ):
         parser = actions.add_parser(action, help=purpose)
@@ -98,18 +100,15 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
         "sensitivity: projection on sensitivity matrices"
     )
     modes = "basis indices to use, like 0:400 (400 is not) or 3,5,9; default all"
-    start = "where to begin: subapertures, degrees, ratio"
-    flux = "mean counts of the four pupil images, array flux (4, n, n): the model is lit as it says"
-    reference = "a flux map of another day: by how much the light is turned since is told"
-    arms = (
-        "the spider's arms at rotation 0: the rotation is told that their shadows in the "
-        "flux map have"
-    )
+    start = "start of the fit: subapertures, degrees, ratio"
+    flux = "mean counts of the four pupil images, array flux (4, n, n), to light the model"
+    reference = "a flux map of another day: report how far the light has turned since"
+    arms = "the spider's arms at rotation 0: report the rotation of their shadows in the flux map"
     add(
         fit,
         _INSTRUMENT,
         words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
-        words("--dataset NAME", "of the matrix, default interaction_matrix"),
+        words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
         words("--method", methods, choices=("joint", "paper", "sensitivity"), default="joint"),
         words("--modes FIRST:END", modes, type=_read_by(parse_modes)),
         words("--start X,Y,ROT,MAG", start, type=_read_by(parse_alpha)),
@@ -123,11 +122,11 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     cores = os.cpu_count() or 1
     add(
         fit,
-        words("--gain-map", "fit a gain over the pupil, too"),
-        words("--anamorphosis", "fit a stretched image, too"),
+        words("--gain-map", "also fit a smooth gain over the pupil"),
+        words("--anamorphosis", "also fit a stretched image"),
         words("--json", "print one JSON object, not a table"),
         words("--plot FILE.png", "write the paper's figures", type=Path),
-        words("--output FILE.h5", "write all that was found", type=Path),
+        words("--output FILE.h5", "write everything found", type=Path),
         words("--threads N", "default: one for every core", type=_count, default=cores),
     )
 
@@ -159,7 +158,7 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         condition,
         words("--slope-noise RMS", noise, type=float, default=0.05),
         words("--no-gains", gains),
-        words("--flux-map FILE", "as of pyrcal fit: the model is lit like it", type=Path),
+        words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),
     )
 

@@ -27,7 +27,7 @@ def main(folder: Path) -> int:
         fit_upload(folder, request)
     except PyrcalError as error:
         return _failed(str(error))
-    except MemoryError:
+    except (MemoryError, SystemError):  # the latter: an extension module got no memory
         return _failed(f"needs more memory than {request.memory_mb} MB, the most it may have")
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed fit
         return _failed(f"failed unforeseen: {error!r}")

@@ -25,7 +25,7 @@ _ENDPOINT = re.compile(r"[\w-]+/\S+")
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
     _describe_run(commands.add_parser("run", help="the service"))
-    _describe_key(commands.add_parser("key", help="who may ask: make, list, revoke API keys"))
+    _describe_key(commands.add_parser("key", help="make, list, revoke API keys"))
 
 
 def _describe_run(run: argparse.ArgumentParser) -> None:
@@ -44,8 +44,8 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
     usual = "zenoh, default tcp/127.0.0.1:7447"
     run.add_argument("--listen", metavar="ENDPOINT", help=usual, type=endpoint)
     run.add_argument("--connect", metavar="ENDPOINT", help=router, type=endpoint)
-    run.add_argument("--host", metavar="HOST", help="of the REST API, default 127.0.0.1")
-    run.add_argument("--port", metavar="PORT", help="of the REST API, default 8080", type=port)
+    run.add_argument("--host", metavar="HOST", help="address of the REST API, default 127.0.0.1")
+    run.add_argument("--port", metavar="PORT", help="port of the REST API, default 8080", type=port)
     run.add_argument("--log-format", help=formats, choices=logs)
 
 
@@ -58,18 +58,18 @@ def _describe_key(key: argparse.ArgumentParser) -> None:
     key.epilog = "Exit status: 0 done, 2 it cannot be done."
     settings = "the service's settings, TOML"
     where = "the service's data_dir, default that of the one that runs, else var"
-    scopes = "read: look; operate: give orders, too; admin: also see who has a key, and revoke one"
+    scopes = "read: read everything; operate: give orders, too; admin: also list and revoke keys"
     actions = key.add_subparsers(dest="action", required=True)
     for action, purpose in (
-        ("add", "make a key, and show it this once"),
-        ("revoke", "make one worthless"),
-        ("list", "who has a key, and for what"),
+        ("add", "make a key and print it, this once"),
+        ("revoke", "revoke a key"),
+        ("list", "list the keys and their scopes"),
     ):
         parser = actions.add_parser(action, help=purpose)
         parser.add_argument("--config", metavar="FILE", help=settings, type=Path)
         parser.add_argument("--data-dir", metavar="DIR", help=where)
         if action != "list":
-            parser.add_argument("name", metavar="NAME", help="of the person, program or place")
+            parser.add_argument("name", metavar="NAME", help="name of the person, program or place")
         if action == "add":
             choices = ("read", "operate", "admin")
             parser.add_argument("--scope", help=scopes, choices=choices, required=True)

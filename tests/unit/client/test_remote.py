@@ -262,7 +262,7 @@ def test_what_goes_out_again_is_followed_until_the_rtc_has_applied_it(
     at_the_next_look(monkeypatch, lambda: service.change(reconstructors=next(coming)))
     assert main([*words, "--yes"]) == 0
     told = capsys.readouterr()
-    assert "cm-0 is proposed: judged before it is sent again" in told.err
+    assert "cm-0 is proposed: judged again before it is sent" in told.err
     assert told.out.splitlines()[-1] == "cm-2 is applied"
 
 

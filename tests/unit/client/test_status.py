@@ -77,7 +77,7 @@ def test_it_says_why_the_last_window_was_refused():
 
 def test_a_service_that_knows_nothing_says_so():
     text = "\n".join(status_lines(told(tracker_state(system="small", mode=STATE.operator.mode))))
-    assert "none has been heard" in text
+    assert "none seen yet" in text
     assert "not known yet" in text
     assert "unknown in use, not judged" in text
 

@@ -16,8 +16,10 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.peers import hcipy_slopes
 from service.config import load_instrument
-from service.model.interaction import InteractionModel, reference_slopes
+from service.model.interaction import InteractionModel
 from service.model.modes import karhunen_loeve_basis
+from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.signals import reference_slopes
 from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
 
 MODES = (0, 1, 2, 5, 20, 50, 100, 200, 300, 399)
@@ -37,7 +39,7 @@ def main() -> None:
     model = InteractionModel(instrument, basis, pupil_sampling=JUDGE_SAMPLING, detector_nodes=1)
     judge = hcipy_slopes(model)
     pupil = centred_pupil(instrument, 3)
-    pyramid = DiffractivePyramid(instrument.wfs, pupil)
+    pyramid = DiffractivePyramid(pyramid_in(instrument), pupil)
 
     def judged(mode: int, sign: float) -> Array:
         opd_m = np.zeros_like(model.pupil.amplitude)

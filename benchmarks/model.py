@@ -29,7 +29,7 @@ from service.config import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from service.model.pyramid import Mapper
+from service.model.sensors.sensor import Mapper
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.model.interaction import InteractionModel
+from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.optics import enough_modulation_points
+from service.model.sensors.sensor import Fineness
 from tests.physics.fft_pyramid import FftPyramid
 
 MODES = (0, 50, 200, 400)
@@ -33,7 +36,7 @@ class Measured:
 
 def fft_reference(model: InteractionModel) -> Measured:
     """Run the FFT pyramid of ``tests/physics``: same sampling, quadrature and modulation."""
-    wfs = model.instrument.wfs
+    wfs = pyramid_in(model.instrument)
     reference = FftPyramid(
         amplitude=model.pupil.amplitude,
         sampling=model.pupil.sampling,
@@ -41,8 +44,8 @@ def fft_reference(model: InteractionModel) -> Measured:
         n_subapertures=wfs.n_subapertures,
         image_separation_subap=wfs.image_separation_subap,
         modulation_lambda_over_d=wfs.modulation_lambda_over_d,
-        n_modulation=model.optics.n_modulation,
-        n_nodes=model.optics.n_nodes,
+        n_modulation=enough_modulation_points(wfs),
+        n_nodes=Fineness().n_nodes,
     )
     return _push_pull(lambda opd_m: reference.slopes(opd_m, model.valid), model)
 
@@ -58,7 +61,7 @@ def hcipy_slopes(
     """Return HCIPy's slopes as a function of the OPD ``(n, n)`` on the model's pupil grid."""
     import hcipy
 
-    wfs, diameter_m = model.instrument.wfs, model.instrument.diameter_m
+    wfs, diameter_m = pyramid_in(model.instrument), model.instrument.diameter_m
     n_detector = round(wfs.n_subapertures + wfs.image_separation_subap)
     pupil = hcipy.make_pupil_grid(len(model.pupil.coordinates), diameter_m)
     detector = hcipy.make_pupil_grid(
@@ -73,7 +76,7 @@ def hcipy_slopes(
             wavelength_0=wfs.wavelength_m,
         ),
         wfs.modulation_lambda_over_d * wfs.wavelength_m / diameter_m,
-        num_steps=model.optics.n_modulation,
+        num_steps=enough_modulation_points(wfs),
         fast_modulation_method=True,
     )
     amplitude = model.pupil.amplitude

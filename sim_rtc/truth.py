@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import queue
 from collections import deque
 from collections.abc import Iterator
@@ -283,7 +284,7 @@ def write_snapshot(telescope: Telescope, path: Path) -> None:
     slope = 3.0 * float(np.nanstd(rows[0].slopes))
     for moment, (images, along_x, along_y, left) in zip(rows, axes, strict=True):
         images.set_ylabel(f"frame {moment.frame}")
-        _show(images, moment.images, "four pupil images, mean 1", (0.0, None), "inferno")
+        _show(images, moment.images, "light, mean 1", (0.0, None), "inferno")
         for axis, values, name in zip((along_x, along_y), moment.slopes, "xy", strict=True):
             _show(axis, values, f"slopes along {name}", (-slope, slope), "RdBu_r")
         title = f"residual wavefront in nm, {moment.error_nm:.0f} RMS"
@@ -313,14 +314,14 @@ def _moment(telescope: Telescope, batch: Batch, frame: int) -> Moment:
     light = optics.images
     if isinstance(optics, DiffractiveOptics):
         light = optics.light(opd_m.astype(np.float32)).astype(np.float64)
-    n = len(plant.valid)
-    share = light.sum(axis=(0, 2))[plant.valid].mean() / 4
+    n, side = len(plant.valid), math.isqrt(light.size)
+    share = light.reshape(-1)[plant.pixels].mean()
     maps = np.full((2, n, n), np.nan)
     maps[:, plant.valid] = slopes_of(batch.slopes[0], plant.slope_errors.recipe.kind)
     left_nm = (opd_m - plant.weights @ opd_m) * 1e9
     return Moment(
         frame=frame,
-        images=light.reshape(2 * n, 2 * n) / share,
+        images=light.reshape(side, side) / share,
         slopes=(maps[0], maps[1]),
         residual_nm=_on_grid(plant.points_m / plant.pitch_m, left_nm),
         error_nm=float(np.sqrt(plant.weights @ left_nm**2)),

@@ -25,7 +25,7 @@ from service.estimation.reference import Reference, Target, target_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from service.model.pyramid import Mapper
+from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
 from sim_rtc.telescope.imperfections import SETS
 from studies.fit_coverage import FIRST_SEED, N_MODES, measured

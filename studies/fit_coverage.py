@@ -26,10 +26,10 @@ from pyrcal.offline.matrix import FitOptions, fit_matrix
 from service.config import load_instrument
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
-from service.model.interaction import reference_slopes
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import Basis, ModalBasis, karhunen_loeve_basis
-from service.model.pyramid import Mapper
+from service.model.sensors.pyramid.signals import reference_slopes
+from service.model.sensors.sensor import Mapper
 from sim_rtc.telescope.detector import Camera, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import SETS

@@ -19,12 +19,17 @@ from pyrcal.offline.matrix import fit_matrix
 from service.config.mirrors import grid
 from service.estimation.reference import Reference
 from service.model.described import KarhunenLoeve
-from service.model.detector_windows import frame_windows, slopes_from_frames, slopes_per_unit
-from service.model.instrument import FrameWindows, Instrument, Mirror, Pyramid
-from service.model.interaction import rtc_valid_subapertures
+from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Normalisation, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import modal_basis
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.pyramid.description import FrameWindows, Pyramid, pyramid_in
+from service.model.sensors.pyramid.detector_windows import (
+    frame_windows,
+    slopes_from_frames,
+    slopes_per_unit,
+)
 from service.model.slopes import SlopeRecipe
 from sim_rtc.telescope.diffractive import DiffractivePyramid, centred_pupil
 
@@ -81,7 +86,7 @@ def centres_px(separation_px: int) -> Array:
 def exposed(instrument: Instrument, n: int, offsets_px: Array, modes: NDArray[np.intp]) -> Light:
     """Return the light on windows of ``n`` pixels, each image moved by its own offset."""
     pupil = centred_pupil(instrument, SAMPLING)
-    sensor = DiffractivePyramid(replace(instrument.wfs, n_subapertures=n), pupil)
+    sensor = DiffractivePyramid(replace(pyramid_in(instrument), n_subapertures=n), pupil)
     sensors = [sensor.at((column, row)) for row, column in offsets_px]
 
     def images(opd_m: Array) -> Array:
@@ -105,7 +110,10 @@ def main() -> None:
     options = parser.parse_args()
     instrument = bench(options.diameter_px)
     modes = np.union1d(np.arange(10), np.arange(0, 80, options.every))
-    n, separation = instrument.wfs.n_subapertures, int(instrument.wfs.image_separation_subap)
+    n, separation = (
+        instrument.wfs.n_subapertures,
+        int(pyramid_in(instrument).image_separation_subap),
+    )
     with threadpool_limits(1), ThreadPoolExecutor(2) as threads:
         frames = exposed(instrument, separation, OFFSETS_PX, modes)
         direct = exposed(instrument, n, np.zeros((4, 2)), modes)

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.estimation.light import CannotTell, find_pupil, measured_illumination
 from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
+from service.model.sensors.light import CannotTell
+from service.model.sensors.pyramid.light import PyramidLight, find_pupil, measured_illumination
 from studies.registered import PASSES, STROKE_M, Array, measured_by_day, registered
 
 N_FRAMES = 100
@@ -51,7 +52,8 @@ def main() -> None:
             measured, telescope = measured_by_day(words, given.averages)
             optics = telescope.optics.at(0.0)
             rng = np.random.default_rng(seed)
-            light = N_FRAMES * telescope.detector.counts(optics.images)
+            flux = telescope.detector.flux(optics.images) or b""
+            light = N_FRAMES * PyramidLight(instrument=instrument).counts_of(flux)
             counts = rng.poisson(light) / N_FRAMES
             position = find_pupil(counts, instrument)
             if isinstance(position, CannotTell):

@@ -25,10 +25,11 @@ from pyrcal.offline.matrix import fit_matrix
 from service.errors import PyrcalError
 from service.estimation.reference import Reference
 from service.model.described import InfluenceShape, KarhunenLoeve
-from service.model.instrument import Instrument, Mirror, Pyramid
+from service.model.instrument import Instrument, Mirror
 from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import karhunen_loeve_basis
+from service.model.sensors.pyramid.description import Pyramid
 from service.model.slopes import SlopeRecipe
 from studies.mistold_matrices import (
     COUPLING,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.figures import PAPER_MODES, check_plots
 from service.errors import MatrixError
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures, valid_subapertures
+from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import as_maps, to_conventions
 
 if TYPE_CHECKING:

@@ -17,6 +17,7 @@ from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis, karhunen_loeve_basis
+from service.model.sensors.pyramid.description import pyramid_in
 from studies.peers_pushpull import Bench
 
 Array = NDArray[Any]
@@ -122,14 +123,15 @@ def basis(influence: Influence) -> ModalBasis:
 def bench(case: Case) -> Bench:
     """Return what the peer is told of the optics."""
     shared, alpha = instrument(), case.alpha
+    wfs = pyramid_in(shared)
     moved = case.stop is Stop.MIRROR
     return Bench(
         diameter_m=shared.diameter_m,
         obscuration_ratio=shared.obscuration_ratio,
-        n_subapertures=shared.wfs.n_subapertures,
-        pupil_separation_subap=round(shared.wfs.image_separation_subap),
-        wavelength_m=shared.wfs.wavelength_m,
-        modulation_lambda_over_d=shared.wfs.modulation_lambda_over_d,
+        n_subapertures=wfs.n_subapertures,
+        pupil_separation_subap=round(wfs.image_separation_subap),
+        wavelength_m=wfs.wavelength_m,
+        modulation_lambda_over_d=wfs.modulation_lambda_over_d,
         n_modulation=N_MODULATION,
         sampling=SAMPLING,
         as_shipped=case.as_shipped,

@@ -21,11 +21,12 @@ from pyrcal.offline.matrix import Fit, fit_matrix
 from service.config import load_instrument
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
-from service.model.interaction import InteractionModel, reference_slopes
+from service.model.interaction import InteractionModel
 from service.model.kinds import SignalKind
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from service.model.pyramid import Mapper
+from service.model.sensors.pyramid.signals import reference_slopes
+from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
 from sim_rtc.telescope.detector import Camera, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractivePlant

@@ -11,9 +11,11 @@ from typing import Any
 
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import OTHER_PROGRAMS, command_line
-from service.config.instrument_schema import WHOLE
+from service.config.instrument_schema import whole_of
 from service.config.settings import Settings
 from service.config.sources import Table
+from service.model.sensors.kind import SensorKind
+from service.model.sensors.registry import KINDS
 from service.tracking.alarms import ALARMS
 from studies.contract_tables import described
 from studies.demo.arguments import demo_parser
@@ -65,7 +67,16 @@ def instrument() -> str:
         "explains orientation. A reference to data is `path:/dataset`, relative to the file. In "
         "brackets: type and default."
     )
-    return page("The instrument file", intro, *_tables(WHOLE))
+    first, *others = KINDS.values()
+    own = [part for kind in others for part in _sensor_table(kind)]
+    return page("The instrument file", intro, *_tables(whole_of(first)), *own)
+
+
+def _sensor_table(kind: SensorKind) -> list[str]:
+    """Return ``[wfs]`` of one kind of sensor: the other tables are alike."""
+    parts = list(_tables(whole_of(kind)))
+    start = parts.index("## [wfs]") + 1
+    return [f'## [wfs] with kind = "{kind.name}"', *parts[start : start + 2]]
 
 
 def _tables(whole: type[Table]) -> Iterator[str]:

@@ -26,7 +26,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
-from service.model.pyramid import Mapper
+from service.model.sensors.sensor import Mapper
 from service.model.tabulated import filled
 from studies.registered import against, step_of
 

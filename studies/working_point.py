@@ -21,7 +21,7 @@ from service.config import load_instrument
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.modes import karhunen_loeve_basis
-from service.model.turbulence import working_point
+from service.model.sensors.pyramid.working_point import working_point
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 from studies.optical_gain import PROBE_M, closed_loop, telescope_of
@@ -73,7 +73,7 @@ def main() -> None:
     def at_work(strength: float) -> InteractionModel:
         r0_m = instrument.modes.r0_m * strength ** (-3 / 5)
         halo = working_point(instrument, n_controlled=400, r0_m=r0_m, sampling=3)
-        return InteractionModel(instrument, basis, halo=halo)
+        return InteractionModel(instrument, basis, working_point=halo)
 
     flat, expected = InteractionModel(instrument, basis), at_work(1.0)
     sys.stdout.write(

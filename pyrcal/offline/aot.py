@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError, WireError
 from service.files.recording import RecordedKind, Recording
 from service.model.instrument import Instrument, Mirror
-from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.misregistration import Misregistration, rotation
+from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import to_conventions
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry

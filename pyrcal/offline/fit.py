@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pyrcal.offline.figures import check_plots, write_sheet
 from pyrcal.offline.fit_file import fit_file
-from pyrcal.offline.light import Light, read_light
+from pyrcal.offline.light import SeenLight, read_light
 from pyrcal.offline.light_rotation import Arms
 from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.report import document, fill_fit, table
@@ -67,7 +67,7 @@ def main(options: argparse.Namespace) -> int:
     return ACCEPTED if report.fit.accepted else REFUSED
 
 
-def _light(options: argparse.Namespace, instrument: Instrument) -> Light | None:
+def _light(options: argparse.Namespace, instrument: Instrument) -> SeenLight | None:
     reference: Path | Arms | None = options.flux_reference or options.arms
     if options.flux_map is not None:
         return read_light(options.flux_map, instrument, reference)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from pyrcal.offline.report import FitReport
 from service.errors import MatrixError
 from service.estimation.reference import Reference
 from service.files.container import FLUX_FRAME, Recorded, read_recorded
-from service.model.detector_windows import frame_windows, slopes_from_frames
-from service.model.instrument import FrameWindows, Instrument, instrument_sha256
+from service.model.instrument import Instrument, instrument_sha256
+from service.model.sensors.registry import kind_of
 
 Progress = Callable[[str], None]
 
@@ -86,7 +86,7 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
         notes.append("the noise in the measured file is of frames, not of slopes: not used")
     matrix = _slopes(recorded, instrument)
     if instrument.frames is not None and recorded.flux_frame is not None:
-        notes.extend(_windows_note(instrument, instrument.frames, recorded.flux_frame))
+        notes.extend(kind_of(instrument).remarks_on_frames(instrument, recorded.flux_frame))
     reference = Reference(
         matrix=matrix,
         modes=recorded.modes,
@@ -94,16 +94,6 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
         double_pass=double_pass,
     )
     return reference, tuple(notes)
-
-
-def _windows_note(
-    instrument: Instrument, frames: FrameWindows, flux_frame: NDArray[np.float64]
-) -> Iterator[str]:
-    """Yield where the pupil images were found, if the instrument file does not say."""
-    if frames.centres_px is None:
-        centres = frame_windows(instrument, flux_frame).centres_px.reshape(4, 2)
-        words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
-        yield f"shifts count from the pupil images as found: pupil_centres_px = [{words}]"
 
 
 def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
@@ -125,4 +115,5 @@ def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
             f"{recorded.where}: found no {FLUX_FRAME} beside it, expected a mean detector frame "
             "(ny, nx) in the same counts"
         )
-    return slopes_from_frames(instrument, recorded.values, recorded.flux_frame)
+    flux_frame = recorded.flux_frame
+    return kind_of(instrument).signals_of_frames(instrument, recorded.values, flux_frame)

@@ -21,8 +21,8 @@ from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]
 
-FITTED_KEYS = ("coupling", "modulation_lambda_over_d")
-"""Of the instrument file, for the width of influence functions and the modulation."""
+COUPLING_KEY = "coupling"
+"""Of the instrument file, for the width of influence functions."""
 
 NOTABLE = 0.03
 """A logarithm of the instrument's that differs by less from the file's is not worth a word."""
@@ -58,6 +58,9 @@ class FoundOptic:
     optic: Optic
     """Which."""
 
+    key: str
+    """Of the instrument file."""
+
     change: float
     """Found over told, as a logarithm."""
 
@@ -65,7 +68,7 @@ class FoundOptic:
     """1 σ of it."""
 
     found: float | None
-    """Coupling, or radius in λ/D; None: a width of influence functions without a coupling."""
+    """Coupling, or the sensor's number; None: a width of influence functions without a coupling."""
 
     reported: float | None
     """The same in the instrument file; None as above, or said to be unknown."""
@@ -75,14 +78,9 @@ class FoundOptic:
         """1 σ of the value found, in its own unit; of a width as its logarithm."""
         if self.found is None:
             return self.sigma
-        if self.optic is Optic.MODULATION:
+        if self.optic is Optic.SENSOR:
             return self.found * self.sigma
         return -2.0 * self.found * float(np.log(self.found)) * self.sigma
-
-    @property
-    def key(self) -> str:
-        """Its key in the instrument file."""
-        return FITTED_KEYS[self.optic is Optic.MODULATION]
 
     @property
     def found_words(self) -> str:
@@ -121,7 +119,7 @@ class AsTold:
 def rivals(settled: Settled) -> tuple[Rival, ...]:
     """Return other instruments, the one that explains the matrix best first.
 
-    Each is allowed its own registration, coupling and modulation, to first order about those found;
+    Each is allowed its own registration, coupling and sensor, to first order about those found;
     where the matrix cannot tell, it is fitted as well.
     """
     few, solution = Few(settled), settled.solution
@@ -165,16 +163,17 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
     """Return coupling and modulation as fitted; ``models`` are of the file's instrument."""
     nuisances = settled.nuisances
     changes = nuisances.changes(settled.solution.nuisances)
-    radius = models.instrument.wfs.modulation_lambda_over_d
+    number, sensor_key = models.sensor_number, models.sensor_key
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
-        told, value = radius, radius * float(np.exp(change))
+        told, value = number, number * float(np.exp(change))
         if optic is Optic.WIDTH and models.coupling is not None:
             told, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
         known = models.exact(optic)
         found.append(
             FoundOptic(
                 optic=optic,
+                key=sensor_key if optic is Optic.SENSOR and sensor_key else COUPLING_KEY,
                 change=change,
                 sigma=float(sure.nuisance_sigma[k]),
                 found=value if known else None,

@@ -1,35 +1,28 @@
-"""The light on the four pupil images, read from a file."""
+"""The light on a sensor, read from a file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.light_rotation import Arms, LightRotation, find_rotation
 from service.errors import MatrixError
-from service.estimation.light import (
-    CannotTell,
-    PupilPosition,
-    find_pupil,
-    measured_illumination,
-    relative_light,
-)
 from service.files.container import opened
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination
-from service.model.slopes import turned_mask
+from service.model.sensors.light import CannotTell, Light, PupilPosition
+from service.model.sensors.registry import kind_of
 
 FLUX = "flux"
 """Name of the array in its file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Light:
-    """The pupil images' light: evenness, place, rotation."""
+class SeenLight:
+    """The light's evenness, place, rotation."""
 
     illumination: Illumination
     """For the model's pupil amplitude."""
@@ -63,8 +56,10 @@ class Light:
                 )
 
 
-def read_light(path: Path, instrument: Instrument, reference: Path | Arms | None = None) -> Light:
-    """Read mean counts ``(4, n, n)``, the images in row-major order of their place on the detector.
+def read_light(
+    path: Path, instrument: Instrument, reference: Path | Arms | None = None
+) -> SeenLight:
+    """Read mean counts, ``(4, n, n)`` of a pyramid: the images as they lie on the detector.
 
     They are in the RTC's own axes, as slopes are, so the instrument must know these. A
     ``reference``, the counts of another day or the spider's arms at rotation 0, tells by how much
@@ -76,12 +71,13 @@ def read_light(path: Path, instrument: Instrument, reference: Path | Arms | None
     MatrixError
         If there are no such counts in a file, their axes are not known, or they show no pupil.
     """
-    counts, position = _read(path, instrument)
+    light = _light_of(path, instrument)
+    counts, position = _read(path, instrument, light)
     turn = None
     if reference is not None:
-        turn = _turn(relative_light(counts, instrument, position), position, instrument, reference)
-    illumination = measured_illumination(counts, instrument, position)
-    return Light(illumination=illumination, position=position, turn=turn)
+        turn = _turn(light.relative(counts, position), position, instrument, reference)
+    illumination = light.illumination(counts, position)
+    return SeenLight(illumination=illumination, position=position, turn=turn)
 
 
 def _turn(
@@ -103,37 +99,35 @@ def _turn(
 
 
 def _illumination(path: Path, instrument: Instrument) -> Illumination:
-    counts, position = _read(path, instrument)
-    return measured_illumination(counts, instrument, position)
+    light = _light_of(path, instrument)
+    counts, position = _read(path, instrument, light)
+    return light.illumination(counts, position)
 
 
-def _read(path: Path, instrument: Instrument) -> tuple[NDArray[np.float64], PupilPosition]:
+def _light_of(path: Path, instrument: Instrument) -> Light:
+    light = kind_of(instrument).light(instrument)
+    if isinstance(light, CannotTell):
+        raise MatrixError(f"{path}: {light.reason}")
+    return light
+
+
+def _read(
+    path: Path, instrument: Instrument, light: Light
+) -> tuple[NDArray[np.float64], PupilPosition]:
     """Return counts in the axes of conventions.md, and where they show the pupil."""
     if instrument.slopes.orientation is None:
         raise MatrixError(
             f'{path}: found slopes.orientation = "auto", expected it written down: which way a '
             "flux map lies it does not show; fit without it once, and copy what was found"
         )
-    n = instrument.wfs.n_subapertures
     with opened(path) as container:
         stored = container.find(FLUX)
         if stored is None:
             raise MatrixError(f"{path}: no dataset {FLUX}; it holds {container.listing()}")
-        if stored.shape != (4, n, n):
-            raise MatrixError(f"{stored.where}: found shape {stored.shape}, expected {(4, n, n)}")
-        counts = in_conventions(stored.numbers(), instrument)
-    position = find_pupil(counts, instrument)
+        if stored.shape != light.shape:
+            raise MatrixError(f"{stored.where}: found shape {stored.shape}, expected {light.shape}")
+        counts = light.turned(stored.numbers())
+    position = light.find_pupil(counts)
     if isinstance(position, CannotTell):
         raise MatrixError(f"{path}: {position.reason}")
     return counts, position
-
-
-def in_conventions(counts: NDArray[Any], instrument: Instrument) -> NDArray[Any]:
-    """Return counts ``(4, n, n)`` in the RTC's axes, in those of conventions.md.
-
-    A flip or a swap moves the images among one another, too.
-    """
-    n = counts.shape[-1]
-    detector = counts.reshape(2, 2, n, n).transpose(0, 2, 1, 3).reshape(2 * n, 2 * n)
-    turned = turned_mask(detector, instrument.slopes.assumed_orientation)
-    return np.ascontiguousarray(turned.reshape(2, n, 2, n).transpose(0, 2, 1, 3)).reshape(4, n, n)

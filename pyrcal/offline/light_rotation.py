@@ -14,9 +14,9 @@ import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.estimation.light import CannotTell, PupilPosition
 from service.estimation.solver import vertex
 from service.model.pupil import Illumination
+from service.model.sensors.light import CannotTell, PupilPosition
 
 Array = NDArray[np.float64]
 

@@ -42,12 +42,11 @@ from service.estimation.orientation import DOUBTFUL, MIN_CORRELATION, find_orien
 from service.estimation.reference import Reference, Target, checked, target_of
 from service.estimation.solver import nuisances_of
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import Method, Normalisation, SlopeOrder
 from service.model.misregistration import Determination, Misregistration
 from service.model.modes import Basis, modal_basis
-from service.model.pupil import Illumination
-from service.model.pyramid import Mapper
+from service.model.pupil import Illumination, rtc_valid_subapertures
+from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
 
 Array = NDArray[np.float64]

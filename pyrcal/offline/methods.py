@@ -88,11 +88,11 @@ N_LEFT_OUT = 10
 MAX_MODES = 60
 """Modes, spread over those fitted, that are compared where a few will do."""
 
-MODULATIONS = np.arange(-4, 5) * 0.3
-"""Logarithms of the factors that a modulation is looked for at, from a third to three."""
+CHANGES = np.arange(-4, 5) * 0.3
+"""Logarithms of the factors that the sensor's number is looked for at, from a third to three."""
 
 STRANGE = 0.05
-"""RMS share of the signal left over beyond which the modulation is looked for from afar, ..."""
+"""RMS share of the signal left over beyond which the sensor is looked for from afar, ..."""
 
 FAR_OFF = 0.03
 """... as it is where its logarithm seems off by this."""
@@ -190,7 +190,7 @@ def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances
     seen = _known(models, target, start)
     solution = refine(models, seen, start, nuisances)
     settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
-    models, nuisances = _with_nearest_modulation(settled)
+    models, nuisances = _with_nearest_sensor(settled)
     for _ in range(MAX_REPEATS):
         if models is settled.models:
             models, nuisances = _adjusted(settled)
@@ -202,18 +202,18 @@ def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances
     return settled
 
 
-def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
-    """Return the models of the modulation that explains the matrix best, where it seems far off.
+def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models of the sensor that explains the matrix best, where it seems far off.
 
     Steps lead slowly there: gains hide much of what a modulation does. So a few modes are looked at
-    on the cheap grid; each modulation is allowed its own registration, to first order.
+    on the cheap grid; each sensor is allowed its own registration, to first order.
     """
     models, nuisances, solution = settled.models, settled.nuisances, settled.solution
-    places = [k for k, (o, _) in enumerate(nuisances.optics) if o is Optic.MODULATION]
+    places = [k for k, (o, _) in enumerate(nuisances.optics) if o is Optic.SENSOR]
     if not places:
         return models, nuisances
     step = solution.nuisances[nuisances.first_optic + places[0]]
-    unknown = Optic.MODULATION in nuisances.unknown
+    unknown = Optic.SENSOR in nuisances.unknown
     if settled.share < STRANGE and abs(step) < FAR_OFF and not unknown:
         return models, nuisances
     modes = spread(settled.target.n_modes)
@@ -224,20 +224,20 @@ def _with_nearest_modulation(settled: Settled) -> tuple[FitModels, Nuisances]:
 
     def left(change: float) -> float:
         models.counter.n += 1
-        changed = subset.adjusted(Optic.MODULATION, change) if change else subset
+        changed = subset.adjusted(Optic.SENSOR, change) if change else subset
         return few.project(changed.cheap.interaction_matrix(here), every).chi_at_best
 
-    found = [left(change) for change in MODULATIONS]
+    found = [left(change) for change in CHANGES]
     best = int(np.argmin(found))
-    change = MODULATIONS[best]
+    change = CHANGES[best]
     if 0 < best < len(found) - 1:
-        change += vertex(*found[best - 1 : best + 2]) * (MODULATIONS[1] - MODULATIONS[0])
+        change += vertex(*found[best - 1 : best + 2]) * (CHANGES[1] - CHANGES[0])
     if abs(change) < LINEAR:
         return models, nuisances
     optics = [
-        (optic, offset + change * (optic is Optic.MODULATION)) for optic, offset in nuisances.optics
+        (optic, offset + change * (optic is Optic.SENSOR)) for optic, offset in nuisances.optics
     ]
-    moved = models.adjusted(Optic.MODULATION, float(change))
+    moved = models.adjusted(Optic.SENSOR, float(change))
     return moved, replace(nuisances, optics=tuple(optics))
 
 

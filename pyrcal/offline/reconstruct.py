@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.instrument_checks import FITTED_KEYS
+from pyrcal.offline.instrument_checks import COUPLING_KEY
 from pyrcal.offline.light import read_light
 from pyrcal.offline.report import (
     KnownFit,
@@ -35,8 +35,7 @@ from service.files.container import file_sha256
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import Basis, Gaussian, ModalBasis, modal_basis
-
-COUPLING_KEY, MODULATION_KEY = FITTED_KEYS
+from service.model.sensors.registry import kind_of
 
 SAMPLING = 4
 """Pupil points per subaperture, and detector nodes: the finest of the design's table that takes
@@ -60,7 +59,7 @@ def main(options: argparse.Namespace) -> int:
     found = instrument_sha256(described)
     if fit.instrument_sha256 not in {None, found}:
         say(f"note: {options.instrument} has changed since {fit.origin} was fitted with it")
-    instrument = _modulated(_oriented(described, fit), fit)
+    instrument = _with_sensor(_oriented(described, fit), fit)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(
@@ -145,14 +144,15 @@ def _oriented(instrument: Instrument, fit: KnownFit) -> Instrument:
     return replace(instrument, slopes=recipe)
 
 
-def _modulated(instrument: Instrument, fit: KnownFit) -> Instrument:
-    """Return the instrument with the modulation that the fit found; say so."""
+def _with_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
+    """Return the instrument with the sensor that the fit found; say so."""
     for key, value in fit.instrument_found.items():
         say(f"note: made with {key} = {value:.3g}, as {fit.origin} found; correct the instrument")
-    radius = fit.instrument_found.get(MODULATION_KEY)
-    if radius is None:
+    sensor_key = kind_of(instrument).fitted_key(instrument.wfs)
+    if sensor_key is None or sensor_key not in fit.instrument_found:
         return instrument
-    return replace(instrument, wfs=replace(instrument.wfs, modulation_lambda_over_d=radius))
+    number = fit.instrument_found[sensor_key]
+    return replace(instrument, wfs=replace(instrument.wfs, **{sensor_key: number}))
 
 
 def _basis(instrument: Instrument, fit: KnownFit) -> Basis:

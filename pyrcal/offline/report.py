@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.instrument_checks import FITTED_KEYS, NOTABLE, NOTABLE_SIGMA
+from pyrcal.offline.instrument_checks import NOTABLE, NOTABLE_SIGMA
 from pyrcal.offline.matrix import Fit
 from pyrcal.offline.methods import ScanStep
 from service import __version__
@@ -80,7 +80,7 @@ def document(report: FitReport) -> dict[str, Any]:
         "verdict": verdict_line(fit),
         "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
         "instrument_found": {
-            one.key if one.found is not None else "influence_width": {
+            one.key if one.found is not None else _WIDTH: {
                 "found": _plain(one.found if one.found is not None else np.exp(one.change)),
                 "sigma": _plain(one.found_sigma),
                 "told": one.reported,
@@ -114,6 +114,9 @@ def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nes
     """Return numbers or nested lists of them, None for one that is not finite."""
     return np.ma.masked_invalid(np.asarray(values, dtype=np.float64)).tolist()
 
+
+_WIDTH = "influence_width"
+"""What is found of influence functions that have no coupling: no key of an instrument file."""
 
 _ROWS = (
     ("shift x", "subapertures", 4),
@@ -406,7 +409,7 @@ def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
     otherwise = {}
     for key, one in found.items():
         value, told, sigma = one["found"], one["told"], one["sigma"] or 0.0
-        if value is None or key not in FITTED_KEYS:
+        if value is None or key == _WIDTH:
             continue
         if told is None or abs(value - told) > max(NOTABLE * told, NOTABLE_SIGMA * sigma):
             otherwise[key] = value

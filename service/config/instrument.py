@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,33 +11,22 @@ from numpy.typing import NDArray
 
 from service.config import packaged_file
 from service.config.instrument_schema import (
-    UNKNOWN,
     AboutTable,
-    Centres,
     InstrumentFile,
     MirrorTable,
     Section,
     SlopesTable,
-    WfsTable,
     read_instrument_file,
+    refused_at,
+    unknown_values,
 )
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.sources import refuse
-from service.errors import ConfigurationError, ModelError
-from service.model.described import USUAL_SEPARATION, KarhunenLoeve, LoopFacts, PyramidNumbers
-from service.model.detector_windows import by_quadrant
-from service.model.instrument import (
-    FrameWindows,
-    Instrument,
-    Mirror,
-    Pyramid,
-    TabulatedModes,
-)
+from service.errors import ConfigurationError
+from service.model.described import KarhunenLoeve, LoopFacts
+from service.model.instrument import Instrument, Mirror, SensorDescription, TabulatedModes
+from service.model.sensors.kind import SensorKind, SensorTable
 from service.model.slopes import Orientation, SlopeRecipe
-
-_SEPARATION_TOLERANCE = 0.1
-
-_FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
 
 
 def load_instrument(name_or_path: str | Path) -> Instrument:
@@ -53,41 +42,36 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         in contradiction to another.
     """
     said = read_instrument_file(name_or_path)
-    section = said.section
-    about, wfs = section(AboutTable).said, section(WfsTable)
+    section, kind = said.section, said.kind
+    about, wfs = section(AboutTable).said, section(kind.table)
     pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
-    pyramid = _pyramid(wfs)
+    sensor = _sensor(wfs, kind)
     mirror, about_mirror = read_mirror(section(MirrorTable), pupil)
     modes = _modes(section(KarhunenLoeve), mirror)
+    with refused_at(wfs.path, wfs.name):
+        frames = kind.frames(wfs.said, wfs.given)
     return Instrument(
         **asdict(about),
-        wfs=pyramid,
+        wfs=sensor,
         mirror=mirror,
         modes=modes,
-        slopes=_slopes(section(SlopesTable), wfs.said),
-        frames=_frames(wfs),
+        slopes=_slopes(section(SlopesTable), kind, has_frames=frames is not None),
+        frames=frames,
         loop=_loop(section(LoopFacts), modes.n_modes),
-        unknown=tuple(one for one in UNKNOWN if one in said.unknown),
-        remarks=(*about_mirror, *_assumed(said, pyramid, mirror)),
+        unknown=tuple(one for one in unknown_values(kind) if one in said.unknown),
+        remarks=(*about_mirror, *_assumed(said, sensor, mirror)),
     )
 
 
 def _assumed(
-    said: InstrumentFile, pyramid: Pyramid, mirror: Mirror | TabulatedModes
+    said: InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
 ) -> Iterator[str]:
     """Yield what the file does not say, and what is taken instead."""
-    wfs = said.section(WfsTable)
-    centres = wfs.said.input == "frames" and wfs.said.pupil_centres_px is not None
-    if "pupil_separation_subap" not in wfs.given and not centres:
-        yield (
-            f"{wfs.where('pupil_separation_subap')}: not told, taken as "
-            f"{pyramid.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil diameters)"
-        )
-    values = {
-        "wfs.wavelength_m": pyramid.wavelength_m,
-        "wfs.modulation_lambda_over_d": pyramid.modulation_lambda_over_d,
-        "mirror.coupling": mirror.shape.coupling if isinstance(mirror, Mirror) else None,
-    }
+    wfs = said.section(said.kind.table)
+    for key, text in said.kind.assumed(wfs.said, wfs.given):
+        yield f"{wfs.where(key)}: {text}"
+    values = {f"wfs.{key}": getattr(sensor, key) for key in said.kind.unknown}
+    values["mirror.coupling"] = mirror.shape.coupling if isinstance(mirror, Mirror) else None
     for key in sorted(said.unknown):
         yield (
             f"{wfs.path}: {key}: unknown; a fit of a measured matrix finds it, everything else "
@@ -126,9 +110,11 @@ def _modes(file: Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> Kar
     return table
 
 
-def _slopes(file: Section[SlopesTable], wfs: WfsTable) -> SlopeRecipe:
+def _slopes(file: Section[SlopesTable], sensor: SensorKind, *, has_frames: bool) -> SlopeRecipe:
     table = file.said
-    if wfs.input == "frames" and "order" in file.given:
+    if table.kind not in sensor.signals:
+        refuse(file.where("kind"), f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
+    if has_frames and "order" in file.given:
         raise ConfigurationError(
             f'{file.where("order")}: has no meaning beside wfs.input = "frames", '
             "whose slopes are made here"
@@ -145,28 +131,6 @@ def _slopes(file: Section[SlopesTable], wfs: WfsTable) -> SlopeRecipe:
     return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
-def _frames(file: Section[WfsTable]) -> FrameWindows | None:
-    table = file.said
-    if table.input == "slopes":
-        for key in _FRAME_KEYS:
-            if key in file.given and getattr(table, key) != 1:
-                raise ConfigurationError(
-                    f'{file.where(key)}: belongs to input = "frames", found input = "slopes"'
-                )
-        return None
-    centres = None
-    if table.pupil_centres_px is not None:
-        centres = _by_quadrant(table.pupil_centres_px, file).reshape(4, 2)
-    return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
-
-
-def _by_quadrant(centres_px: Centres, file: Section[WfsTable]) -> NDArray[np.float64]:
-    try:
-        return by_quadrant(np.array(centres_px))
-    except ModelError as error:
-        raise ConfigurationError(f"{file.where('pupil_centres_px')}: {error}") from error
-
-
 def _loop(file: Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     if not file.given:
         return None
@@ -180,48 +144,20 @@ def _loop(file: Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     return table
 
 
-def _pyramid(file: Section[WfsTable]) -> Pyramid:
-    table = file.said
-    diameter, separation = table.pupil_diameter, _separation(file)
-    if separation < diameter:
-        refuse(
-            file.where("pupil_separation_subap"),
-            f"{separation:g}",
-            f"at least the pupil's diameter, {diameter:g} subapertures: the images would overlap",
+def _sensor(file: Section[SensorTable], kind: SensorKind) -> SensorDescription:
+    with refused_at(file.path, file.name):
+        sensor = kind.described(file.said, file.given)
+    if file.said.valid_subapertures == "auto":
+        return sensor
+    if "flux_threshold" in file.given:
+        raise ConfigurationError(
+            f"{file.where('flux_threshold')}: has no meaning beside a mask file "
+            "(wfs.valid_subapertures): remove one of the two"
         )
-    mask = None
-    if table.valid_subapertures != "auto":
-        if "flux_threshold" in file.given:
-            raise ConfigurationError(
-                f"{file.where('flux_threshold')}: has no meaning beside a mask file "
-                "(wfs.valid_subapertures): remove one of the two"
-            )
-        mask = _mask(file)
-    optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
-    return Pyramid(**optics | {"pupil_separation_subap": separation}, valid_subapertures=mask)
+    return replace(sensor, valid_subapertures=_mask(file))
 
 
-def _separation(file: Section[WfsTable]) -> float:
-    """Return the images' distance: as given, or as the images on the frames lie."""
-    table = file.said
-    stated = table.image_separation_subap
-    if table.pupil_centres_px is None or table.input == "slopes":
-        return stated
-    centres = _by_quadrant(table.pupil_centres_px, file)
-    sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
-    measured = float(np.mean(sides)) / table.pixels_per_subaperture
-    if "pupil_separation_subap" not in file.given:
-        return measured
-    if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
-        refuse(
-            file.where("pupil_separation_subap"),
-            f"{stated:g}",
-            f"about {measured:.1f}, the distance of wfs.pupil_centres_px",
-        )
-    return stated
-
-
-def _mask(file: Section[WfsTable]) -> NDArray[np.bool_]:
+def _mask(file: Section[SensorTable]) -> NDArray[np.bool_]:
     where, n = file.where("valid_subapertures"), file.said.n_subapertures
     values = file.array("valid_subapertures")
     if values.shape != (n, n):

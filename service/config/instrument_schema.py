@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import BeforeValidator, Field, create_model
 
 from service.config import instrument_path
-from service.config.sources import Id, Table, in_file, read_dataset, read_toml, validated
+from service.config.sources import Id, Table, in_file, read_dataset, read_toml, refuse, validated
+from service.errors import ConfigurationError, ModelError
 from service.model.described import (
     Count,
     InfluenceShape,
     KarhunenLoeve,
     LoopFacts,
     Positive,
-    PyramidNumbers,
     Telescope,
 )
 from service.model.kinds import BasisKind, Normalisation, SignalKind, SlopeOrder
+from service.model.sensors.kind import SensorKind
+from service.model.sensors.registry import KINDS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Sign = Literal[-1, 1]
-Pixel = Annotated[float, Field(ge=0.0)]
-Centre = tuple[Pixel, Pixel]
-Centres = tuple[Centre, Centre, Centre, Centre]
 
 
 def _auto_is_none(value: object) -> object:
@@ -42,16 +43,6 @@ def _signs(value: object) -> object:
     return tuple(pair)
 
 
-def _centres(value: object) -> object:
-    if value == "auto":
-        return None
-    points = value if isinstance(value, list) else []
-    pairs = [point for point in points if isinstance(point, list) and len(point) == 2]
-    if len(points) != 4 or len(pairs) != 4:
-        raise ValueError(f'found {value!r}, expected "auto" or four pairs [row, column]')
-    return tuple(tuple(point) for point in pairs)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AboutTable(Telescope):
     """``[instrument]``: the telescope as a whole."""
@@ -62,25 +53,6 @@ class AboutTable(Telescope):
 
     config_id: Id | None = None
     """Pins the RTC's sensor configuration; None: the first seen is adopted."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WfsTable(PyramidNumbers):
-    """``[wfs]``: the pyramid sensor."""
-
-    kind: Literal["pyramid"]
-
-    valid_subapertures: str = "auto"
-    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
-
-    input: Literal["slopes", "frames"] = "slopes"
-    """What the RTC sends."""
-
-    pupil_centres_px: Annotated[Centres | None, BeforeValidator(_centres)] = None
-    """Of the four pupil images, row and column; "auto": from a flux frame. Frames only."""
-
-    pixels_per_subaperture: Count = 1
-    """Frames only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,24 +132,25 @@ class SlopesTable(Table):
     """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
 
 
-TABLES: Mapping[str, Any] = {
-    "instrument": AboutTable,
-    "wfs": WfsTable,
-    "mirror": MirrorTable,
-    "modes": (KarhunenLoeve, Field(default_factory=KarhunenLoeve)),
-    "slopes": (SlopesTable, Field(default_factory=SlopesTable)),
-    "loop": (LoopFacts, Field(default_factory=LoopFacts)),
-}
-"""What each table is read into, and what it is where it may be left out."""
+@cache
+def whole_of(kind: SensorKind) -> type[Table]:
+    """Return what a file with this kind of sensor is read into, table by table."""
+    tables: dict[str, Any] = {
+        "instrument": AboutTable,
+        "wfs": kind.table,
+        "mirror": MirrorTable,
+        "modes": (KarhunenLoeve, Field(default_factory=KarhunenLoeve)),
+        "slopes": (SlopesTable, Field(default_factory=SlopesTable)),
+        "loop": (LoopFacts, Field(default_factory=LoopFacts)),
+    }
+    return create_model("InstrumentFile", __base__=Table, **tables)
 
-WHOLE = create_model("InstrumentFile", __base__=Table, **TABLES)
 
-UNKNOWN: Mapping[str, float] = {
-    "wfs.wavelength_m": 750e-9,
-    "wfs.modulation_lambda_over_d": 3.0,
-    "mirror.coupling": 0.35,
-}
-"""Keys that may be "unknown", and what is taken until a measured matrix tells."""
+def unknown_values(kind: SensorKind) -> dict[str, float]:
+    """Return keys that may be "unknown", and what is taken until a measured matrix tells."""
+    of_sensor = {f"wfs.{key}": value for key, value in kind.unknown.items()}
+    return {**of_sensor, "mirror.coupling": 0.35}
+
 
 Said = TypeVar("Said")
 
@@ -209,6 +182,9 @@ class InstrumentFile:
     """An instrument file by its tables."""
 
     sections: tuple[Section[Any], ...]
+    kind: SensorKind
+    """Of its sensor."""
+
     unknown: frozenset[str] = frozenset()
     """Keys, with their tables, that are said to be unknown."""
 
@@ -227,18 +203,45 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     """
     path = instrument_path(name_or_path)
     written = read_toml(path)
-    unknown = frozenset(key for key in UNKNOWN if _value(written, key) == "unknown")
+    kind = _kind(written, path)
+    taken = unknown_values(kind)
+    unknown = frozenset(key for key in taken if _value(written, key) == "unknown")
+    tables = dict(written)
     for key in unknown:
         table, name = key.split(".")
-        written[table] = {**written[table], name: UNKNOWN[key]}
-    whole = validated(WHOLE, written, in_file(path))
+        tables[table] = {**tables[table], name: taken[key]}
+    if isinstance(tables.get("wfs"), dict):
+        with refused_at(path, "wfs"):
+            tables["wfs"] = kind.as_read(tables["wfs"])
+    whole = whole_of(kind)
+    said = validated(whole, tables, in_file(path))
     return InstrumentFile(
         tuple(
-            Section(getattr(whole, name), frozenset(written.get(name, ())), path, name)
-            for name in TABLES
+            Section(getattr(said, name), frozenset(written.get(name, ())), path, name)
+            for name in whole.model_fields
         ),
+        kind,
         unknown,
     )
+
+
+def _kind(written: Mapping[str, Any], path: Path) -> SensorKind:
+    """Return the kind of sensor a file is about; the first one where it does not say."""
+    name = _value(written, "wfs.kind")
+    if name is None:
+        return next(iter(KINDS.values()))
+    if not isinstance(name, str) or name not in KINDS:
+        refuse(f"{path}: wfs.kind", repr(name), " or ".join(repr(known) for known in KINDS))
+    return KINDS[name]
+
+
+@contextmanager
+def refused_at(path: Path, table: str) -> Iterator[None]:
+    """Say where in a file stands what a kind of sensor refuses."""
+    try:
+        yield
+    except ModelError as error:
+        raise ConfigurationError(f"{path}: {table}.{error}") from error
 
 
 def _value(written: Mapping[str, Any], key: str) -> object:

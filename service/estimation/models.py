@@ -19,17 +19,19 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
-from service.model.kinds import Influence, Normalisation, Stop
+from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis, Gaussian, ModalBasis, ThinPlate, mirror_surface
 from service.model.pupil import Illumination
-from service.model.pyramid import Mapper
+from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import Mapper
 
 Array = NDArray[np.float64]
 
-COARSE, CHEAP, FINE = 1, 2, 3
-"""Pupil points per subaperture, and nodes, of the models for far steps, derivatives, residuals.
-Against 8 points the fine one is biased by 0.02 % of a subaperture and 0.004 % of magnification."""
+CHEAP, FINE = 2, 3
+"""Pupil points per subaperture, and nodes, of the models for derivatives and for residuals; for
+far steps the sensor's kind says how many are enough. Against 8 points the fine one is biased by
+0.02 % of a subaperture and 0.004 % of magnification."""
 
 DEGREE = 5
 """Of the polynomials that stand for the lowest orders: 20 without piston."""
@@ -55,8 +57,8 @@ shift of 0.08 subaperture on; at no shift the two differ by less than 0.01."""
 FAR_BETTER = 0.7
 """The same of influence functions, of which none is quite the mirror's."""
 
-MODULATION_STEP = 0.05
-"""Of the difference that stands for a derivative by the modulation, its logarithm."""
+SENSOR_STEP = 0.05
+"""Of the difference that stands for a derivative by the sensor's number, its logarithm."""
 
 
 class Optic(StrEnum):
@@ -65,8 +67,8 @@ class Optic(StrEnum):
     WIDTH = "width"
     """Of the influence functions: their coupling, where they have one."""
 
-    MODULATION = "modulation"
-    """Radius of the circle."""
+    SENSOR = "sensor"
+    """What the kind of sensor says can be told: a pyramid's modulation."""
 
 
 @dataclass(slots=True)
@@ -88,13 +90,8 @@ class Other:
 
 
 def coarse_sampling(instrument: Instrument) -> int:
-    """Return how many pupil points a subaperture needs for the smoothest shapes.
-
-    The phase of a modulation wide for its subapertures turns too fast for one.
-    """
-    wfs = instrument.wfs
-    enough = 2.0 * wfs.modulation_lambda_over_d + 3.0 < wfs.n_subapertures
-    return COARSE if enough else CHEAP
+    """Return how many pupil points a subaperture needs for the smoothest shapes."""
+    return kind_of(instrument).coarsest_sampling(instrument.wfs)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -156,15 +153,26 @@ class FitModels:
         found = []
         if self.coupling is not None:
             found.append(Optic.WIDTH)
-        if self.instrument.wfs.modulation_lambda_over_d > 0.0:
-            found.append(Optic.MODULATION)
+        if self.sensor_key is not None:
+            found.append(Optic.SENSOR)
         return tuple(found)
 
     @property
     def unknown(self) -> frozenset[Optic]:
         """Numbers that the instrument file calls unknown."""
-        keys = {Optic.WIDTH: "mirror.coupling", Optic.MODULATION: "wfs.modulation_lambda_over_d"}
+        keys = {Optic.WIDTH: "mirror.coupling", Optic.SENSOR: f"wfs.{self.sensor_key}"}
         return frozenset(one for one in self.optics if keys[one] in self.instrument.unknown)
+
+    @property
+    def sensor_key(self) -> str | None:
+        """Key of the sensor's number that the matrix can tell; None: it has none."""
+        return kind_of(self.instrument).fitted_key(self.instrument.wfs)
+
+    @property
+    def sensor_number(self) -> float:
+        """That number, as the instrument has it; 0 where there is none."""
+        key = self.sensor_key
+        return 0.0 if key is None else float(getattr(self.instrument.wfs, key))
 
     @property
     def coupling(self) -> float | None:
@@ -174,13 +182,13 @@ class FitModels:
 
     def exact(self, optic: Optic) -> bool:
         """Return whether an instrument of another value can be made, or a derivative has to do."""
-        return optic is Optic.MODULATION or self.coupling is not None
+        return optic is Optic.SENSOR or self.coupling is not None
 
     def adjusted(self, optic: Optic, change: float) -> FitModels:
         """Return the models of an instrument that differs by this in a logarithm."""
-        if optic is Optic.MODULATION:
-            radius = self.instrument.wfs.modulation_lambda_over_d * float(np.exp(change))
-            wfs = replace(self.instrument.wfs, modulation_lambda_over_d=radius)
+        if optic is Optic.SENSOR and self.sensor_key is not None:
+            number = self.sensor_number * float(np.exp(change))
+            wfs = replace(self.instrument.wfs, **{self.sensor_key: number})
             return replace(self, instrument=replace(self.instrument, wfs=wfs))
         if not isinstance(self.basis, ModalBasis) or not isinstance(self.basis.surface, Gaussian):
             raise ModelError("fit: found influence functions without a coupling to be changed")
@@ -198,10 +206,10 @@ class FitModels:
                 found.append(self.cheap.width_derivative(alpha))
                 continue
             less, more = (
-                self.adjusted(optic, side * MODULATION_STEP).cheap.interaction_matrix(alpha)
+                self.adjusted(optic, side * SENSOR_STEP).cheap.interaction_matrix(alpha)
                 for side in (-1.0, 1.0)
             )
-            found.append((more - less) / (2.0 * MODULATION_STEP))
+            found.append((more - less) / (2.0 * SENSOR_STEP))
             self.counter.n += 1
         self.counter.n += len(found)
         return found
@@ -209,18 +217,14 @@ class FitModels:
     @property
     def other_instruments(self) -> dict[Other, FitModels]:
         """Models of instruments that this one may be taken for."""
-        about, slopes = self.instrument, self.instrument.slopes
+        about = self.instrument
         stop = Stop.TELESCOPE if about.stop is Stop.MIRROR else Stop.MIRROR
-        local = slopes.normalisation is Normalisation.LOCAL
-        divisor = Normalisation.GLOBAL if local else Normalisation.LOCAL
+        others = {f'stop = "{stop}"': replace(about, stop=stop)}
+        for words, recipe in kind_of(about).other_recipes(about.slopes).items():
+            others[words] = replace(about, slopes=recipe)
         found = {
-            Other(words=f'stop = "{stop}"', believed=BETTER): replace(
-                self, instrument=replace(about, stop=stop)
-            ),
-            Other(words=f'normalisation = "{divisor}"', believed=BETTER): replace(
-                self,
-                instrument=replace(about, slopes=replace(slopes, normalisation=divisor)),
-            ),
+            Other(words=words, believed=BETTER): replace(self, instrument=other)
+            for words, other in others.items()
         }
         if isinstance(self.basis, ModalBasis):
             gaussian = isinstance(self.basis.surface, ThinPlate)

@@ -15,12 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import ModelError
 from service.estimation import solver
 from service.estimation.lockin import MAX_LAG_FRAMES, LockInEstimate, Spectra, fit_window
 from service.estimation.solver import LONGEST_STEP, Columns
 from service.estimation.windows import ClosedLoop, RefusalKind, WindowRefused
+from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
+from service.model.sensors.light import CannotTell
+from service.model.sensors.registry import kind_of
+from service.model.slopes import Orientation
 
 Array = NDArray[Any]
 
@@ -37,6 +43,11 @@ FAINTEST = 5.0
 """σ of a line's gain from which on it is seen."""
 
 LARGEST_GAIN = 3.0
+
+FARTHEST_SUBAP = 3.0
+"""Light that says the pupil lies further off is another instrument's."""
+
+_TURNS_RAD = np.deg2rad([5.0, -5.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -166,3 +177,34 @@ def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | Non
             f"expected at most {UNEXPLAINED:.0%}"
         )
     return None
+
+
+def far_starts(instrument: Instrument, flux: bytes | None) -> tuple[Misregistration, ...]:
+    """Return where to start from when nothing is known, the likeliest first.
+
+    With the mirror as stop the image of the pupil moves with it, so that its mean light tells the
+    shift where a sensor can say how; rotation and magnification it does not tell. ``flux`` is as
+    the RTC sends it, in its own axes: it is used where these are the conventions'.
+    """
+    nominal = instrument.start
+    turned = [replace(nominal, rotation_rad=nominal.rotation_rad + turn) for turn in _TURNS_RAD]
+    lit = _lit_start(instrument, nominal, flux)
+    return (*(() if lit is None else (lit,)), nominal, *turned)
+
+
+def _lit_start(
+    instrument: Instrument, nominal: Misregistration, flux: bytes | None
+) -> Misregistration | None:
+    own_axes = instrument.slopes.assumed_orientation == Orientation()
+    if flux is None or instrument.stop is not Stop.MIRROR or not own_axes:
+        return None
+    light = kind_of(instrument).light(instrument)
+    if isinstance(light, CannotTell):
+        return None
+    try:
+        seen = light.find_pupil(light.counts_of(flux))
+    except ModelError:
+        return None
+    if isinstance(seen, CannotTell) or max(map(abs, seen.at)) > FARTHEST_SUBAP:
+        return None
+    return replace(nominal, shift_x_subap=seen.at[0], shift_y_subap=seen.at[1])

@@ -23,11 +23,12 @@ from service.estimation.models import LowOrder, coarse_sampling, low_order_of
 from service.estimation.reference import Reference, Target, target_of
 from service.estimation.solver import vertex
 from service.model.instrument import Instrument
-from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration, rotation, wrapped
 from service.model.modes import Basis
-from service.model.pyramid import Mapper
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.sensor import Mapper
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe, turned_mask
 
 Array = NDArray[np.float64]
@@ -238,14 +239,15 @@ class _Turned:
     def of(cls, model: InteractionModel, mapper: Mapper) -> _Turned:
         """Turn the smoothest shapes of a model's modes round."""
         lowest = low_order_of(model)
-        jacobian = np.asarray(model.sensor_jacobian(Misregistration()), dtype=np.float64)
         points = model.pupil.points
 
         def at(angle: int) -> Array:
-            return jacobian @ lowest.shapes.render(points @ rotation(ANGLES_RAD[angle]))
+            return lowest.shapes.render(points @ rotation(ANGLES_RAD[angle]))
 
-        turned = np.array(list(mapper(at, range(len(ANGLES_RAD)))))
-        columns = np.ascontiguousarray(turned.transpose(2, 0, 1))
+        turned = np.hstack(list(mapper(at, range(len(ANGLES_RAD)))))
+        seen = np.asarray(model.seen(Misregistration(), turned), dtype=np.float64)
+        by_angle = seen.T.reshape(len(ANGLES_RAD), -1, len(seen))
+        columns = np.ascontiguousarray(by_angle.swapaxes(0, 1))
         return cls(lowest=lowest, columns=columns, valid=model.valid)
 
     def pose(self, target: Target, slopes: SlopeRecipe) -> Pose:

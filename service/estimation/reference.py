@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from service.errors import MatrixError
 from service.estimation.solver import Columns
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.misregistration import unit_like
+from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import likely_kind, to_conventions
 
 Array = NDArray[Any]

@@ -27,10 +27,10 @@ from service.estimation.orientation import (
 )
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration, unit_like, wrapped
 from service.model.modes import Basis
-from service.model.pyramid import Mapper
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.sensor import Mapper
 from service.model.slopes import FLIPS, SlopeRecipe, to_conventions, turned_mask
 
 Array = NDArray[Any]

@@ -64,7 +64,7 @@ GAIN_MAP_SIGMA = 0.3
 ANAMORPHOSIS_SIGMA = 0.02
 """Half the stretch of the mirror's image along one axis over the other."""
 
-OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.MODULATION: 0.5}
+OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.SENSOR: 0.5}
 """How far what a file says of an instrument may be off, as a logarithm: a coupling of 0.35 might be
 0.18 or 0.53."""
 

@@ -8,15 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Gt, Lt
 
 from service.model.kinds import Influence, Stop
 
 Positive = Annotated[float, Gt(0.0)]
 Count = Annotated[int, Ge(1)]
-
-USUAL_SEPARATION = 1.2
-"""Distance of neighbouring pupil images over their diameter, where nobody tells."""
 
 
 class Read:
@@ -48,40 +45,6 @@ class Telescope(Read):
 
     double_pass: bool = False
     """Whether a measured matrix sees the mirror twice."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PyramidNumbers(Read):
-    """The modulated pyramid wavefront sensor and its sampling."""
-
-    n_subapertures: Annotated[int, Ge(4), Le(1000)]
-    """Subapertures across the sensor grid."""
-
-    wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
-    """Sensing wavelength, metres; may be "unknown" until a matrix is fitted."""
-
-    modulation_lambda_over_d: Annotated[float, Ge(0.0), Le(100.0)]
-    """Radius of the modulation circle, λ/D; may be "unknown" until a matrix is fitted."""
-
-    pupil_separation_subap: Positive | None = None
-    """Distance between the centres of neighbouring pupil images, subapertures; None: 1.2 diameters
-    of the pupil."""
-
-    pupil_diameter_subap: Positive | None = None
-    """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
-
-    flux_threshold: Annotated[float, Gt(0.0), Le(1.0)] = 0.5
-    """Least flux of a valid subaperture, relative to a full one."""
-
-    @property
-    def pupil_diameter(self) -> float:
-        """Diameter of the pupil image, in subapertures."""
-        return float(self.pupil_diameter_subap or self.n_subapertures)
-
-    @property
-    def image_separation_subap(self) -> float:
-        """Distance between the centres of neighbouring pupil images, in subapertures."""
-        return float(self.pupil_separation_subap or USUAL_SEPARATION * self.pupil_diameter)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from service.model.described import (
     InfluenceShape,
     KarhunenLoeve,
     LoopFacts,
-    PyramidNumbers,
     Telescope,
 )
 from service.model.kinds import BasisKind
@@ -29,13 +28,32 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pyramid(PyramidNumbers):
-    """The modulated pyramid wavefront sensor, and which of its subapertures are valid."""
+class SensorDescription(Protocol):
+    """What is known of a sensor whatever its kind; each kind has a frozen dataclass of its own."""
 
-    valid_subapertures: NDArray[np.bool_] | None = None
-    """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
-    listed; None: by ``flux_threshold`` at α = 0."""
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    kind: ClassVar[str]
+    """``wfs.kind`` of an instrument file: ``sensors.registry`` knows what may be asked of it."""
+
+    @property
+    def n_subapertures(self) -> int:
+        """Subapertures across the sensor grid."""
+
+    @property
+    def wavelength_m(self) -> float:
+        """Sensing wavelength, metres."""
+
+    @property
+    def pupil_diameter(self) -> float:
+        """Diameter of the pupil image, in subapertures."""
+
+    @property
+    def flux_threshold(self) -> float:
+        """Least flux of a valid subaperture, relative to a full one."""
+
+    @property
+    def valid_subapertures(self) -> NDArray[np.bool_] | None:
+        """Mask ``(n_subapertures, n_subapertures)`` [y, x], the RTC's own axes; None: by flux."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,27 +114,16 @@ class TabulatedModes(Mount):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrameWindows:
-    """Positions of the four pupil images on full detector frames."""
-
-    centres_px: NDArray[np.float64] | None = None
-    """``(4, 2)`` row and column of the images' centres, one in each quadrant of the four, in any
-    order; pixel centres are whole numbers. None: to be found in a flux frame."""
-
-    pixels_per_subaperture: int = 1
-    """Detector pixels along a side of a subaperture."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Instrument(Telescope):
     """One telescope, its mirror and its wavefront sensor."""
 
-    wfs: Pyramid
+    wfs: SensorDescription
     mirror: Mirror | TabulatedModes
     modes: KarhunenLoeve = field(default_factory=KarhunenLoeve)
     slopes: SlopeRecipe = field(default_factory=SlopeRecipe)
-    frames: FrameWindows | None = None
-    """The RTC delivers detector frames, cut like this; None: it delivers slopes."""
+    frames: object | None = None
+    """The RTC delivers detector frames, of which the sensor's kind makes slopes like this; None: it
+    delivers slopes."""
 
     loop: LoopFacts | None = None
     """What is known of the loop without an RTC."""

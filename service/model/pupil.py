@@ -1,9 +1,9 @@
-"""The pupil: points and how much light passes at each."""
+"""The pupil: points, how much light passes at each, and which subapertures it lights."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import scipy
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
+from service.model.slopes import rtc_mask, turned_mask
 
 _EDGE_NODES = 32
 """Gauss-Legendre nodes across a cell: area fractions good to about 1e-4."""
@@ -126,6 +127,48 @@ def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
         obscuration_ratio=instrument.obscuration_ratio,
         sampling=sampling,
     )
+
+
+def valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return the mask ``(n, n)`` [y, x] in our axes: the instrument's own, or by flux at α = 0."""
+    own = instrument.wfs.valid_subapertures
+    if own is None:
+        return lit_subapertures(instrument)
+    return turned_mask(own, instrument.slopes.assumed_orientation)
+
+
+def rtc_valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return the mask ``(n, n)`` [y, x] in the RTC's own axes, in which its slopes are listed."""
+    if instrument.wfs.valid_subapertures is not None:
+        return instrument.wfs.valid_subapertures
+    return rtc_mask(lit_subapertures(instrument), instrument.slopes.assumed_orientation)
+
+
+def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return which subapertures ``(n, n)`` have enough of the pupil's area at α = 0.
+
+    The flux is the pupil's light on each subaperture, so that the mask depends neither on the
+    sampling nor on the light diffracted out of the images.
+    """
+    n = instrument.wfs.n_subapertures
+    flux = _light_per_subaperture(n, instrument.wfs.pupil_diameter, instrument.obscuration_ratio)
+    return np.asarray(flux >= instrument.wfs.flux_threshold)
+
+
+@lru_cache(maxsize=8)
+def _light_per_subaperture(
+    n: int, diameter_subap: float, obscuration_ratio: float
+) -> NDArray[np.float64]:
+    """Return the share of each subaperture ``(n, n)`` that the pupil lights."""
+    fine = annular_pupil(
+        n_subapertures=n,
+        diameter_subap=diameter_subap,
+        obscuration_ratio=obscuration_ratio,
+        sampling=8,
+    ).amplitude
+    margin = (len(fine) - 8 * n) // 2
+    inner = fine[margin : margin + 8 * n, margin : margin + 8 * n]
+    return np.asarray(inner.reshape(n, 8, n, 8).mean(axis=(1, 3)))
 
 
 @cache

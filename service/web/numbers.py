@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from service.errors import CommandError, UnknownIdError
 from service.estimation.frames import FrameBlock
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures
+from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import as_maps, slopes_of, to_conventions, turned_mask
 from service.runtime.supervisor import Supervisor
 from service.tracking.products import MatrixState

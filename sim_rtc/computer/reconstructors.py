@@ -21,6 +21,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import BasisKind, SignalKind
 from service.model.modes import ModalBasis
+from service.model.sensors.registry import kind_of
 from service.wire import (
     TEXT_LIMIT,
     Acknowledgement,
@@ -252,13 +253,11 @@ def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
         strokes = mirror.mode_to_actuator
         basis.update(b"zonal" if strokes is None else np.round(strokes, 9).tobytes())
     sensor = hashlib.sha256(np.packbits(valid).tobytes())
-    sensor.update(
-        repr((wfs.wavelength_m, wfs.modulation_lambda_over_d, wfs.image_separation_subap)).encode()
-    )
+    sensor.update(repr(kind_of(instrument).identity(wfs)).encode())
     if instrument.slopes.kind is not SignalKind.XY:
         sensor.update(instrument.slopes.kind.encode())
     return Identity(
         system=instrument.name,
         basis_id=f"{kind}-{instrument.modes.n_modes}-{basis.hexdigest()[:8]}",
-        config_id=f"pyramid-{wfs.n_subapertures}-{sensor.hexdigest()[:8]}",
+        config_id=f"{wfs.kind}-{wfs.n_subapertures}-{sensor.hexdigest()[:8]}",
     )

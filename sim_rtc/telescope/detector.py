@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
-from service.model.interaction import signals_of
 from service.model.kinds import SignalKind
+from service.model.sensors.light import CannotTell
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -41,7 +42,7 @@ class Camera:
     """Atmosphere, telescope, sensor optics and quantum efficiency together, 0..1."""
 
     read_noise_electrons: float = 4.0
-    """RMS per pixel and read; a subaperture is one pixel in each of the four images."""
+    """RMS per pixel and read; a pyramid's subaperture is four pixels."""
 
     excess_noise: float = 1.0
     """Variance of the photon noise over Poisson's: 2 for an electron-multiplying CCD."""
@@ -49,7 +50,7 @@ class Camera:
     def electrons_per_frame(
         self, instrument: Instrument, *, magnitude: float, frame_rate_hz: float
     ) -> float:
-        """Return the electrons of a star in all four images together."""
+        """Return the electrons of a star on all pixels together."""
         area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
         flux = self.zero_point_photons * 10 ** (-0.4 * magnitude) * area_m2
         return float(flux * self.throughput / frame_rate_hz)
@@ -69,7 +70,7 @@ class Detector:
         camera: Camera | None = None,
         silent: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take the share of the light that each pixel detects, ``images`` ``(2, n, 2, n)``.
+        """Take the share of the light that each pixel detects, ``images`` in the sensor's shape.
 
         ``silent`` ``(n_valid,)`` are subapertures that read 0, noise included.
         """
@@ -77,14 +78,15 @@ class Detector:
         self.electrons_per_frame: float = camera.electrons_per_frame(
             instrument, magnitude=magnitude, frame_rate_hz=frame_rate_hz
         )
-        """Detected in all four images together while no pixel is dead."""
-        kind = instrument.slopes.kind
-        own = images.sum(axis=(0, 2))[valid] * self.electrons_per_frame
+        """Detected on all pixels together while none is dead."""
+        kind, sensor = instrument.slopes.kind, kind_of(instrument)
+        self._light = sensor.light(instrument)
+        pixels = images.reshape(-1)[sensor.pixels(valid)]
+        own = pixels.sum(axis=0) * self.electrons_per_frame
         if kind is SignalKind.XY:
-            lights, n_pixels = np.tile(own, 2), 4
+            lights, n_pixels = np.tile(own, 2), len(pixels)
         else:
-            pixels, _ = signals_of(images, valid, instrument.slopes)
-            lights, n_pixels = pixels * self.electrons_per_frame, 1
+            lights, n_pixels = pixels.reshape(-1) * self.electrons_per_frame, 1
         variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
         variance /= own.mean() ** 2
         self.sigma: Array32 = np.sqrt(variance).astype(np.float32)
@@ -94,18 +96,12 @@ class Detector:
         # Drawn from by number, in a third of the time of a normal deviate; they end at 4.3 sigma.
         self._normal = _normal_values(2**16)
 
-    def counts(self, images: Array) -> Array32:
-        """Return ``(4, n, n)`` electrons per frame of these images ``(2, n, 2, n)``.
-
-        In row-major order of the images' place on the detector.
-        """
-        n = images.shape[1]
-        electrons = images * self.electrons_per_frame
-        return electrons.transpose(0, 2, 1, 3).reshape(4, n, n).astype(np.float32)
-
-    def flux(self, images: Array) -> bytes:
-        """Return the same in the units of a status."""
-        return self.counts(images).astype("<f4").tobytes()
+    def flux(self, images: Array) -> bytes | None:
+        """Return electrons per frame as a status tells them; None: nobody could read them."""
+        if isinstance(self._light, CannotTell):
+            return None
+        counts = self._light.counts(images * self.electrons_per_frame)
+        return counts.astype("<f4").tobytes()
 
     def noise(self, n_frames: int, rng: np.random.Generator) -> Array32:
         """Return slope noise ``(n_frames, n_slopes)``.
@@ -221,12 +217,7 @@ def binned(instrument: Instrument, binning: int) -> Instrument:
         )
     return replace(
         instrument,
-        wfs=replace(
-            wfs,
-            n_subapertures=wfs.n_subapertures // binning,
-            pupil_separation_subap=wfs.image_separation_subap / binning,
-            pupil_diameter_subap=wfs.pupil_diameter / binning,
-        ),
+        wfs=kind_of(instrument).binned(wfs, binning),
     )
 
 

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, Mirror, Pyramid
-from service.model.interaction import reference_slopes
+from service.model.instrument import Instrument, Mirror
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
+from service.model.sensors.pyramid.description import Pyramid, pyramid_in
+from service.model.sensors.pyramid.signals import reference_slopes
 from sim_rtc.telescope.detector import PixelDetector
 from sim_rtc.telescope.imperfections import SlopeErrors
 from sim_rtc.telescope.mirror import PlantSurface, TensionedPlate, heights
@@ -135,8 +136,9 @@ class DiffractivePlant(Plant):
     ) -> None:
         """Take the instrument as it is binned: the finest pixels set how finely it is computed."""
         super().__init__(instrument, basis, centred_pupil(instrument, _SAMPLING * binning), made)
+        wfs = pyramid_in(replace(instrument, wfs=self._wfs))
         self._sensor = DiffractivePyramid(
-            self._wfs, self._pupil, quadrature=quadrature or _quadrature(self._wfs, binning)
+            wfs, self._pupil, quadrature=quadrature or _quadrature(wfs, binning)
         )
 
     @override

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Pyramid
+from service.model.instrument import Instrument, SensorDescription
 from service.model.kinds import SignalKind
+from service.model.sensors.registry import kind_of
 from service.model.slopes import PLAIN, SlopeRecipe, signals_of_slopes, slopes_of
 
 Array = NDArray[np.float64]
@@ -89,27 +90,26 @@ class SlopeErrors:
 
     def __init__(
         self,
-        valid: NDArray[np.bool_],
+        pixels: NDArray[np.intp],
         imperfections: Imperfections,
         rng: np.random.Generator,
         recipe: SlopeRecipe = PLAIN,
     ) -> None:
+        """Take where the pixels of valid subapertures stand in the light, as a ``SensorKind`` says.
+
+        ``pixels`` is ``(n_pixels, n_valid)``.
+        """
         self.recipe = recipe
         """What the sensor makes of the light."""
-        n_valid = int(valid.sum())
+        n_valid = pixels.shape[1]
         angle = np.deg2rad(imperfections.slope_rotation_deg)
         self._cosine, self._sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        n_bad = min(imperfections.bad_pixels, 4 * n_valid)
-        # Four images: a pixel's subaperture is its number modulo their common mask.
-        pixels = rng.choice(4 * n_valid, size=n_bad, replace=False)
+        n_bad = min(imperfections.bad_pixels, pixels.size)
+        bad = rng.choice(pixels.size, size=n_bad, replace=False)
         self.silent: NDArray[np.bool_] = np.zeros(n_valid, dtype=np.bool_)
         """``(n_valid,)`` subapertures whose slopes read 0."""
-        self.silent[pixels % n_valid] = True
-        self.dark: NDArray[np.bool_] = np.zeros((2, len(valid), 2, len(valid)), dtype=np.bool_)
-        """``(2, n, 2, n)`` dead pixels: side, row along y, side, column along x."""
-        side_y, side_x = np.divmod(pixels // n_valid, 2)
-        row, column = np.argwhere(valid)[pixels % n_valid].T
-        self.dark[side_y, row, side_x, column] = True
+        self.silent[bad % n_valid] = True
+        self._dark = pixels.reshape(-1)[bad]
 
     @property
     def absent(self) -> bool:
@@ -117,8 +117,12 @@ class SlopeErrors:
         return bool(self._sine == 0.0 and not self.silent.any())
 
     def read(self, light: NDArray[Any]) -> NDArray[Any]:
-        """Return the part of ``light`` ``(2, n, 2, n)`` that the electronics read."""
-        return np.where(self.dark, 0, light) if self.silent.any() else light
+        """Return what reaches the detector's electronics of light in the sensor's own shape."""
+        if not len(self._dark):
+            return light
+        read = light.copy()
+        read.reshape(-1)[self._dark] = 0
+        return read
 
     def applied(self, slopes: Array32) -> Array32:
         """Return the slopes with these errors; the first axis of ``slopes`` is ``n_slopes``."""
@@ -162,10 +166,13 @@ def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Ar
     return np.asarray(points + np.column_stack([error.real, error.imag]))
 
 
-def true_sensor(wfs: Pyramid, imperfections: Imperfections) -> Pyramid:
-    """Return the sensor with the modulation it really has."""
-    radius = wfs.modulation_lambda_over_d * (1.0 + imperfections.modulation_error)
-    return replace(wfs, modulation_lambda_over_d=radius)
+def true_sensor(instrument: Instrument, imperfections: Imperfections) -> SensorDescription:
+    """Return the sensor as it really is: with another modulation, where it has one."""
+    wfs = instrument.wfs
+    key = kind_of(instrument).fitted_key(wfs)
+    if key is None:
+        return wfs
+    return replace(wfs, **{key: getattr(wfs, key) * (1.0 + imperfections.modulation_error)})
 
 
 def non_common_path(

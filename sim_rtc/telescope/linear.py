@@ -1,6 +1,6 @@
 """A linear telescope: slopes are ``K_eff turbulence + D G command``.
 
-It differs from the service's model by its grid (q = 4), its quadrature and modulation points, by
+It differs from the service's model by its grid (q = 4), its quadrature and source points, by
 everything in ``Imperfections``, and by an optical gain for every mode.
 """
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.model.instrument import Instrument, Mirror
-from service.model.interaction import normalised_jacobian
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import instrument_pupil
-from service.model.pyramid import PyramidOptics
+from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import Fineness
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.mirror import DrawnSurface, modal_content
@@ -29,7 +29,7 @@ Array32 = NDArray[np.float32]
 
 _SAMPLING = 4
 _NODES = 4
-_FEWEST_MODULATION_POINTS = 32
+_SOURCE_POINTS = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,18 +73,16 @@ class LinearOptics(Optics):
 
 
 class LinearPlant(Plant):
-    """A pyramid and a thin-plate mirror, each slightly unlike the service's model of them."""
+    """A sensor and a thin-plate mirror, each slightly unlike the service's model of them."""
 
     def __init__(
         self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
     ) -> None:
         super().__init__(instrument, basis, instrument_pupil(instrument, _SAMPLING), made)
-        self._pyramid = PyramidOptics(
-            wfs=self._wfs,
-            pupil=self._pupil,
-            n_nodes=_NODES,
-            n_modulation=_modulation_points(self._wfs.modulation_lambda_over_d),
-            recipe=instrument.slopes,
+        self._sensor = kind_of(instrument).sensor(
+            replace(instrument, wfs=self._wfs),
+            self._pupil,
+            Fineness(n_nodes=_NODES, n_source_points=_SOURCE_POINTS),
         )
         imperfections = made.get("imperfections") or Imperfections()
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)
@@ -95,15 +93,10 @@ class LinearPlant(Plant):
 
         The optical gain acts on the part of the turbulence the mirror can reproduce exactly as it
         acts on the mirror: ``K_eff = K + D (G - 1) P`` with P the projection of phase on modes.
-        Of dead pixels the lost flux counts; what the phase would have changed in it, some 1e-4 of
-        the flux's gradient, does not.
         """
-        response = self._pyramid.response(self.valid, self._image_shift(alpha))
-        light = float(response.images.sum())
-        response = replace(response, images=self.slope_errors.read(response.images))
-        jacobian = normalised_jacobian(response, self.valid)
-        jacobian *= np.float32(2 * np.pi / self._instrument.wfs.wavelength_m)
-        jacobian = self.slope_errors.applied(jacobian)
+        response = self._sensor.at(self._image_shift(alpha))
+        light = self.slope_errors.read(response.light)
+        jacobian = self.slope_errors.applied(response.lit(light).jacobian())
         shapes, stuck_opd_m = self._render(alpha)
         modes = np.ascontiguousarray(shapes)
         matrix = jacobian @ modes
@@ -114,19 +107,13 @@ class LinearPlant(Plant):
             responses=((1.0, PhaseResponse(jacobian)),),
             slopes_per_command=np.asfortranarray(matrix * (self._gain * self._passes)),
             opd_per_command=modes * self._passes,
-            images=response.images / light,
+            images=light / float(response.light.sum()),
             stuck_opd_m=stuck_opd_m * self._passes,
         )
 
     @override
     def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[DrawnSurface, Array]:
         return DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m), strokes
-
-
-def _modulation_points(radius_lambda_over_d: float) -> int:
-    """Return an even number of points that is enough for the radius."""
-    enough = 2 * int(np.ceil(3 * radius_lambda_over_d)) + 10
-    return max(_FEWEST_MODULATION_POINTS, enough)
 
 
 def optical_gain(n_modes: int, imperfections: Imperfections) -> Array32:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.instrument import Instrument, Mirror
-from service.model.interaction import valid_subapertures
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis
-from service.model.pupil import PupilGrid
+from service.model.pupil import PupilGrid, valid_subapertures
+from service.model.sensors.registry import kind_of
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import (
     Imperfections,
@@ -50,10 +50,8 @@ class Optics(ABC):
     """``(n_points,)`` what stuck actuators add."""
 
     images: Array
-    """``(2, n, 2, n)`` share of the light that every pixel detects, 0 where it is dead.
-
-    Side, row along y, side, column along x.
-    """
+    """Share of the light that every pixel detects, 0 where it is dead, in the sensor's own shape:
+    ``(2, n, 2, n)`` of a pyramid, side, row along y, side, column along x."""
 
     responses: tuple[tuple[float, PhaseResponse], ...] = ()
     """Slopes per metre of turbulence OPD: shares of exact responses, their sum 1; none where the
@@ -94,7 +92,7 @@ class Plant(ABC):
         self._passes = np.float32(scene.passes)
         width_m = instrument.subaperture_m
         pupil = scene.light(pupil, width_m)
-        self._wfs = true_sensor(instrument.wfs, imperfections)
+        self._wfs = true_sensor(instrument, imperfections)
         self._pupil = uneven(pupil, imperfections.unevenness, uneven_rng)
         drawn, influence = instrument.analytic_mirror, made.get("influence")
         mirror = misplaced(drawn, imperfections.position_error, position_rng)
@@ -114,7 +112,9 @@ class Plant(ABC):
         """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
         self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
         """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
-        self.slope_errors = SlopeErrors(self.valid, imperfections, pixel_rng, instrument.slopes)
+        self.pixels: NDArray[np.intp] = kind_of(instrument).pixels(self.valid)
+        """``(n_pixels, n_valid)`` where their pixels stand in the light."""
+        self.slope_errors = SlopeErrors(self.pixels, imperfections, pixel_rng, instrument.slopes)
         """What the sensor makes of correct light and slopes."""
         self.sensor_opd_m: Array32 = non_common_path(
             self._points, self.weights, imperfections, path_rng

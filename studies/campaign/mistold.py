@@ -20,8 +20,8 @@ from typing_extensions import override
 
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.model.interaction import rtc_valid_subapertures
 from service.model.kinds import SlopeOrder
+from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from service.runtime.worker import Compute, OpticsWorker, Sampling
 from service.tracking.state import Mode

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.estimation.frames import FrameBlock
-from service.model.interaction import valid_subapertures
+from service.model.pupil import valid_subapertures
 from service.wire import (
     Acknowledgement,
     Command,

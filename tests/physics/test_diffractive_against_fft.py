@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.model.interaction import (
-    normalised_jacobian,
-    reference_slopes,
-    valid_subapertures,
-)
-from service.model.pyramid import PyramidOptics
+from service.model.pupil import valid_subapertures
+from service.model.sensors.pyramid.optics import PyramidOptics
+from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
 from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, centred_pupil
 from tests.numerics import flao_basis
 from tests.physics.fft_pyramid import FftPyramid

@@ -8,11 +8,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.model.detector_windows import frame_windows, slopes_from_frames, slopes_per_unit
-from service.model.instrument import FrameWindows
-from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation
 from service.model.misregistration import Misregistration
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.pyramid.description import FrameWindows
+from service.model.sensors.pyramid.detector_windows import (
+    frame_windows,
+    slopes_from_frames,
+    slopes_per_unit,
+)
 from service.model.slopes import SlopeRecipe
 from tests.numerics import small_basis, small_instrument
 from tests.physics.fft_pyramid import FftPyramid

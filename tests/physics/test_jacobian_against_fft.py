@@ -42,9 +42,7 @@ def optics(
 ) -> tuple[InteractionModel, FftPyramid]:
     """The model and the reference with the same sampling, quadrature and modulation."""
     instrument = load_instrument("flao-lbt")
-    model = InteractionModel(
-        instrument, basis, pupil_sampling=sampling, detector_nodes=n_nodes, n_modulation=28
-    )
+    model = InteractionModel(instrument, basis, pupil_sampling=sampling, detector_nodes=n_nodes)
     reference = FftPyramid(
         amplitude=model.pupil.amplitude,
         sampling=sampling,

@@ -29,7 +29,6 @@ def model_of(*, nodes=2, dtype=np.float32, recipe=LOCAL):
         small_basis(),
         pupil_sampling=3,
         detector_nodes=nodes,
-        n_modulation=28,
         dtype=dtype,
     )
 

@@ -9,7 +9,7 @@ from service.config import packaged_instrument
 from service.control.reconstructor import invert
 from service.errors import UnknownIdError
 from service.estimation.frames import FrameBlock
-from service.model.interaction import rtc_valid_subapertures
+from service.model.pupil import rtc_valid_subapertures
 from service.web import numbers
 from tests.unit.test_api_fits import assert_problem
 

@@ -13,10 +13,10 @@ from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
 from service.model.described import LoopFacts
 from service.model.instrument import instrument_sha256
-from service.model.interaction import rtc_valid_subapertures, valid_subapertures
 from service.model.kinds import Influence, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
+from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import Orientation
 from service.tracking.state import Mode
 

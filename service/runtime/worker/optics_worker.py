@@ -19,9 +19,14 @@ from service.control.loop import ControlLoop
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.estimation.description import Description
 from service.estimation.estimate import DitheredEstimate, PassiveEstimate
-from service.estimation.light import far_starts
 from service.estimation.lockin import LockInEstimate, Spectra, fit_window
-from service.estimation.openloop import WideCaptureEstimate, WideCaptureSearch, find, not_found
+from service.estimation.openloop import (
+    WideCaptureEstimate,
+    WideCaptureSearch,
+    far_starts,
+    find,
+    not_found,
+)
 from service.estimation.own_matrix import OwnMatrix, recognise_modes
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
@@ -31,8 +36,8 @@ from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
+from service.model.sensors.kind import WorkingPoint
 from service.model.slopes import SlopeRecipe
-from service.model.turbulence import Halo
 from service.runtime.worker.records import (
     Compute,
     Conditions,
@@ -42,7 +47,7 @@ from service.runtime.worker.records import (
     outer_of,
     waits,
 )
-from service.runtime.worker.sensor import REACH, Sensor, length, near_enough
+from service.runtime.worker.sensor import REACH, SensorAtWork, length, near_enough
 
 MAX_APPROACHES = 5
 """Steps of the coarse model; from the edge of the capture range three are enough."""
@@ -89,20 +94,23 @@ class OpticsWorker:
         """Make the models of an instrument, all but its modes."""
         basis, compute = self._basis, self._compute
 
-        def model(sampling: int, nodes: int, halo: Halo | None) -> RtcInteractionModel:
+        def model(sampling: int, nodes: int, at_work: WorkingPoint | None) -> RtcInteractionModel:
             return RtcInteractionModel(
                 instrument,
                 basis,
                 pupil_sampling=sampling,
                 detector_nodes=nodes,
-                halo=halo,
+                working_point=at_work,
                 mapper=self._threads.map,
                 mode_response=self._mode_response,
             )
 
         sampling, nodes, working_point_modes = compute.sampling
-        self._sensor = Sensor(
-            lambda halo: model(sampling, nodes, halo), instrument, working_point_modes, sampling
+        self._sensor = SensorAtWork(
+            lambda at_work: model(sampling, nodes, at_work),
+            instrument,
+            working_point_modes,
+            sampling,
         )
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.turbulence import Halo, working_point
+from service.model.sensors.kind import WorkingPoint
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 
@@ -42,14 +43,14 @@ STRENGTHS = (0.05, 4.0)
 """Variance of the residual over that at the instrument's r0. Of the first a wavefront is all but
 flat, and gains above 1 ask for less; the second is 2.3" of seeing."""
 
-ModelOf = Callable[[Halo | None], RtcInteractionModel]
+ModelOf = Callable[[WorkingPoint | None], RtcInteractionModel]
 
 
-class Sensor:
+class SensorAtWork:
     """The response at work, its last linearisation, and what it is of that to a flat wavefront.
 
-    ``model_of`` makes the model of a halo. Without ``n_controlled`` modes, or with None, the
-    response is that to a flat wavefront for good.
+    ``model_of`` makes the model of a working point. Without ``n_controlled`` modes, or where the
+    kind of sensor has no working point, the response is that to a flat wavefront for good.
     """
 
     def __init__(
@@ -145,14 +146,17 @@ class Sensor:
     def _at_work(self) -> RtcInteractionModel:
         if self._n_controlled is None:
             return self.flat
-        halo = working_point(
+        found = kind_of(self._instrument).working_point(
             self._instrument,
             n_controlled=self._n_controlled,
             # a residual's variance goes with r0^(-5/3)
             r0_m=self._instrument.modes.r0_m * self._strength ** (-3 / 5),
             sampling=self._sampling,
         )
-        return self._model_of(halo)
+        if found is None:
+            self._n_controlled = None
+            return self.flat
+        return self._model_of(found)
 
 
 def length(step: Array) -> float:

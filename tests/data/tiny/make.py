@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from service.config import load_instrument
 from service.model.instrument import Instrument
-from service.model.interaction import valid_subapertures
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
+from service.model.pupil import valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, rtc_mask, to_rtc
 from sim_rtc.telescope.diffractive import DiffractivePlant
 

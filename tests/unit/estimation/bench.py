@@ -10,10 +10,11 @@ import numpy as np
 from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument
-from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis
+from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from tests.numerics import small_basis, small_instrument
 

@@ -11,7 +11,7 @@ from service.config.instrument import load_instrument
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.pupil import Illumination, instrument_pupil
-from service.model.pyramid import PyramidOptics
+from service.model.sensors.pyramid.optics import PyramidOptics
 from tests.numerics import small_instrument
 
 COUNTS = 400.0

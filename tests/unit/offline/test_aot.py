@@ -11,8 +11,8 @@ from pyrcal.offline.aot import affine
 from service.archive import Archive
 from service.errors import ConfigurationError
 from service.files.recording import RecordedKind, Recording, RecordingWriter
-from service.model.interaction import rtc_valid_subapertures
 from service.model.misregistration import Misregistration
+from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation, SlopeOrder, SlopeRecipe, to_conventions
 from service.wire import (
     FrameHeader,

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from pyrcal.offline.fit_file import fit_file
-from pyrcal.offline.light import in_conventions, read_light
+from pyrcal.offline.light import read_light
 from pyrcal.offline.matrix import FitOptions
 from service.config import load_instrument
 from service.errors import MatrixError
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
+from service.model.sensors.pyramid.light import PyramidLight
 from service.model.slopes import Orientation
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, ORIENTATION, SEED
@@ -57,14 +58,17 @@ def path(light, tmp_path):
 def test_a_flux_map_is_turned_with_its_images(light, instrument):
     rows_from_top = light.reshape(24, 24)[::-1].reshape(2, 12, 2, 12)
     np.testing.assert_array_equal(
-        in_conventions(as_four(rows_from_top), instrument), as_four(light)
+        PyramidLight(instrument=instrument).turned(as_four(rows_from_top)), as_four(light)
     )
     swapped = light.reshape(24, 24).T.reshape(2, 12, 2, 12)
     np.testing.assert_array_equal(
-        in_conventions(as_four(swapped), oriented(Orientation(swap_xy=True))), as_four(light)
+        PyramidLight(instrument=oriented(Orientation(swap_xy=True))).turned(as_four(swapped)),
+        as_four(light),
     )
     signed = oriented(Orientation(sign_x=-1, sign_y=-1))
-    np.testing.assert_array_equal(in_conventions(as_four(light), signed), as_four(light))
+    np.testing.assert_array_equal(
+        PyramidLight(instrument=signed).turned(as_four(light)), as_four(light)
+    )
 
 
 def test_the_light_alone_puts_the_pupil_within_a_tenth_of_a_subaperture(path, instrument):

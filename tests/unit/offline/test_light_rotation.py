@@ -7,14 +7,10 @@ import pytest
 
 from pyrcal.offline.light_rotation import Arms, LightRotation, find_rotation
 from service.errors import ModelError
-from service.estimation.light import (
-    CannotTell,
-    PupilPosition,
-    measured_illumination,
-    relative_light,
-)
+from service.model.sensors.light import CannotTell, PupilPosition
+from service.model.sensors.pyramid.light import measured_illumination, relative_light
 from tests.unit.estimation.lamps import beam, counts_of, flao, gaussian
-from tests.unit.estimation.test_light_illumination import at
+from tests.unit.model.sensors.test_pyramid_light_illumination import at
 
 SHIFT = (-0.4, 0.3)
 HERE = at(*SHIFT)

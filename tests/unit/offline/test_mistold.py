@@ -17,10 +17,11 @@ from service.errors import ModelError
 from service.estimation.models import Optic
 from service.estimation.reference import Reference
 from service.model.described import InfluenceShape
-from service.model.instrument import Instrument, Mirror, Pyramid
-from service.model.interaction import lit_subapertures
+from service.model.instrument import Instrument, Mirror
 from service.model.kinds import BasisKind, Influence, Normalisation, Stop
 from service.model.misregistration import Misregistration
+from service.model.pupil import lit_subapertures
+from service.model.sensors.pyramid.description import Pyramid
 from service.model.slopes import Orientation, SlopeRecipe
 from tests.physics.fft_pyramid import FftPyramid
 

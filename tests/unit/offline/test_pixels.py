@@ -13,8 +13,8 @@ from service.estimation.orientation import Pose, find_orientation
 from service.estimation.reference import Reference
 from service.estimation.slope_convention import of_answer
 from service.estimation.solver import nuisances_of
-from service.model.interaction import valid_subapertures
 from service.model.kinds import SignalKind, SlopeOrder
+from service.model.pupil import valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, slopes_of
 from tests.numerics import small_basis
 from tests.unit.estimation.bench import (

@@ -11,9 +11,9 @@ from pyrcal.offline.matrix import FitOptions
 from service.config import load_instrument
 from service.errors import MatrixError
 from service.files.container import Recorded, read_recorded
-from service.model.instrument import FrameWindows
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
+from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from tests.data.tiny.make import ALPHA, HERE, STROKE_M

@@ -10,8 +10,9 @@ from service.control.gate import judge
 from service.estimation.windows import ClosedLoop
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.turbulence import working_point
-from service.runtime.worker import OpticsWorker, sensor
+from service.model.sensors.pyramid import working_point as pyramid_at_work
+from service.model.sensors.pyramid.working_point import working_point
+from service.runtime.worker import OpticsWorker
 from service.runtime.worker.sensor import FOLLOWED, STRENGTHS
 from tests.unit.runtime.small import (
     COMPUTE,
@@ -28,7 +29,7 @@ AT_WORK = replace(COMPUTE, sampling=COMPUTE.sampling._replace(working_point_mode
 
 @pytest.fixture(autouse=True)
 def each_working_point_once(monkeypatch):
-    monkeypatch.setattr(sensor, "working_point", once)
+    monkeypatch.setattr(pyramid_at_work, "working_point", once)
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def on_sky(strength):
         sampling=COMPUTE.sampling.pupil,
     )
     other = OpticsWorker(instrument, COMPUTE)
-    other._model = RtcInteractionModel(instrument, other._model.basis, halo=halo)
+    other._model = RtcInteractionModel(instrument, other._model.basis, working_point=halo)
     return other
 
 

@@ -11,11 +11,12 @@ import pytest
 from service.errors import ModelError
 from service.estimation.slope_convention import of_answer
 from service.estimation.windows import RefusalKind
-from service.model.instrument import FrameWindows
-from service.model.interaction import InteractionModel, rtc_valid_subapertures
+from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe, to_rtc
 from service.runtime.worker import OpticsWorker
 from tests.unit.runtime.small import (

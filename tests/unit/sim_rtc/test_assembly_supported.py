@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.model.instrument import FrameWindows, TabulatedModes
+from service.model.instrument import TabulatedModes
 from service.model.kinds import BasisKind, Normalisation, SlopeOrder
+from service.model.sensors.pyramid.description import FrameWindows
 from service.model.slopes import Orientation, SlopeRecipe
 from sim_rtc.assembly import check_supported
 from sim_rtc.computer.reconstructors import identity_of

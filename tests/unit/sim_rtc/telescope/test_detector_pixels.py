@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.model.interaction import valid_subapertures
+from service.model.pupil import valid_subapertures
 from sim_rtc.telescope.detector import FLAO_PRESETS, Camera, PixelDetector, binned, preset_for
 
 N_DRAWS = 40_000

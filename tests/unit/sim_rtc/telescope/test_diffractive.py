@@ -7,14 +7,11 @@ import pytest
 
 from service.errors import ModelError
 from service.model.described import KarhunenLoeve
-from service.model.interaction import (
-    normalised_jacobian,
-    reference_slopes,
-    valid_subapertures,
-)
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
-from service.model.pyramid import PyramidOptics
+from service.model.pupil import valid_subapertures
+from service.model.sensors.pyramid.optics import PyramidOptics
+from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
 from sim_rtc.computer.feed import BATCH_FRAMES, PhaseFeed
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.telescope.atmosphere import Layer, frozen_layers

@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.estimation.light import (
-    PupilPosition,
-    find_pupil,
-    measured_illumination,
-    relative_light,
-)
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
+from service.model.sensors.light import PupilPosition
+from service.model.sensors.pyramid.light import find_pupil, measured_illumination, relative_light
 from tests.numerics import small_basis
 from tests.unit.estimation.lamps import beam, counts_of, flao, fringes, gaussian, small
 

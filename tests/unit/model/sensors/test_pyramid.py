@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.instrument import Pyramid
 from service.model.interaction import InteractionModel
 from service.model.pupil import instrument_pupil
-from service.model.pyramid import Nodes, PyramidOptics, enough_modulation_points
+from service.model.sensors.pyramid.description import Pyramid
+from service.model.sensors.pyramid.optics import Nodes, PyramidOptics, enough_modulation_points
 from tests.numerics import small_basis, small_instrument, small_model
 
 
@@ -46,7 +46,7 @@ def test_the_model_chooses_an_even_number_of_points_that_is_enough(modulation, e
     wfs = replace(instrument.wfs, modulation_lambda_over_d=modulation)
     assert enough_modulation_points(wfs) == enough
     model = InteractionModel(replace(instrument, wfs=wfs), small_basis())
-    assert model.optics.n_modulation == enough
+    assert model.sensor.optics.n_modulation == enough
 
 
 def test_twice_the_modulation_points_change_nothing():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.light import far_starts
+from service.estimation.openloop import far_starts
 from service.model.instrument import SlopeRecipe
 from service.model.kinds import Stop
 from service.model.slopes import Orientation

@@ -7,6 +7,7 @@ spline through it: what falls on neighbouring subapertures is then neither lost 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.interaction import rtc_valid_subapertures, signals_of
+from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
+from service.model.sensors.pyramid.signals import signals_of
 from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
@@ -87,13 +90,14 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
     ModelError
         If the images cannot be found, or a window leaves the frame.
     """
-    if instrument.frames is None:
+    told = instrument.frames
+    if not isinstance(told, FrameWindows):
         raise ModelError(f"{instrument.name}: found wfs.input = slopes, expected frames")
-    pixels = instrument.frames.pixels_per_subaperture
-    if instrument.frames.centres_px is None:
+    pixels = told.pixels_per_subaperture
+    if told.centres_px is None:
         centres = found_centres(flux_frame, instrument.wfs.pupil_diameter * pixels)
     else:
-        centres = by_quadrant(instrument.frames.centres_px)
+        centres = by_quadrant(told.centres_px)
     n = instrument.wfs.n_subapertures
     shape = (flux_frame.shape[0], flux_frame.shape[1])
     windows = []
@@ -102,6 +106,15 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
         columns, along_x = _axis(column, n, pixels, shape[1], "columns")
         windows.append(_Window(rows=rows, columns=columns, along_y=along_y, along_x=along_x))
     return Windows(centres_px=centres, shape=shape, windows=tuple(windows))
+
+
+def remarks_on_windows(instrument: Instrument, flux_frame: NDArray[np.floating]) -> Iterator[str]:
+    """Yield where the pupil images were found, where the instrument does not tell."""
+    told = instrument.frames
+    if isinstance(told, FrameWindows) and told.centres_px is None:
+        centres = frame_windows(instrument, flux_frame.astype(np.float64)).centres_px.reshape(4, 2)
+        words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
+        yield f"shifts count from the pupil images as found: pupil_centres_px = [{words}]"
 
 
 def slopes_from_frames(
@@ -170,23 +183,6 @@ def slopes_per_unit(
         )
     slopes = signals / flux
     return np.asarray(((changes - slopes * flux_changes) / flux).T)
-
-
-def by_quadrant(centres_px: Array) -> Array:
-    """Return four centres ``(4, 2)`` as ``(2, 2, 2)``: side along y, side along x, (row, column).
-
-    Raises
-    ------
-    ModelError
-        If they do not lie in the four quadrants around their middle, one in each.
-    """
-    side = (centres_px > centres_px.mean(axis=0)).astype(int)
-    place = 2 * side[:, 0] + side[:, 1]
-    if sorted(place) != [0, 1, 2, 3]:
-        raise ModelError(
-            f"found pupil images at {centres_px.tolist()}, expected one in each quadrant"
-        )
-    return np.asarray(centres_px[np.argsort(place)].reshape(2, 2, 2))
 
 
 def found_centres(flux_frame: Array, diameter_px: float) -> Array:

@@ -1,4 +1,4 @@
-"""Find the pupil images in their mean light.
+"""Find the pupil images in their mean light, and how evenly they are lit.
 
 With the mirror as stop the outline and the obscuration move with the shift, so their edges are a
 start for a fit, before any matrix is looked at. The light inside the outline may be uneven: it is
@@ -15,7 +15,7 @@ when the light was counted. With a fixed telescope stop it stays on the sensor.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.kinds import Stop
-from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination, instrument_pupil
-from service.model.pyramid import PyramidOptics, enough_modulation_points
-from service.model.slopes import Orientation
+from service.model.sensors.light import CannotTell, PupilPosition
+from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
+from service.model.slopes import turned_mask
 
 Array = NDArray[np.float64]
 
@@ -60,23 +60,54 @@ _FLOOR_SUBAP = 0.02
 """1 σ of what smooth light of any shape moves an edge."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PupilPosition:
-    """Position of the pupil images, all four alike."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PyramidLight:
+    """The light of four pupil images as a ``Light``."""
 
-    at: tuple[float, float]
-    """x and y of their centre from that of the sensor's grid, subapertures."""
+    instrument: Instrument
 
-    sigma: tuple[float, float]
-    """1 σ of both: noise, and what the four images disagree by."""
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Four images."""
+        n = self.instrument.wfs.n_subapertures
+        return (4, n, n)
 
+    def counts_of(self, flux: bytes) -> Array:
+        """Return the counts that a status carries, ``<f4``."""
+        side = math.isqrt(len(flux) // 16)
+        try:
+            return np.frombuffer(flux, "<f4").reshape(4, side, side)
+        except ValueError as error:
+            raise ModelError(f"flux: {error}") from error
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CannotTell:
-    """The map does not say; a value, because it may well happen."""
+    def counts(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Return images ``(2, n, 2, n)`` in row-major order of their place on the detector."""
+        return light.transpose(0, 2, 1, 3).reshape(self.shape)
 
-    reason: str
-    """What was found, and what would help."""
+    def turned(self, counts: NDArray[Any]) -> NDArray[Any]:
+        """Return counts in the RTC's axes, in those of conventions.md.
+
+        A flip or a swap moves the images among one another, too.
+        """
+        n = counts.shape[-1]
+        detector = counts.reshape(2, 2, n, n).transpose(0, 2, 1, 3).reshape(2 * n, 2 * n)
+        turned = turned_mask(detector, self.instrument.slopes.assumed_orientation)
+        sides = turned.reshape(2, n, 2, n).transpose(0, 2, 1, 3)
+        return np.ascontiguousarray(sides).reshape(4, n, n)
+
+    def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
+        """Return where the pupil images lie."""
+        return find_pupil(counts, self.instrument)
+
+    def illumination(self, counts: NDArray[Any], position: PupilPosition) -> Illumination:
+        """Return how evenly the beam is lit."""
+        return measured_illumination(counts, self.instrument, position)
+
+    def relative(
+        self, counts: NDArray[Any], position: PupilPosition
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the light over that of an even beam, and where it is known."""
+        return relative_light(counts, self.instrument, position)
 
 
 def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | CannotTell:
@@ -120,10 +151,10 @@ def find_pupil(counts: NDArray[Any], instrument: Instrument) -> PupilPosition | 
 def even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
     """Return the sensor with an evenly lit pupil, as finely as light needs it."""
     return PyramidOptics(
-        wfs=instrument.wfs,
+        wfs=pyramid_in(instrument),
         pupil=instrument_pupil(instrument, sampling),
         n_nodes=sampling,
-        n_modulation=enough_modulation_points(instrument.wfs),
+        n_modulation=enough_modulation_points(pyramid_in(instrument)),
     )
 
 
@@ -340,38 +371,3 @@ def _beam(smooth: Array, position: PupilPosition) -> Illumination:
     centred = scipy.ndimage.map_coordinates(smooth, places, order=3, mode="nearest")
     coordinates = np.arange(len(centred), dtype=np.float64) - (len(centred) - 1) / 2
     return Illumination(coordinates=coordinates, intensity=np.maximum(centred, 0.0))
-
-
-FARTHEST_SUBAP = 3.0
-"""Pupil images further off than this are another instrument's."""
-
-_TURNS_RAD = np.deg2rad([5.0, -5.0])
-
-
-def far_starts(instrument: Instrument, flux: bytes | None) -> tuple[Misregistration, ...]:
-    """Return where to start from when nothing is known, the likeliest first.
-
-    With the mirror as stop the pupil images move with it, so that their mean light tells the
-    shift; rotation and magnification it does not tell. ``flux`` is as the RTC sends it, ``<f4``
-    ``[4, n, n]``, in its own axes: it is used where these are the conventions'.
-    """
-    nominal = instrument.start
-    turned = [replace(nominal, rotation_rad=nominal.rotation_rad + turn) for turn in _TURNS_RAD]
-    lit = _lit_start(instrument, nominal, flux)
-    return (*(() if lit is None else (lit,)), nominal, *turned)
-
-
-def _lit_start(
-    instrument: Instrument, nominal: Misregistration, flux: bytes | None
-) -> Misregistration | None:
-    own_axes = instrument.slopes.assumed_orientation == Orientation()
-    if flux is None or instrument.stop is not Stop.MIRROR or not own_axes:
-        return None
-    side = math.isqrt(len(flux) // 16)
-    try:
-        seen = find_pupil(np.frombuffer(flux, "<f4").reshape(4, side, side), instrument)
-    except ModelError:
-        return None
-    if isinstance(seen, CannotTell) or max(map(abs, seen.at)) > FARTHEST_SUBAP:
-        return None
-    return replace(nominal, shift_x_subap=seen.at[0], shift_y_subap=seen.at[1])

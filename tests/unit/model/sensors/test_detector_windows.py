@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.detector_windows import (
-    by_quadrant,
+from service.model.kinds import Normalisation
+from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
+from service.model.sensors.pyramid.detector_windows import (
     found_centres,
     frame_windows,
     slopes_from_frames,
     slopes_per_unit,
 )
-from service.model.instrument import FrameWindows
-from service.model.kinds import Normalisation
 from service.model.slopes import SlopeRecipe
 from tests.numerics import small_instrument
 

@@ -6,7 +6,7 @@ the modulated pupil field and W the one-dimensional "roof" operator. Unit of len
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,16 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Pyramid
 from service.model.kinds import Normalisation, SignalKind
 from service.model.pupil import PupilGrid, gauss_legendre
+from service.model.sensors.pyramid.description import Pyramid
+from service.model.sensors.pyramid.working_point import Halo
+from service.model.sensors.sensor import Mapper
 from service.model.slopes import PLAIN, SlopeRecipe
-from service.model.turbulence import Halo
 
 Array = NDArray[Any]
-
-Mapper = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
-"""Like the builtin ``map``; an executor's ``map`` spreads the work over rows."""
 
 _SIDES = np.array([-1.0, 1.0])
 _SIGNS = -_SIDES
@@ -52,7 +50,7 @@ class Nodes:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Response:
+class LightGradient:
     """Intensities at rest and their gradient with respect to the pupil phase, not normalised."""
 
     images: NDArray[np.float64]
@@ -69,7 +67,7 @@ class Response:
     recipe: SlopeRecipe
     """What the signals are, and what normalises them."""
 
-    def to(self, shapes: Array, product: Callable[[Array, Array], Array]) -> Response:
+    def to(self, shapes: Array, product: Callable[[Array, Array], Array]) -> LightGradient:
         """Return the response to combinations of points, ``shapes`` ``(n_points, n_shapes)``.
 
         What is linear in the phase may be done to a few hundred shapes as well as to thousands of
@@ -132,7 +130,7 @@ class PyramidOptics:
         nodes_y: Nodes | None = None,
         nodes_x: Nodes | None = None,
         mapper: Mapper = map,
-    ) -> Response:
+    ) -> LightGradient:
         """Return the response of the valid subapertures with the pupil images moved by ``shift``.
 
         ``valid`` is ``(n, n)`` [y, x]; ``shift`` is (x, y) in subapertures. Replacing the nodes of
@@ -153,12 +151,17 @@ class PyramidOptics:
             )
         )
         n_planes = self.recipe.kind.n_planes
-        return Response(
+        return LightGradient(
             images=self._images(fields, roof_y, roof_x),
             gradient=np.concatenate([b[k] for k in range(n_planes) for b in blocks]),
             flux_gradient=self._flux_gradient([b[-1] for b in blocks], int(valid.sum())),
             recipe=self.recipe,
         )
+
+    @property
+    def n_pairs(self) -> int:
+        """Pairs of source points."""
+        return len(self._source()[2])
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""

@@ -8,7 +8,7 @@ from service.config import load_instrument
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.turbulence import Halo, working_point
+from service.model.sensors.pyramid.working_point import Halo, working_point
 from tests.numerics import small_basis, small_instrument, small_model
 
 ALIGNED = Misregistration()
@@ -25,7 +25,7 @@ def small_halo(r0_m):
 
 
 def small_matrix(halo):
-    model = InteractionModel(small_instrument(), small_basis(), halo=halo)
+    model = InteractionModel(small_instrument(), small_basis(), working_point=halo)
     return model.interaction_matrix(ALIGNED)
 
 
@@ -79,7 +79,11 @@ def shift_derivative_error(n_nodes):
         n_points=whole.n_points[1::3],
     )
     model = InteractionModel(
-        small_instrument(), small_basis(), halo=halo, detector_nodes=n_nodes, dtype=np.float64
+        small_instrument(),
+        small_basis(),
+        working_point=halo,
+        detector_nodes=n_nodes,
+        dtype=np.float64,
     )
     step = 1e-3
     ahead, behind = (

@@ -1,0 +1,186 @@
+"""A kind of sensor: its table in an instrument file, its optics, its light.
+
+Whoever needs something of the sensor asks here; only the folder of a kind knows which one it is.
+What a kind does not have, it need not mention. Quick to import: mathematics come with the answers.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+from service.errors import ModelError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from service.model.instrument import Instrument, SensorDescription
+    from service.model.kinds import SignalKind
+    from service.model.pupil import PupilGrid
+    from service.model.sensors.light import CannotTell, Light
+    from service.model.sensors.sensor import Fineness, Sensor
+    from service.model.slopes import SlopeRecipe
+
+
+class SensorTable(Protocol):
+    """What ``[wfs]`` says whatever the kind: a dataclass that pydantic can read."""
+
+    @property
+    def n_subapertures(self) -> int:
+        """Subapertures across the sensor grid."""
+
+    @property
+    def pupil_diameter(self) -> float:
+        """Diameter of the pupil image, in subapertures."""
+
+    @property
+    def valid_subapertures(self) -> str:
+        """A mask ``path:/dataset``, or "auto": by ``flux_threshold``, which no mask allows."""
+
+
+class WorkingPoint:
+    """What the residual of a loop makes of the source; only the kind that found it looks inside."""
+
+    __slots__ = ()
+
+
+class SensorKind(ABC):
+    """One kind of wavefront sensor."""
+
+    name: ClassVar[str]
+    """``wfs.kind`` of an instrument file."""
+
+    table: ClassVar[type[Any]]
+    """What ``[wfs]`` is read into, a ``SensorTable``."""
+
+    unknown: ClassVar[Mapping[str, float]] = {}
+    """Keys of it that may be "unknown", and what is taken until a measured matrix tells."""
+
+    signals: ClassVar[tuple[SignalKind, ...]]
+    """What its subapertures give."""
+
+    def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return ``[wfs]`` as it is to be held against the table.
+
+        Raises
+        ------
+        ModelError
+            One line that begins with the key.
+        """
+        return written
+
+    @abstractmethod
+    def described(self, table: Any, given: frozenset[str]) -> SensorDescription:  # noqa: ANN401 - its own
+        """Return the sensor that a table describes, its mask apart; ``given``: keys written.
+
+        Raises
+        ------
+        ModelError
+            One line that begins with the key.
+        """
+
+    def frames(self, table: Any, given: frozenset[str]) -> object | None:  # noqa: ANN401 - its own
+        """Return how signals are made of the frames that the RTC sends; None: it sends signals."""
+        return None
+
+    def assumed(self, table: Any, given: frozenset[str]) -> Iterator[tuple[str, str]]:  # noqa: ANN401
+        """Yield keys that the table leaves out, and what is taken instead."""
+        yield from ()
+
+    def signals_of_frames(
+        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        """Return the signals ``(n_signals, n_modes)`` that frames ``(n_modes, ny, nx)`` stand for.
+
+        They are changes per unit of each mode, beside a mean frame ``(ny, nx)``; see ``frames``.
+
+        Raises
+        ------
+        ModelError
+            If the frames do not fit the sensor.
+        """
+        raise ModelError(f"{instrument.name}: found frames; expected signals of a {self.name}")
+
+    def remarks_on_frames(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Iterator[str]:
+        """Yield what was found in a mean frame because the instrument file leaves it open."""
+        yield from ()
+
+    def identity(self, sensor: Any) -> tuple[float, ...]:  # noqa: ANN401 - its own
+        """Return the numbers that make another configuration of it when they change."""
+        return (sensor.wavelength_m,)
+
+    def binned(self, sensor: Any, binning: int) -> SensorDescription:  # noqa: ANN401 - its own
+        """Return the sensor with so many subapertures made one along each axis.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be binned.
+        """
+        raise ModelError(f"a {self.name}: found binning {binning}, expected none")
+
+    @abstractmethod
+    def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return where the pixels of valid subapertures stand in a response's flat light.
+
+        ``(n_pixels, n_valid)``; the light has n_pixels for every subaperture of the grid.
+        """
+
+    @abstractmethod
+    def sensor(
+        self,
+        instrument: Instrument,
+        pupil: PupilGrid,
+        fineness: Fineness,
+        working_point: WorkingPoint | None = None,
+    ) -> Sensor:
+        """Return the sensor of an instrument on this pupil, for a flat wavefront unless told.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be computed so.
+        """
+
+    def working_point(
+        self,
+        instrument: Instrument,
+        *,
+        n_controlled: int,
+        r0_m: float | None = None,
+        sampling: int,
+    ) -> WorkingPoint | None:
+        """Return what a loop of so many modes makes of a star; None: nothing, to this sensor.
+
+        ``sampling`` are the pupil's points along a subaperture.
+
+        Raises
+        ------
+        ModelError
+            If no mode is controlled or r0 is not positive.
+        """
+        return None
+
+    def coarsest_sampling(self, sensor: Any) -> int:  # noqa: ANN401 - its own
+        """Return how many pupil points along a subaperture the smoothest shapes need."""
+        return 1
+
+    def fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
+        """Return the key of a number that a measured matrix tells beside α, by its logarithm.
+
+        It is fitted with the registration, so that a wrong one in the file does not move α; None:
+        there is none.
+        """
+        return None
+
+    def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:
+        """Return recipes that this one may be taken for, by what a file would say of them."""
+        return {}
+
+    def light(self, instrument: Instrument) -> Light | CannotTell:
+        """Return how an instrument's light tells of the pupil, or that it does not."""
+        from service.model.sensors.light import CannotTell
+
+        return CannotTell(reason=f"the light of a {self.name} does not tell where the pupil lies")

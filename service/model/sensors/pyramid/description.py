@@ -1,0 +1,130 @@
+"""A pyramid as an instrument has it, made of its file's table or refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.sensors.pyramid.table import PyramidNumbers, PyramidTable
+
+_SEPARATION_TOLERANCE = 0.1
+
+_FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pyramid(PyramidNumbers):
+    """The modulated pyramid wavefront sensor, and which of its subapertures are valid."""
+
+    kind: ClassVar[str] = "pyramid"
+
+    valid_subapertures: NDArray[np.bool_] | None = None
+    """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
+    listed; None: by ``flux_threshold`` at α = 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameWindows:
+    """Positions of the four pupil images on full detector frames."""
+
+    centres_px: NDArray[np.float64] | None = None
+    """``(4, 2)`` row and column of the images' centres, one in each quadrant of the four, in any
+    order; pixel centres are whole numbers. None: to be found in a flux frame."""
+
+    pixels_per_subaperture: int = 1
+    """Detector pixels along a side of a subaperture."""
+
+
+def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
+    """Return the pyramid of a table, its mask apart; ``given`` are the keys that are written.
+
+    Raises
+    ------
+    ModelError
+        One line that begins with the key: the images overlap, or lie elsewhere than told.
+    """
+    diameter, separation = table.pupil_diameter, _separation(table, given)
+    if separation < diameter:
+        raise ModelError(
+            f"pupil_separation_subap: found {separation:g}, expected at least the pupil's "
+            f"diameter, {diameter:g} subapertures: the images would overlap"
+        )
+    optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
+    return Pyramid(**optics | {"pupil_separation_subap": separation})
+
+
+def pyramid_in(instrument: Instrument) -> Pyramid:
+    """Return the pyramid of an instrument that has one.
+
+    Raises
+    ------
+    ModelError
+        If its sensor is another.
+    """
+    if not isinstance(instrument.wfs, Pyramid):
+        raise ModelError(f"{instrument.name}: found a {instrument.wfs.kind}, expected a pyramid")
+    return instrument.wfs
+
+
+def frames_of(table: PyramidTable, given: frozenset[str]) -> FrameWindows | None:
+    """Return where the images lie on the frames that the RTC delivers; None: it sends slopes.
+
+    Raises
+    ------
+    ModelError
+        One line that begins with the key: it belongs to frames, or the images are no quadrants.
+    """
+    if table.input == "slopes":
+        for key in _FRAME_KEYS:
+            if key in given and getattr(table, key) != 1:
+                raise ModelError(f'{key}: belongs to input = "frames", found input = "slopes"')
+        return None
+    centres = None if table.pupil_centres_px is None else _centres(table).reshape(4, 2)
+    return FrameWindows(centres_px=centres, pixels_per_subaperture=table.pixels_per_subaperture)
+
+
+def by_quadrant(centres_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return four centres ``(4, 2)`` as ``(2, 2, 2)``: side along y, side along x, (row, column).
+
+    Raises
+    ------
+    ModelError
+        If they do not lie in the four quadrants around their middle, one in each.
+    """
+    side = (centres_px > centres_px.mean(axis=0)).astype(int)
+    place = 2 * side[:, 0] + side[:, 1]
+    if sorted(place) != [0, 1, 2, 3]:
+        raise ModelError(
+            f"found pupil images at {centres_px.tolist()}, expected one in each quadrant"
+        )
+    return np.asarray(centres_px[np.argsort(place)].reshape(2, 2, 2))
+
+
+def _separation(table: PyramidTable, given: frozenset[str]) -> float:
+    """Return the images' distance: as given, or as the images on the frames lie."""
+    stated = table.image_separation_subap
+    if table.pupil_centres_px is None or table.input == "slopes":
+        return stated
+    centres = _centres(table)
+    sides = (centres[1, :, 0] - centres[0, :, 0], centres[:, 1, 1] - centres[:, 0, 1])
+    measured = float(np.mean(sides)) / table.pixels_per_subaperture
+    if "pupil_separation_subap" not in given:
+        return measured
+    if abs(measured / stated - 1.0) > _SEPARATION_TOLERANCE:
+        raise ModelError(
+            f"pupil_separation_subap: found {stated:g}, expected about {measured:.1f}, the "
+            "distance of wfs.pupil_centres_px"
+        )
+    return stated
+
+
+def _centres(table: PyramidTable) -> NDArray[np.float64]:
+    try:
+        return by_quadrant(np.array(table.pupil_centres_px))
+    except ModelError as error:
+        raise ModelError(f"pupil_centres_px: {error}") from error

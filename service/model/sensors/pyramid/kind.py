@@ -1,0 +1,159 @@
+"""The pyramid as a kind of sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from typing_extensions import override
+
+from service.errors import ModelError
+from service.model.kinds import Normalisation, SignalKind
+from service.model.sensors.kind import SensorKind, WorkingPoint
+from service.model.sensors.pyramid.table import USUAL_SEPARATION, PyramidTable
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from service.model.instrument import Instrument
+    from service.model.pupil import PupilGrid
+    from service.model.sensors.pyramid.description import FrameWindows, Pyramid
+    from service.model.sensors.pyramid.light import PyramidLight
+    from service.model.sensors.pyramid.signals import PyramidSensor
+    from service.model.sensors.pyramid.working_point import Halo
+    from service.model.sensors.sensor import Fineness
+    from service.model.slopes import SlopeRecipe
+
+
+class PyramidKind(SensorKind):
+    """The modulated pyramid."""
+
+    name = "pyramid"
+    table = PyramidTable
+    unknown: ClassVar[Mapping[str, float]] = {
+        "wavelength_m": 750e-9,
+        "modulation_lambda_over_d": 3.0,
+    }
+    signals = (SignalKind.XY, SignalKind.INTENSITY)
+
+    @override
+    def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
+        centres = written.get("pupil_centres_px")
+        if centres is None:
+            return written
+        if centres == "auto":
+            return {**written, "pupil_centres_px": None}
+        points = centres if isinstance(centres, list) else []
+        pairs = [point for point in points if isinstance(point, list) and len(point) == 2]
+        if len(points) != 4 or len(pairs) != 4:
+            raise ModelError(
+                f'pupil_centres_px: found {centres!r}, expected "auto" or four pairs [row, column]'
+            )
+        return written
+
+    @override
+    def described(self, table: PyramidTable, given: frozenset[str]) -> Pyramid:
+        from service.model.sensors.pyramid.description import pyramid_of
+
+        return pyramid_of(table, given)
+
+    @override
+    def frames(self, table: PyramidTable, given: frozenset[str]) -> FrameWindows | None:
+        from service.model.sensors.pyramid.description import frames_of
+
+        return frames_of(table, given)
+
+    @override
+    def assumed(self, table: PyramidTable, given: frozenset[str]) -> Iterator[tuple[str, str]]:
+        told = table.input == "frames" and table.pupil_centres_px is not None
+        if "pupil_separation_subap" not in given and not told:
+            yield (
+                "pupil_separation_subap",
+                f"not told, taken as {table.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil "
+                "diameters)",
+            )
+
+    @override
+    def signals_of_frames(
+        self, instrument: Instrument, frames: NDArray[Any], flux_frame: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        from service.model.sensors.pyramid.detector_windows import slopes_from_frames
+
+        return slopes_from_frames(instrument, frames, flux_frame)
+
+    @override
+    def remarks_on_frames(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Iterator[str]:
+        from service.model.sensors.pyramid.detector_windows import remarks_on_windows
+
+        yield from remarks_on_windows(instrument, flux_frame)
+
+    @override
+    def identity(self, sensor: Pyramid) -> tuple[float, ...]:
+        separation = sensor.image_separation_subap
+        return (sensor.wavelength_m, sensor.modulation_lambda_over_d, separation)
+
+    @override
+    def binned(self, sensor: Pyramid, binning: int) -> Pyramid:
+        return replace(
+            sensor,
+            n_subapertures=sensor.n_subapertures // binning,
+            pupil_separation_subap=sensor.image_separation_subap / binning,
+            pupil_diameter_subap=sensor.pupil_diameter / binning,
+        )
+
+    @override
+    def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+        from service.model.sensors.pyramid.signals import pixel_places
+
+        return pixel_places(valid)
+
+    @override
+    def sensor(
+        self,
+        instrument: Instrument,
+        pupil: PupilGrid,
+        fineness: Fineness,
+        working_point: WorkingPoint | None = None,
+    ) -> PyramidSensor:
+        from service.model.sensors.pyramid.signals import pyramid_sensor
+
+        return pyramid_sensor(instrument, pupil, fineness, working_point)
+
+    @override
+    def working_point(
+        self,
+        instrument: Instrument,
+        *,
+        n_controlled: int,
+        r0_m: float | None = None,
+        sampling: int,
+    ) -> Halo:
+        from service.model.sensors.pyramid import working_point
+
+        return working_point.working_point(
+            instrument, n_controlled=n_controlled, r0_m=r0_m, sampling=sampling
+        )
+
+    @override
+    def coarsest_sampling(self, sensor: Pyramid) -> int:
+        # the phase of a modulation wide for its subapertures turns too fast for one point
+        wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.n_subapertures
+        return 2 if wide else 1
+
+    @override
+    def fitted_key(self, sensor: Pyramid) -> str | None:
+        return "modulation_lambda_over_d" if sensor.modulation_lambda_over_d > 0.0 else None
+
+    @override
+    def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:
+        local = recipe.normalisation is Normalisation.LOCAL
+        divisor = Normalisation.GLOBAL if local else Normalisation.LOCAL
+        return {f'normalisation = "{divisor}"': replace(recipe, normalisation=divisor)}
+
+    @override
+    def light(self, instrument: Instrument) -> PyramidLight:
+        from service.model.sensors.pyramid.light import PyramidLight
+
+        return PyramidLight(instrument=instrument)

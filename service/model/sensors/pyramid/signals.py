@@ -1,0 +1,224 @@
+"""Signals of a pyramid's four images, and their response to the wavefront."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.kinds import Normalisation, SignalKind
+from service.model.pupil import PupilGrid, valid_subapertures
+from service.model.sensors.kind import WorkingPoint
+from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.optics import (
+    LightGradient,
+    Nodes,
+    PyramidOptics,
+    enough_modulation_points,
+)
+from service.model.sensors.pyramid.working_point import Halo
+from service.model.sensors.sensor import Fineness, Mapper, Work, by_rows
+from service.model.slopes import PLAIN, SlopeRecipe
+
+Array = NDArray[Any]
+
+
+def pyramid_sensor(
+    instrument: Instrument,
+    pupil: PupilGrid,
+    fineness: Fineness,
+    working_point: WorkingPoint | None = None,
+) -> PyramidSensor:
+    """Return the pyramid of an instrument on this pupil, for a flat wavefront unless told.
+
+    Raises
+    ------
+    ModelError
+        If the instrument's sensor is another, or the working point another sensor's.
+    """
+    wfs = pyramid_in(instrument)
+    if not isinstance(working_point, Halo | None):
+        raise ModelError(f"pyramid: found {working_point!r}, expected a halo")
+    optics = PyramidOptics(
+        wfs=wfs,
+        pupil=pupil,
+        n_nodes=fineness.n_nodes,
+        n_modulation=max(fineness.n_source_points, enough_modulation_points(wfs)),
+        dtype=fineness.dtype,
+        halo=working_point,
+        recipe=instrument.slopes,
+    )
+    return PyramidSensor(
+        optics=optics, valid=valid_subapertures(instrument), mapper=fineness.mapper
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PyramidSensor:
+    """The pyramid as a ``Sensor``."""
+
+    optics: PyramidOptics
+    valid: NDArray[np.bool_]
+    mapper: Mapper = map
+
+    @property
+    def n_signals(self) -> int:
+        """Two slopes or four pixels for each valid subaperture."""
+        return self.optics.recipe.kind.n_planes * int(self.valid.sum())
+
+    def at(self, shift: tuple[float, float]) -> PyramidResponse:
+        """Return the response with the four images moved by ``shift``, (x, y) in subapertures."""
+        gradient = self.optics.response(self.valid, shift, mapper=self.mapper)
+        return PyramidResponse(sensor=self, shift=shift, at_rest=gradient)
+
+    def work(self, n_shapes: int) -> Work:
+        """Return what K and its product with so many shapes take; K is held whole, twice."""
+        optics, rows, n_valid = self.optics, self.n_signals, int(self.valid.sum())
+        n_points, side = int(optics.pupil.lit.sum()), len(optics.pupil.coordinates)
+        local = optics.recipe.normalisation is Normalisation.LOCAL
+        gradients = rows + (n_valid if local else int(self.valid.any(axis=1).sum()))
+        of_source = 8.0 * optics.n_pairs * optics.n_nodes * side
+        folded = of_source * (side * gradients + 8.0 * optics.n_nodes * n_valid)
+        return Work(
+            memory_bytes=2.0 * gradients * n_points * np.dtype(optics.dtype).itemsize,
+            flop=folded + 2.0 * gradients * n_points * n_shapes,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PyramidResponse:
+    """The pyramid's ``Response``, its images at one place."""
+
+    sensor: PyramidSensor
+    shift: tuple[float, float]
+    at_rest: LightGradient
+
+    @property
+    def light(self) -> NDArray[np.float64]:
+        """``(2, n, 2, n)`` the four images: side along y, row, side along x, column."""
+        return self.at_rest.images
+
+    def lit(self, light: NDArray[np.float64]) -> PyramidResponse:
+        """Return the response where the images have other light at rest.
+
+        What the phase changes in the light that is missing, some 1e-4 of the flux's gradient, is
+        left in.
+        """
+        return replace(self, at_rest=replace(self.at_rest, images=light))
+
+    def jacobian(self) -> Array:
+        """Return K whole, ``(n_signals, n_points)`` per metre."""
+        return self._per_metre(normalised_jacobian(self.at_rest, self.sensor.valid))
+
+    def apply(self, shapes: Array) -> Array:
+        """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
+        light = self.at_rest.to(shapes, self._product)
+        return self._per_metre(normalised_jacobian(light, self.sensor.valid))
+
+    def shift_rates(self, shapes: Array) -> tuple[Array, Array]:
+        """Return how they change when the images move along x, and along y, per subaperture."""
+        at_rest = self.at_rest.to(shapes, self._product)
+        optics, valid = self.sensor.optics, self.sensor.valid
+        along_x, along_y = (
+            self._per_metre(
+                normalised_derivative(
+                    at_rest,
+                    optics.response(valid, self.shift, mapper=self.sensor.mapper, **edges).to(
+                        shapes, self._product
+                    ),
+                    valid,
+                )
+            )
+            for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()})
+        )
+        return along_x, along_y
+
+    def _per_metre(self, jacobian: Array) -> Array:
+        wavelength_m = self.sensor.optics.wfs.wavelength_m
+        jacobian *= np.asarray(2 * np.pi / wavelength_m, dtype=jacobian.dtype)
+        return jacobian
+
+    def _product(self, gradient: Array, shapes: Array) -> Array:
+        if gradient.ndim == 1:
+            return np.asarray(gradient @ shapes)
+        return by_rows(self.sensor.mapper, lambda rows: rows @ shapes, gradient)
+
+
+def pixel_places(valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return where the pixels of valid subapertures stand in flat light ``(2, n, 2, n)``.
+
+    ``(4, n_valid)``: in the images at -x -y, +x -y, -x +y, +x +y.
+    """
+    n = len(valid)
+    places = np.arange(4 * n * n, dtype=np.intp).reshape(2, n, 2, n)
+    return np.ascontiguousarray(places.swapaxes(1, 2)[..., valid].reshape(4, -1))
+
+
+def reference_slopes(
+    images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe = PLAIN
+) -> tuple[Array, float]:
+    """Return the signals ``(n_slopes,)`` of four images and the mean flux per valid subaperture.
+
+    Signs of conventions.md. ``images`` is ``(2, n, 2, n)``.
+    """
+    signals, flux = signals_of(images, valid, recipe)
+    return signals / flux, float(flux.mean())
+
+
+def signals_of(images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> tuple[Array, Array]:
+    """Return the signals of four images ``(..., 2, n, 2, n)``, and what normalises them.
+
+    The signals are ``(..., n_slopes)``: x, then y differences, or the images. The flux is
+    ``(..., 1)``, the mean per valid subaperture, or ``(..., n_slopes)``, each one's own.
+    """
+    by_x, by_y = images.sum(axis=-4), images.sum(axis=-2)
+    flux = by_y.sum(axis=-3)[..., valid]
+    if recipe.kind is SignalKind.INTENSITY:
+        sides = images.swapaxes(-3, -2)[..., valid]
+        signals = sides.reshape(*flux.shape[:-1], -1)
+    else:
+        x = (by_x[..., 0, :] - by_x[..., 1, :])[..., valid]
+        y = (by_y[..., 0, :, :] - by_y[..., 1, :, :])[..., valid]
+        signals = np.concatenate([x, y], axis=-1)
+    if recipe.normalisation is Normalisation.LOCAL:
+        return signals, np.concatenate([flux] * recipe.kind.n_planes, axis=-1)
+    return signals, flux.mean(axis=-1, keepdims=True)
+
+
+def normalised_jacobian(response: LightGradient, valid: NDArray[np.bool_]) -> Array:
+    """Return the gradient of the normalised signals, ``(n_slopes, n_points)`` per radian.
+
+    Of a response to shapes: their signals, ``(n_slopes, n_shapes)``.
+    """
+    signals, flux = signals_of(response.images, valid, response.recipe)
+    jacobian = response.gradient - _times(signals / flux, response.flux_gradient)
+    jacobian /= flux[:, None].astype(jacobian.dtype)
+    return np.asarray(jacobian)
+
+
+def normalised_derivative(
+    at_rest: LightGradient, moving: LightGradient, valid: NDArray[np.bool_]
+) -> Array:
+    """Return the rate of ``normalised_jacobian`` when the images move, by the product rule."""
+    signals, flux = signals_of(at_rest.images, valid, at_rest.recipe)
+    signal_rate, flux_rate = signals_of(moving.images, valid, moving.recipe)
+    slopes = signals / flux
+    slope_rate = (signal_rate - slopes * flux_rate) / flux
+    rate = moving.gradient - _times(slopes, moving.flux_gradient)
+    rate -= _times(slope_rate, at_rest.flux_gradient)
+    rate -= normalised_jacobian(at_rest, valid) * flux_rate[:, None].astype(rate.dtype)
+    rate /= flux[:, None].astype(rate.dtype)
+    return np.asarray(rate)
+
+
+def _times(slopes: Array, flux_gradient: Array) -> Array:
+    """Return each slope times the gradient of its flux, ``(n_slopes, n_points)``."""
+    column = slopes[:, None].astype(flux_gradient.dtype)
+    if flux_gradient.ndim == 1:
+        return np.asarray(column * flux_gradient)
+    planes = column.reshape(-1, len(flux_gradient), 1) * flux_gradient
+    return planes.reshape(len(slopes), -1)

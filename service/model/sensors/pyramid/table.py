@@ -1,0 +1,70 @@
+"""Keys of a pyramid in an instrument file: quick to import, no arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, Lt
+
+from service.model.described import Count, Positive, Read
+
+USUAL_SEPARATION = 1.2
+"""Distance of neighbouring pupil images over their diameter, where nobody tells."""
+
+Pixel = Annotated[float, Ge(0.0)]
+Centre = tuple[Pixel, Pixel]
+Centres = tuple[Centre, Centre, Centre, Centre]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PyramidNumbers(Read):
+    """The modulated pyramid wavefront sensor and its sampling."""
+
+    n_subapertures: Annotated[int, Ge(4), Le(1000)]
+    """Subapertures across the sensor grid."""
+
+    wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
+    """Sensing wavelength, metres; may be "unknown" until a matrix is fitted."""
+
+    modulation_lambda_over_d: Annotated[float, Ge(0.0), Le(100.0)]
+    """Radius of the modulation circle, λ/D; may be "unknown" until a matrix is fitted."""
+
+    pupil_separation_subap: Positive | None = None
+    """Distance between the centres of neighbouring pupil images, subapertures; None: 1.2 diameters
+    of the pupil."""
+
+    pupil_diameter_subap: Positive | None = None
+    """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
+
+    flux_threshold: Annotated[float, Gt(0.0), Le(1.0)] = 0.5
+    """Least flux of a valid subaperture, relative to a full one."""
+
+    @property
+    def pupil_diameter(self) -> float:
+        """Diameter of the pupil image, in subapertures."""
+        return float(self.pupil_diameter_subap or self.n_subapertures)
+
+    @property
+    def image_separation_subap(self) -> float:
+        """Distance between the centres of neighbouring pupil images, in subapertures."""
+        return float(self.pupil_separation_subap or USUAL_SEPARATION * self.pupil_diameter)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PyramidTable(PyramidNumbers):
+    """``[wfs]``: the pyramid sensor."""
+
+    kind: Literal["pyramid"]
+
+    valid_subapertures: str = "auto"
+    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
+
+    input: Literal["slopes", "frames"] = "slopes"
+    """What the RTC sends."""
+
+    pupil_centres_px: Centres | None = None
+    """Of the four pupil images, row and column; "auto": from a flux frame. Frames only."""
+
+    pixels_per_subaperture: Count = 1
+    """Frames only."""

@@ -1,0 +1,20 @@
+"""The kinds of sensors, one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from service.model.sensors.kind import SensorKind
+from service.model.sensors.pyramid.kind import PyramidKind
+
+if TYPE_CHECKING:
+    from service.model.instrument import Instrument
+
+KINDS: Mapping[str, SensorKind] = {kind.name: kind for kind in (PyramidKind(),)}
+"""By ``wfs.kind`` of an instrument file; the first one where a file does not say."""
+
+
+def kind_of(instrument: Instrument) -> SensorKind:
+    """Return the kind of an instrument's sensor."""
+    return KINDS[instrument.wfs.kind]

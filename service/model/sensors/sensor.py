@@ -1,0 +1,100 @@
+"""A sensor with its pupil, and its response to small wavefronts, whatever its kind.
+
+Signals stand plane by plane, each plane over all valid subapertures in row-major order of the mask:
+Sx, then Sy, or whatever planes ``SignalKind`` has. In which order an RTC lists them, and how its
+axes lie, ``service.model.slopes`` says. Nobody outside holds the sensor's Jacobian K: ``apply`` may
+make it row by row of subapertures, and never have it whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+Mapper = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
+"""Like the builtin ``map``; an executor's ``map`` spreads the work over rows."""
+
+_ROW_CHUNK = 512
+"""Rows of a product per task: large enough for BLAS, small enough to share between cores."""
+
+
+class Response(Protocol):
+    """What the sensor makes of small wavefronts, its image of the pupil at one place."""
+
+    @property
+    def light(self) -> NDArray[np.float64]:
+        """Light on every pixel of a flat wavefront, in the sensor's own shape and unit."""
+
+    def lit(self, light: NDArray[np.float64]) -> Response:
+        """Return the response where the pixels have other light at rest: some may be dead."""
+
+    def jacobian(self) -> Array:
+        """Return K whole, ``(n_signals, n_points)`` per metre: for simulators only."""
+
+    def apply(self, shapes: Array) -> Array:
+        """Return the signals ``(n_signals, n_shapes)`` of wavefronts ``(n_points, n_shapes)``.
+
+        Wavefronts are in metres of OPD, at the lit points of the pupil.
+        """
+
+    def shift_rates(self, shapes: Array) -> tuple[Array, Array]:
+        """Return how they change when the image moves along x, and along y, per subaperture."""
+
+
+class Sensor(Protocol):
+    """A sensor with its pupil, as finely as somebody wants it."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """``(n, n)`` [y, x] subapertures that give signals, in the axes of conventions.md."""
+
+    @property
+    def n_signals(self) -> int:
+        """Signals of a frame."""
+
+    def at(self, shift: tuple[float, float]) -> Response:
+        """Return the response with the pupil's image moved by ``shift``, (x, y) subapertures."""
+
+    def work(self, n_shapes: int) -> Work:
+        """Return what a response and the signals of so many shapes take."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """What a computation takes, known before it begins."""
+
+    memory_bytes: float
+    """At its largest, shapes and signals not counted."""
+
+    flop: float
+    """Additions and multiplications."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fineness:
+    """How finely a sensor is computed, and by whom."""
+
+    n_nodes: int = 3
+    """Quadrature nodes along a side of a subaperture."""
+
+    n_source_points: int = 0
+    """Points of the source at least, where it has any; 0: as many as are enough."""
+
+    dtype: type[np.float32] | type[np.float64] = np.float32
+    """Precision of the products; float64 for derivative checks."""
+
+    mapper: Mapper = map
+    """Spreads rows over threads."""
+
+
+def by_rows(mapper: Mapper, function: Callable[[Array], Array], rows: Array) -> Array:
+    """Return what a function makes of rows, chunk after chunk."""
+    starts = range(0, len(rows), _ROW_CHUNK)
+    chunks = mapper(lambda start: function(rows[start : start + _ROW_CHUNK]), starts)
+    return np.concatenate(list(chunks))

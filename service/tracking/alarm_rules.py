@@ -17,10 +17,11 @@ from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import why_open
-from service.tracking import alarms, dither, mode_proof, refusals, validity
+from service.tracking import alarms, dither, dither_plan, mode_proof, refusals, validity
 from service.tracking import commands as cmd
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
+from service.tracking.dither_request import GONE_WITHIN_S
 from service.tracking.operations.acquisition_stages import missed_enough
 from service.tracking.operations.probation import opening_text
 from service.tracking.policy import SECOND_NS, Rule
@@ -34,8 +35,11 @@ RENEWED_S = 15.0
 
 def derive_alarms(context: StepContext) -> None:
     """Raise what the state says is the matter, and end what is over."""
+    raised = {alarm.name for alarm in context.alarms.active}
     for name, rule in RULES.items():
-        _set(context, name, rule(context), _definition(context, name))
+        text = rule(context)
+        if text is not None or name in raised:
+            _set(context, name, text, _definition(context, name))
     for alarm in context.alarms.active:
         lasts = LASTING.get(alarm.name)
         if lasts is not None and not lasts(context):
@@ -118,6 +122,20 @@ def _not_found(context: StepContext) -> str | None:
     )
 
 
+def _not_stopped(context: StepContext) -> str | None:
+    """Return that the RTC plays a dither that it was asked to stop, or None."""
+    rtc, memory = context.rtc, context.dither_policy
+    if rtc is None or memory.unwanted_id is None or rtc.dither_id != memory.unwanted_id:
+        return None
+    if context.now_ns - memory.stopped_ns_utc < GONE_WITHIN_S * SECOND_NS:
+        return None
+    why = dither_plan.too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
+    return why and (
+        f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
+        f"{dither.TELL_EVERY_S:.0f} s to stop it; stop it at the RTC"
+    )
+
+
 def _jump_suspected(context: StepContext) -> str | None:
     registration = context.registration
     if registration is None or not (registration.doubt and registration.doubt_voids):
@@ -134,7 +152,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.OTHER_SUM: _other_numbers,
     alarms.SHORT_MARGIN: _margin,
     alarms.LOOP_OPENED: opening_text,
-    alarms.NOT_STOPPED: dither.not_stopped_text,
+    alarms.NOT_STOPPED: _not_stopped,
     alarms.MODES_CONTRARY: mode_proof.contrary_text,
     alarms.MODES_UNEVEN: mode_proof.uneven_text,
     alarms.SUSPECTED: _jump_suspected,

@@ -19,11 +19,11 @@ from service.tracking import events as ev
 from service.tracking.dither_modes import N_LINES
 from service.tracking.dither_plan import WantedDither
 from service.tracking.dither_request import (
-    GONE_WITHIN_S,
     NOISY_DITHER,
     OWN_DITHER,
     Dither,
     DitherPhase,
+    DitherPolicyState,
     Precision,
     on_vibrations,
     own_sine,
@@ -80,11 +80,14 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
         return
     mode_proof.give_up(context, rtc)
     wanted, plan = dither_plan.wanted(context, rtc)
-    context.dither_policy = replace(
-        context.dither_policy,
-        plan=plan,
-        next_ns_utc=wanted.next_ns_utc if wanted.next_ns_utc > context.now_ns else None,
-        avoided_hz=wanted.parameters.avoid_hz,
+    _set_policy(
+        context,
+        replace(
+            context.dither_policy,
+            plan=plan,
+            next_ns_utc=wanted.next_ns_utc if wanted.next_ns_utc > context.now_ns else None,
+            avoided_hz=wanted.parameters.avoid_hz,
+        ),
     )
     _show(context, wanted.phase, wanted.reason)
     if dither is not None:
@@ -95,7 +98,7 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
 
 def ask_for(context: StepContext, dither: Dither) -> None:
     """Ask for a dither and follow it."""
-    context.dither = replace(dither, cause=context.cause)
+    _set_dither(context, replace(dither, cause=context.cause))
     context.ask(ev.Ask(request=dither.request))
 
 
@@ -108,7 +111,7 @@ def ask_to_stop(context: StepContext) -> None:
 
 def drop(context: StepContext) -> None:
     """Follow no dither any more."""
-    context.dither = None
+    _set_dither(context, None)
 
 
 def make_way(context: StepContext) -> None:
@@ -117,7 +120,7 @@ def make_way(context: StepContext) -> None:
     running = dither.id if dither is not None else rtc and rtc.dither_id
     if running:
         _note_stop(context, running)
-        context.dither = None
+        _set_dither(context, None)
         ask_to_stop(context)
 
 
@@ -137,7 +140,7 @@ def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
 
 def tell_to_stop(context: StepContext) -> None:
     """Ask the RTC to end a dither that nobody wants, which is not followed."""
-    context.dither_policy = replace(context.dither_policy, stop_asked_ns_utc=context.now_ns)
+    _set_policy(context, replace(context.dither_policy, stop_asked_ns_utc=context.now_ns))
     ask_to_stop(context)
 
 
@@ -146,14 +149,14 @@ def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> Non
     if context.dither is None or context.dither.id != request.id:
         return
     if reply.accepted:
-        context.dither = replace(
-            context.dither, start_seq=reply.start_seq, asked_ns_utc=context.now_ns
+        _set_dither(
+            context, replace(context.dither, start_seq=reply.start_seq, asked_ns_utc=context.now_ns)
         )
         text = f"{request.id} starts at frame {reply.start_seq}"
         context.log("dither.started", text, _level(request))
         return
     context.put_off(dither_s=10.0)
-    context.dither = None
+    _set_dither(context, None)
     text = f"the RTC refused the dither: {reply.reason}"
     context.raise_alarm(alarms.NO_DITHER, text)
     context.fail(text)
@@ -184,8 +187,8 @@ def follow_status(context: StepContext, rtc: Status) -> None:
     asked_to_stop = dither.id == context.dither_policy.stopped_id
     # a status a second old may be the first to show the end
     if asked_to_stop or played_s >= dither.request.duration_s - SILENT_S:
-        context.dither_policy = replace(context.dither_policy, ended_ns_utc=context.now_ns)
-        context.dither = None
+        _set_policy(context, replace(context.dither_policy, ended_ns_utc=context.now_ns))
+        _set_dither(context, None)
         context.clear_alarm(alarms.DITHER_LOST)
         context.log("dither.ended", f"{dither.id} has ended", _level(dither.request))
         return
@@ -232,7 +235,7 @@ def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> No
         n_windows = 0 if known is None else known.n_windows
         mean = forgetting_mean(None if known is None else known.ratio, n_windows, ratio)
         precision = Precision(ratio=mean, n_windows=n_windows + 1)
-        context.dither_policy = replace(context.dither_policy, precision=precision)
+        _set_policy(context, replace(context.dither_policy, precision=precision))
 
 
 def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None:
@@ -242,11 +245,11 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
-        context.dither_policy = replace(context.dither_policy, loud_text="", amiss_id=None)
+        _set_policy(context, replace(context.dither_policy, loud_text="", amiss_id=None))
         return None
     if rtc is None or dither is None or dither.id != event.id:
         return None
-    context.dither_policy = replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m)
+    _set_policy(context, replace(context.dither_policy, amiss_id=event.id, amiss_m=event.found_m))
     most_m = dither_plan.budget_m(rtc, context.policy)
     if event.found_m > MEASURED * max(event.asked_m, most_m):
         return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
@@ -257,7 +260,7 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
 def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
     """Stop a dither that the frames show to be too strong."""
     _meet_unwanted(context, dither_id)
-    context.dither_policy = replace(context.dither_policy, loud_id=dither_id, loud_text=loud)
+    _set_policy(context, replace(context.dither_policy, loud_id=dither_id, loud_text=loud))
     _blame(context, dither_id, loud)
     tell_to_stop(context)
 
@@ -289,21 +292,15 @@ def stop_unwanted(context: StepContext, rtc: Status) -> None:
 def forget_unwanted(context: StepContext) -> None:
     """Note that no unwanted dither plays, or nobody knows of one."""
     if context.dither_policy.unwanted_id is not None:
-        context.dither_policy = replace(context.dither_policy, unwanted_id=None)
+        _set_policy(context, replace(context.dither_policy, unwanted_id=None))
 
 
-def not_stopped_text(context: StepContext) -> str | None:
-    """Return that the RTC plays a dither that it was asked to stop, or None."""
-    rtc, memory = context.rtc, context.dither_policy
-    if rtc is None or memory.unwanted_id is None or rtc.dither_id != memory.unwanted_id:
-        return None
-    if context.now_ns - memory.stopped_ns_utc < GONE_WITHIN_S * SECOND_NS:
-        return None
-    why = dither_plan.too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
-    return why and (
-        f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
-        f"{TELL_EVERY_S:.0f} s to stop it; stop it at the RTC"
-    )
+def _set_dither(context: StepContext, dither: Dither | None) -> None:
+    context.dithers = replace(context.dithers, dither=dither)
+
+
+def _set_policy(context: StepContext, policy: DitherPolicyState) -> None:
+    context.dithers = replace(context.dithers, policy=policy)
 
 
 def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
@@ -339,12 +336,15 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
         context.warn("dither.on-vibrations", text)
     if wanted.phase is DitherPhase.PROVE:
         mode_proof.begin(context, wanted.parameters.modes)
-    context.dither_policy = replace(
-        context.dither_policy,
-        lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
-        results_due=context.windows.accepted + wanted.parameters.n_windows,
-        ended_ns_utc=None,
-        next_ns_utc=None,
+    _set_policy(
+        context,
+        replace(
+            context.dither_policy,
+            lines_hz=wanted.parameters.last_hz if wanted.parameters.modes else dither.frequency_hz,
+            results_due=context.windows.accepted + wanted.parameters.n_windows,
+            ended_ns_utc=None,
+            next_ns_utc=None,
+        ),
     )
     ask_for(context, dither)
 
@@ -391,7 +391,7 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
             request=running, start_seq=begun_seq, asked_ns_utc=context.now_ns, window_s=window_s
         )
         if why_unusable(dither, rtc, context.policy) is None:
-            context.dither = dither
+            _set_dither(context, dither)
             context.log("dither.adopted", f"{running.id} runs since frame {begun_seq}")
             return True
     return False
@@ -415,20 +415,23 @@ def _account(context: StepContext, rtc: Status) -> None:
     windows_ns = 0 if registration is None else registration.window_ns_utc
     if registration is not None and windows_ns and registration.arrived_ns_utc > windows_ns:
         passive_ns = registration.arrived_ns_utc
-    context.dither_policy = replace(
-        dithering,
-        budget_m=dither_plan.budget_m(rtc, context.policy),
-        mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
-        seen_ns_utc=context.now_ns,
-        passive_ns_utc=passive_ns,
+    _set_policy(
+        context,
+        replace(
+            dithering,
+            budget_m=dither_plan.budget_m(rtc, context.policy),
+            mean_square_m2=float(dithering.mean_square_m2 * (1.0 - share) + power * share),
+            seen_ns_utc=context.now_ns,
+            passive_ns_utc=passive_ns,
+        ),
     )
 
 
 def _show(context: StepContext, phase: DitherPhase, reason: str) -> None:
     none_follows = phase in {DitherPhase.OFF, DitherPhase.OPERATOR}
     next_ns = None if none_follows else context.dither_policy.next_ns_utc
-    context.dither_policy = replace(
-        context.dither_policy, phase=phase, reason=reason, next_ns_utc=next_ns
+    _set_policy(
+        context, replace(context.dither_policy, phase=phase, reason=reason, next_ns_utc=next_ns)
     )
 
 
@@ -442,20 +445,20 @@ def _correct(context: StepContext, asked: Dither, shown: DitherStatus) -> None:
         return
     plays, meant = running.request, asked.request
     if total_m(plays) > dither_plan.ROUNDING * max(total_m(meant), context.dither_policy.budget_m):
-        context.dither_policy = replace(context.dither_policy, loud_id=running.id, loud_text="")
+        _set_policy(context, replace(context.dither_policy, loud_id=running.id, loud_text=""))
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
         f"{plays.amplitude_m} m from frame {running.start_seq}; asked for were modes "
         f"{meant.modes}, {asked.frequency_hz} Hz, {meant.amplitude_m} m from {asked.start_seq}"
     )
-    context.dither = running
+    _set_dither(context, running)
     context.warn("dither.other", text)
 
 
 def _lose(context: StepContext, dither: Dither, text: str) -> None:
     context.raise_alarm(alarms.DITHER_LOST, text)
     context.warn("dither.lost", text)
-    context.dither = None
+    _set_dither(context, None)
     context.dithers = replace(context.dithers, lost=dither.id, losses=context.dithers.losses + 1)
 
 
@@ -466,11 +469,14 @@ def _patience_s(state: TrackerState) -> float:
 def _note_stop(context: StepContext, dither_id: str) -> None:
     """Note that the RTC is asked to stop a dither, and since when."""
     if context.dither_policy.stopped_id != dither_id:
-        context.dither_policy = replace(
-            context.dither_policy,
-            stopped_id=dither_id,
-            ended_ns_utc=None,
-            stopped_ns_utc=context.now_ns,
+        _set_policy(
+            context,
+            replace(
+                context.dither_policy,
+                stopped_id=dither_id,
+                ended_ns_utc=None,
+                stopped_ns_utc=context.now_ns,
+            ),
         )
 
 
@@ -478,8 +484,8 @@ def _meet_unwanted(context: StepContext, running: str) -> None:
     """Note that a dither must go, and follow it no more."""
     _note_stop(context, running)
     if context.dither is not None and context.dither.id == running:
-        context.dither = None
-    context.dither_policy = replace(context.dither_policy, unwanted_id=running)
+        _set_dither(context, None)
+    _set_policy(context, replace(context.dither_policy, unwanted_id=running))
 
 
 def _blame(context: StepContext, running: str, loud: str) -> None:
@@ -487,5 +493,5 @@ def _blame(context: StepContext, running: str, loud: str) -> None:
         f"{loud}: it was told to stop {running}, and another is tried after {CALM_S:.0f} s; look "
         "at the RTC's dither, or stop the dither to do without"
     )
-    context.dither_policy = replace(context.dither_policy, loud_ns_utc=context.now_ns)
+    _set_policy(context, replace(context.dither_policy, loud_ns_utc=context.now_ns))
     context.raise_alarm(alarms.OVER_BUDGET, text)

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any, Generic, TypeVar
 
 from service.tracking.acquisition_state import Acquisition
 from service.tracking.alarms import (
@@ -37,8 +36,6 @@ from service.tracking.state import (
     WindowCounts,
 )
 from service.wire import Status
-
-T = TypeVar("T")
 
 LOG_LENGTH = 500
 FAILURES_KEPT = 20
@@ -72,25 +69,6 @@ _VALUE = re.compile(r"(?<![\w.-])[-+]?[0-9]+(?:\.[0-9]+)?(?:e[-+]?[0-9]+)?(?![\w
 """A number that is no part of a name or of a date."""
 
 
-class _Part(Generic[T]):
-    """A record of the state, or a part of one: assigning puts another in its place."""
-
-    def __init__(self, record: str, part: str = "") -> None:
-        self._record, self._part = record, part
-
-    def __get__(self, context: StepContext, _: type[StepContext]) -> T:
-        record = getattr(context.state, self._record)
-        found: T = getattr(record, self._part) if self._part else record
-        return found
-
-    def __set__(self, context: StepContext, other: T) -> None:
-        record: Any = other
-        if self._part:
-            record = replace(getattr(context.state, self._record), **{self._part: other})
-        changed: dict[str, Any] = {self._record: record}
-        context.state = replace(context.state, **changed)
-
-
 class StepContext:
     """One event being worked out: the state as it becomes, and what is to be done about it.
 
@@ -99,27 +77,6 @@ class StepContext:
     """
 
     __slots__ = ("before", "cause", "effects", "now_ns", "policy", "state")
-
-    operator = _Part[OperatorState]("operator")
-    alpha = _Part[AlphaState]("alpha")
-    windows = _Part[WindowCounts]("windows")
-    matrices = _Part[MatrixStates]("matrices")
-    operations = _Part[Operations]("operations")
-    dithers = _Part[DitherState]("dithers")
-    loop = _Part[LoopState]("loop")
-    alarms = _Part[AlarmStates]("alarms")
-
-    registration = _Part[Registration | None]("alpha", "registration")
-    """What is known of α; None: nothing."""
-
-    dither = _Part[Dither | None]("dithers", "dither")
-    """The dither that was asked for or runs; None: none."""
-
-    dither_policy = _Part[DitherPolicyState]("dithers", "policy")
-    """What the dither policy remembers."""
-
-    acquisition = _Part[Acquisition]("operations", "acquisition")
-    """How far finding α from nothing has come."""
 
     def __init__(self, state: TrackerState, policy: Policy, now_ns: int, cause: str = "") -> None:
         self.before = state
@@ -132,6 +89,98 @@ class StepContext:
         """Id of what has led to the event, or its own: effects, lines and records keep it."""
 
         self.effects: list[Effect] = []
+
+    @property
+    def operator(self) -> OperatorState:
+        """Record ``operator`` of the state; assigning replaces it."""
+        return self.state.operator
+
+    @operator.setter
+    def operator(self, operator: OperatorState) -> None:
+        self.state = replace(self.state, operator=operator)
+
+    @property
+    def alpha(self) -> AlphaState:
+        """Record ``alpha`` of the state; assigning replaces it."""
+        return self.state.alpha
+
+    @alpha.setter
+    def alpha(self, alpha: AlphaState) -> None:
+        self.state = replace(self.state, alpha=alpha)
+
+    @property
+    def windows(self) -> WindowCounts:
+        """Record ``windows`` of the state; assigning replaces it."""
+        return self.state.windows
+
+    @windows.setter
+    def windows(self, windows: WindowCounts) -> None:
+        self.state = replace(self.state, windows=windows)
+
+    @property
+    def matrices(self) -> MatrixStates:
+        """Record ``matrices`` of the state; assigning replaces it."""
+        return self.state.matrices
+
+    @matrices.setter
+    def matrices(self, matrices: MatrixStates) -> None:
+        self.state = replace(self.state, matrices=matrices)
+
+    @property
+    def operations(self) -> Operations:
+        """Record ``operations`` of the state; assigning replaces it."""
+        return self.state.operations
+
+    @operations.setter
+    def operations(self, operations: Operations) -> None:
+        self.state = replace(self.state, operations=operations)
+
+    @property
+    def dithers(self) -> DitherState:
+        """Record ``dithers`` of the state; assigning replaces it."""
+        return self.state.dithers
+
+    @dithers.setter
+    def dithers(self, dithers: DitherState) -> None:
+        self.state = replace(self.state, dithers=dithers)
+
+    @property
+    def loop(self) -> LoopState:
+        """Record ``loop`` of the state; assigning replaces it."""
+        return self.state.loop
+
+    @loop.setter
+    def loop(self, loop: LoopState) -> None:
+        self.state = replace(self.state, loop=loop)
+
+    @property
+    def alarms(self) -> AlarmStates:
+        """Record ``alarms`` of the state; assigning replaces it."""
+        return self.state.alarms
+
+    @alarms.setter
+    def alarms(self, alarms: AlarmStates) -> None:
+        self.state = replace(self.state, alarms=alarms)
+
+    @property
+    def registration(self) -> Registration | None:
+        """What is known of α; None: nothing."""
+        return self.state.alpha.registration
+
+    @property
+    def dither(self) -> Dither | None:
+        """The dither that was asked for or runs; None: none."""
+        return self.state.dithers.dither
+
+    @property
+    def dither_policy(self) -> DitherPolicyState:
+        """What the dither policy remembers."""
+        return self.state.dithers.policy
+
+    @property
+    def acquisition(self) -> Acquisition:
+        """How far finding α from nothing has come."""
+        return self.state.operations.acquisition
 
     @property
     def rtc(self) -> Status | None:

@@ -136,9 +136,9 @@ def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
     return earlier[-1][1] if earlier else later[0][1]
 
 
-def store_registration(context: StepContext, registration: Registration) -> None:
+def store_registration(context: StepContext, registration: Registration | None) -> None:
     """Take something for what is known of α."""
-    context.registration = registration
+    context.alpha = replace(context.alpha, registration=registration)
 
 
 def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_utc: int) -> None:
@@ -157,15 +157,18 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
     if registration is None:
         return
     bias = None if registration.bias is None else replace(registration.bias, previous_estimate=None)
-    context.registration = replace(
-        registration,
-        alpha=Misregistration.from_vector(registration.alpha.vector + step),
-        covariance=registration.covariance + np.diag(spread**2),
-        n_windows=0,
-        previous_estimate=None,
-        suspected_jump=None,
-        bias=bias,
-        passive_after_ns_utc=max(registration.passive_after_ns_utc, still_ns_utc),
+    store_registration(
+        context,
+        replace(
+            registration,
+            alpha=Misregistration.from_vector(registration.alpha.vector + step),
+            covariance=registration.covariance + np.diag(spread**2),
+            n_windows=0,
+            previous_estimate=None,
+            suspected_jump=None,
+            bias=bias,
+            passive_after_ns_utc=max(registration.passive_after_ns_utc, still_ns_utc),
+        ),
     )
     want_window(context, MOVING)
     age(context)
@@ -173,24 +176,24 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
 
 def forget(context: StepContext) -> None:
     """Know nothing of α any more."""
-    context.registration = None
+    store_registration(context, None)
 
 
 def forget_bias(context: StepContext) -> None:
     """Forget how far the passive estimate is off."""
     if context.registration is not None:
-        context.registration = replace(context.registration, bias=None)
+        store_registration(context, replace(context.registration, bias=None))
 
 
 def require_confirmation(context: StepContext) -> None:
     """Have windows confirm what is known anew."""
     if context.registration is not None:
-        context.registration = replace(context.registration, n_windows=0)
+        store_registration(context, replace(context.registration, n_windows=0))
 
 
 def restore(context: StepContext, registration: Registration) -> None:
     """Take over what was known before a restart of the service."""
-    context.registration = replace(registration, n_windows=0, restored_ns_utc=context.now_ns)
+    store_registration(context, replace(registration, n_windows=0, restored_ns_utc=context.now_ns))
 
 
 def age(context: StepContext) -> None:
@@ -208,7 +211,7 @@ def age(context: StepContext) -> None:
             want_window(context, standing.reason)
         elif context.dither is None and _too_wide_for_the_gate(context.state, registration):
             want_window(context, "σ has grown beyond what the stability gate accepts")
-        context.registration = replace(registration, validity=standing)
+        store_registration(context, replace(registration, validity=standing))
 
 
 def want_window(context: StepContext, reason: str) -> None:

@@ -164,17 +164,20 @@ def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> No
     left = left_open(context.state, rtc)
     found = left.found if left is not None else None
     found = found or loop_found(context.state, rtc, context.policy)
-    context.acquisition = Acquisition(
-        stage=AcquisitionStage.OPENING,
-        text=f"opening the loop: {why}",
-        started_ns_utc=context.now_ns,
-        since_ns_utc=context.now_ns,
-        commanded=commanded,
-        attempt=1,
-        found=found,
-        n_modes=min(found.n_controlled, FIRST_CLOSED),
-        sent=left is not None and left.sent,
-        cause=context.cause,
+    go_on(
+        context,
+        Acquisition(
+            stage=AcquisitionStage.OPENING,
+            text=f"opening the loop: {why}",
+            started_ns_utc=context.now_ns,
+            since_ns_utc=context.now_ns,
+            commanded=commanded,
+            attempt=1,
+            found=found,
+            n_modes=min(found.n_controlled, FIRST_CLOSED),
+            sent=left is not None and left.sent,
+            cause=context.cause,
+        ),
     )
     validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget(context)
@@ -218,7 +221,7 @@ def missed_enough(state: TrackerState) -> bool:
 def count_miss(context: StepContext, kind: RefusalKind) -> None:
     """Count a refused window, if α was out of its reach and no acquisition is under way."""
     if not context.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
-        context.acquisition = replace(context.acquisition, misses=context.acquisition.misses + 1)
+        go_on(context, replace(context.acquisition, misses=context.acquisition.misses + 1))
 
 
 def why_not_now(state: TrackerState, policy: Policy) -> str | None:
@@ -244,18 +247,21 @@ def sigma_of(acquisition: Acquisition) -> str:
 
 def go_on(context: StepContext, acquisition: Acquisition) -> None:
     """Note how far it has come."""
-    context.acquisition = acquisition
+    context.operations = replace(context.operations, acquisition=acquisition)
 
 
 def enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
     """Begin a stage."""
-    context.acquisition = replace(
-        context.acquisition,
-        stage=stage,
-        text=text,
-        since_ns_utc=context.now_ns,
-        misses=0,
-        command=None,
+    go_on(
+        context,
+        replace(
+            context.acquisition,
+            stage=stage,
+            text=text,
+            since_ns_utc=context.now_ns,
+            misses=0,
+            command=None,
+        ),
     )
     level = Level.WARNING if stage is AcquisitionStage.FAILED else Level.INFO
     context.log(f"acquisition.{stage}", text, level)
@@ -265,7 +271,7 @@ def request_loop(context: StepContext, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop, and remember having asked."""
     set_loop(context, command)
     asked = context.loop.command
-    context.acquisition = replace(context.acquisition, command=None if asked is None else asked.id)
+    go_on(context, replace(context.acquisition, command=None if asked is None else asked.id))
 
 
 def restart(context: StepContext, reason: str, *, slipped: bool = False) -> None:
@@ -285,14 +291,17 @@ def restart(context: StepContext, reason: str, *, slipped: bool = False) -> None
     validity.invalidate_telemetry(context, "the acquisition had not begun anew")
     make_way(context)
     validity.forget(context)
-    context.acquisition = replace(
-        acquisition,
-        attempt=acquisition.attempt + 1,
-        alpha=None,
-        covariance=None,
-        matrix=None,
-        max_modes=most,
-        n_modes=min(acquisition.n_modes, most or goal),
+    go_on(
+        context,
+        replace(
+            acquisition,
+            attempt=acquisition.attempt + 1,
+            alpha=None,
+            covariance=None,
+            matrix=None,
+            max_modes=most,
+            n_modes=min(acquisition.n_modes, most or goal),
+        ),
     )
     enter_stage(context, AcquisitionStage.OPENING, f"opening the loop again: {reason}")
     if context.rtc is not None and context.rtc.loop != "open":
@@ -305,7 +314,7 @@ def give_up(context: StepContext, reason: str) -> None:
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
     make_way(context)
     validity.forget(context)
-    context.acquisition = replace(context.acquisition, windows=context.windows.accepted)
+    go_on(context, replace(context.acquisition, windows=context.windows.accepted))
     if closed and out_of_hand:
         request_loop(context, cmd.SetLoop(loop="open"))
     text = (
@@ -330,7 +339,7 @@ def abort(context: StepContext, why: str, *, held_off: bool = False) -> None:
         request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
     over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
-    context.acquisition = over
+    go_on(context, over)
     enter_stage(context, AcquisitionStage.ABORTED, text)
 
 
@@ -365,7 +374,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     if not _of_stage(context, rtc, estimate.modes):
         return
     covariance = estimate.covariance + np.diag(reach_of(before.stage).floor ** 2)
-    context.acquisition = replace(before, alpha=estimate.alpha, covariance=covariance)
+    go_on(context, replace(before, alpha=estimate.alpha, covariance=covariance))
     place = f"{estimate.alpha} +- {sigma_of(context.acquisition)}"
     if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
         make_way(context)
@@ -374,7 +383,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     difference = estimate.alpha.vector - before.alpha.vector
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
     if chi2 > AGREE:
-        context.acquisition = before
+        go_on(context, before)
         reason = (
             f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
             f"chi2 {chi2:.0f}, expected at most {AGREE}"
@@ -402,7 +411,7 @@ def on_missed(context: StepContext, reason: str) -> None:
     if misses >= MAX_MISSES:
         restart(context, reason)
     else:
-        context.acquisition = replace(context.acquisition, misses=misses)
+        go_on(context, replace(context.acquisition, misses=misses))
 
 
 def _keep_dithering(context: StepContext, rtc: Status) -> None:

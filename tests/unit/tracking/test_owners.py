@@ -9,7 +9,6 @@ import pytest
 
 from service import tracking
 from service.tracking.state import TrackerState
-from service.tracking.step_context import StepContext, _Part
 
 RECORDS = {field.name for field in fields(TrackerState)}
 BLANK = TrackerState(system="")
@@ -19,11 +18,6 @@ PARTS = {
     if is_dataclass(getattr(BLANK, record))
     for part in fields(getattr(BLANK, record))
 }
-SHORTCUTS = {
-    name: f"{way._record}.{way._part}"
-    for name, way in vars(StepContext).items()
-    if isinstance(way, _Part) and way._part
-}
 PACKAGE = Path(tracking.__file__).parent
 STATES = ("context", "context.state", "self", "self.state", "state")
 
@@ -32,13 +26,11 @@ def written(tree):
     """The parts of the state that a module writes, as ``record.part``."""
     for node in ast.walk(tree):
         match node:
-            case ast.Assign(targets=[ast.Attribute(ast.Name("context"), name)]):
-                yield SHORTCUTS.get(name, "")
             case ast.Call(ast.Name("replace"), [ast.Attribute(of, record), *_], keywords):
                 of_state = record in RECORDS and ast.unparse(of) in STATES
                 yield from (f"{record}.{keyword.arg}" for keyword in keywords if of_state)
             case ast.Call(ast.Name("replace"), [of, *_], keywords) if ast.unparse(of) in STATES:
-                # the shortcuts themselves replace a record that they are given as a whole
+                # the context replaces a record that it is given as a whole
                 yield from (keyword.arg or "" for keyword in keywords)
             case _:
                 continue
@@ -48,7 +40,7 @@ def written(tree):
     ("line", "parts"),
     [
         ("context.alpha = replace(context.alpha, history=(), offload=None)", 2),
-        ("context.registration = found", 1),
+        ("context.alpha = replace(context.alpha, registration=found)", 1),
         ("replace(state.windows, run=run + 1)", 1),
         ("replace(self.state.alarms, active=())", 1),
         ("replace(state, log=())", 1),

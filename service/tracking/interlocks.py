@@ -7,7 +7,6 @@ order holds in itself, like a mode that the basis does not have, is checked wher
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, get_args
@@ -17,6 +16,7 @@ from service.tracking import commands as cmd
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import ALARMS, RULE_PREFIX
 from service.tracking.commands import Command
+from service.tracking.events import kebab
 from service.tracking.loop import NO_RTC
 from service.tracking.operations.acquisition_stages import why_not_now
 from service.tracking.operations.running import OperationKind, RunningOperation, under_way
@@ -147,6 +147,8 @@ def _decided(moment: Moment, order: Order) -> Permission:
             return Permission(allowed=False, reason=running.text)
     interlock = INTERLOCKS.get(kind)
     reason = None if interlock is None else interlock(moment, _named(order))
+    if reason is None and isinstance(order, cmd.Gains) and order.effective_gain is not None:
+        reason = _compensate(moment)
     return Permission(allowed=reason is None, reason=reason or "")
 
 
@@ -159,32 +161,42 @@ def _named(order: Order) -> str:
 
 
 def _needs_rtc(moment: Moment, _: str = "") -> str | None:
-    return NO_RTC if moment.state.loop.rtc is None else None
+    return f"{NO_RTC}: start it first" if moment.state.loop.rtc is None else None
+
+
+def _needs_loop(moment: Moment, why: str) -> str | None:
+    """Return why something cannot be done that needs the loop closed."""
+    rtc = moment.state.loop.rtc
+    opened = rtc is not None and rtc.loop == "open"
+    return f"the loop is open: close it first, {why}" if opened else _needs_rtc(moment)
 
 
 def _start_dither(moment: Moment, _: str) -> str | None:
-    return None if _is_closed(moment) else "a dither needs an RTC with its loop closed"
+    return _needs_loop(moment, "a dither is read in the closed loop")
 
 
 def _measure_noisy(moment: Moment, _: str) -> str | None:
-    return None if _is_closed(moment) else "a noisy matrix needs an RTC with its loop closed"
-
-
-def _is_closed(moment: Moment) -> bool:
-    rtc = moment.state.loop.rtc
-    return rtc is not None and rtc.loop != "open"
+    return _needs_loop(moment, "a noisy matrix is measured in the closed loop")
 
 
 def _ramp(moment: Moment, _: str) -> str | None:
-    rtc = moment.state.loop.rtc
-    if rtc is None:
-        return NO_RTC
-    opened = "found the loop open; expected it closed, to see its residual"
-    return opened if rtc.loop == "open" else None
+    return _needs_loop(moment, "gains are tried on its residual")
+
+
+def _compensate(moment: Moment) -> str | None:
+    """Return why gains cannot be had that act alike on all modes, judged with the matrix in use."""
+    registration = moment.state.alpha.registration
+    if registration is None or not registration.optical_gains:
+        return "no optical gain is measured yet; start a dither and wait for a window"
+    unknown = (
+        "the reconstructor in use is not known, so no gains can be judged with it: wait until it "
+        "is read back, or publish one"
+    )
+    return unknown if moment.state.matrices.in_use is None else None
 
 
 def _acquire(moment: Moment, _: str) -> str | None:
-    return why_not_now(moment.state, moment.policy)
+    return _needs_rtc(moment) or why_not_now(moment.state, moment.policy)
 
 
 def _abort(moment: Moment, _: str) -> str | None:
@@ -201,10 +213,8 @@ def _resume(moment: Moment, _: str) -> str | None:
 
 
 def _refit(moment: Moment, _: str) -> str | None:
-    if moment.state.loop.rtc is None:
-        return NO_RTC
     unknown = "α is not known yet; start a dither and wait for a window"
-    return unknown if moment.state.alpha.registration is None else None
+    return _needs_rtc(moment) or (unknown if moment.state.alpha.registration is None else None)
 
 
 def _approve(moment: Moment, matrix_id: str) -> str | None:
@@ -321,12 +331,10 @@ INTERLOCKS: Final[dict[type, Callable[[Moment, str], str | None]]] = {
 """Why an order may not be given though nothing that runs forbids it; the others need nothing."""
 
 
-def _word(kind: type) -> str:
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
-
-
 ORDERS: Final[Mapping[str, Order]] = {
-    **{_word(kind): kind for kind in get_args(Command)},
+    **{kebab(kind).replace("-", "_"): kind for kind in get_args(Command)},
     "open_loop": cmd.SetLoop(loop="open"),
+    "compensate_gains": cmd.SetLoop(effective_gain=1.0),
 }
-"""Every order by its name; opening the loop is one of its own, because it ends a gain ramp."""
+"""Every order by its name; opening the loop is one of its own, because it ends a gain ramp, and so
+are gains that act alike on all modes, because they need a measured optical gain."""

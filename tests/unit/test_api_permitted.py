@@ -31,6 +31,7 @@ REQUESTS = {
     "measure_noisy": ("POST", "/v1/noisy-matrix", {"modes": [0, 1]}),
     "set_loop": ("POST", "/v1/loop", {"leak": 0.99}),
     "open_loop": ("POST", "/v1/loop", {"loop": "open"}),
+    "compensate_gains": ("POST", "/v1/loop", {"effective_gain": 0.5}),
     "ramp": ("POST", "/v1/loop/ramp", {}),
     "set_pointing": ("PUT", "/v1/pointing", {"elevation_deg": 60.0, "azimuth_deg": 0.0}),
 }

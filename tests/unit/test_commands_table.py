@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from pyrcal.client import remote
 from service.tracking import interlocks
 from service.tracking.commands import Command
+from service.tracking.dither_request import NOISY_DITHER
 from service.web.commands import ORDERS, OrderRoute
 
 PATHS = json.loads((Path(__file__).parents[2] / "docs" / "openapi.json").read_text("utf-8"))[
@@ -24,6 +25,10 @@ def test_every_command_has_its_route():
     assert set(kinds) == set(get_args(Command))
     twice = {kind.__name__ for kind in kinds if kinds.count(kind) > 1}
     assert twice == {"GiveUp"}  # of a matrix that the RTC measures, and of a noisy one
+
+
+def test_the_id_of_a_noisy_matrix_is_that_of_its_dither():
+    assert f"{ORDERS['measure_noisy'].makes}-" == NOISY_DITHER
 
 
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from service.control.gains import ModeGain
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import AlarmRecord, Severity
@@ -52,6 +53,22 @@ def in_use():
     story = Story(Mode.HOLD).meet()
     story.see(n_windows=3)
     return story.use("cm-1")
+
+
+def gains_measured():
+    """Windows have told the optical gains."""
+    story = in_use()
+    gain = ModeGain(mode=509, gain=0.7, sigma=0.01, scatter=0.02, t_ns_utc=story.now_ns)
+    known = replace(story.state.alpha.registration, optical_gains=(gain,))
+    story.state = changed(story.state, registration=known)
+    return story
+
+
+def gains_without_matrix():
+    """The same, and nobody knows which reconstructor is in use."""
+    story = gains_measured()
+    story.state = changed(story.state, in_use=None)
+    return story
 
 
 def refused_since():
@@ -138,6 +155,8 @@ MOMENTS = [
     without_dither,
     proposed,
     in_use,
+    gains_measured,
+    gains_without_matrix,
     refused_since,
     left_behind,
     suspected,
@@ -193,6 +212,7 @@ PLAIN = {
     "measure_noisy": cmd.MeasureNoisy(id="noisy-9", modes=(0, 1)),
     "set_loop": cmd.SetLoop(leak=0.99),
     "open_loop": cmd.SetLoop(loop="open"),
+    "compensate_gains": cmd.SetLoop(effective_gain=0.5),
     "set_pointing": cmd.SetPointing(elevation_deg=60.0, azimuth_deg=0.0),
     "ramp": cmd.Ramp(),
 }

@@ -53,7 +53,7 @@ def test_gains_an_operator_names_are_his_own_business(story):
 
 
 def test_without_a_measured_gain_there_is_nothing_to_undo():
-    with pytest.raises(CommandError, match="no measured optical gain"):
+    with pytest.raises(CommandError, match="no optical gain is measured yet; start a dither"):
         Story(Mode.HOLD).meet().tell(cmd.SetLoop(effective_gain=0.3))
 
 

@@ -91,6 +91,11 @@ def test_each_moment_refuses_something_and_each_order_is_refused_and_allowed_som
         (in_use, "approve", "no reconstructor is proposed"),
         (proposed, "give_up", "nothing is being measured"),
         (proposed, "resume", "nothing is stopped"),
+        (
+            proposed,
+            "compensate_gains",
+            "no optical gain is measured yet; start a dither and wait for a window",
+        ),
         (proposed, "unmute_alarm", "no alarm is muted"),
         (proposed, "acknowledge_alarm", "every alarm is acknowledged"),
         (refused_since, "approve", "cm-2 cannot be sent: too little margin"),

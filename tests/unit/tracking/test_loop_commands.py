@@ -146,7 +146,7 @@ def test_a_ramp_needs_a_closed_loop_and_modes_it_controls(story):
     with pytest.raises(CommandError, match=r"found modes 100 to 400; expected .* 0 to 399"):
         story.tell(cmd.Ramp(groups=(cmd.ModeGroup(first=100, last=400),)))
     story.tell(rtc(loop="open"))
-    with pytest.raises(CommandError, match="found the loop open"):
+    with pytest.raises(CommandError, match="the loop is open: close it first"):
         story.tell(cmd.Ramp())
 
 

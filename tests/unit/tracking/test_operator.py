@@ -238,8 +238,8 @@ class TestDither:
         refused(story, cmd.StartDither(), "is running; stop it first")
 
     def test_it_needs_a_closed_loop(self):
-        refused(Story(), cmd.StartDither(), "needs an RTC with its loop closed")
-        refused(Story().meet(loop="open"), cmd.StartDither(), "needs an RTC with its loop closed")
+        refused(Story(), cmd.StartDither(), "no RTC is there: start it first")
+        refused(Story().meet(loop="open"), cmd.StartDither(), "the loop is open: close it")
 
     @pytest.mark.parametrize(
         ("command", "match"),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.errors import ArchiveError, ModelError, StorageError
 from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE, Misregistration
+from service.tracking.filtering import joint_of
 from service.tracking.registration import Registration
 from service.tracking.state import Saved
 
@@ -197,7 +198,7 @@ def _kept(saved: Saved) -> dict[str, Any]:
     known, acquisition = values["registration"], values["acquisition"]
     if known is not None:
         known["alpha"] = [known["alpha"][name] for name in _NUMERIC]
-        for record in (known, known["bias"] or {}):
+        for record in (known, *known["biases"]):
             for name in _NOT_KEPT:
                 record.pop(name, None)
     if acquisition is not None:
@@ -215,6 +216,8 @@ def _saved_of(values: dict[str, Any]) -> Saved:
     known = values["registration"]
     if known is not None:
         known["alpha"] = dict(zip(_NUMERIC, known["alpha"], strict=True))
+        # written when there was one passive estimate
+        known.setdefault("biases", [bias for bias in (known.pop("bias", None),) if bias])
     saved = msgspec.convert(
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
@@ -248,15 +251,13 @@ def _check(registration: Registration) -> None:
         (registration.floor, (4,)),
         (np.array(registration.scatter), ()),
     ]
-    bias = registration.bias
-    if bias is not None:
-        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4))]
+    for k, bias in enumerate(registration.biases):
+        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4 + 4 * k))]
         arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
         arrays += [(np.array(bias.scatter), ())]
+        arrays += [(np.array(shape), (4,)) for shape in bias.block.shapes]
     _check_shapes(arrays)
-    covariance = registration.covariance
-    if bias is not None:
-        covariance = np.block([[covariance, bias.shared.T], [bias.shared, bias.covariance]])
+    covariance = joint_of(registration).covariance
     power = np.linalg.eigvalsh(covariance)
     # parameters of different units: rounding is relative to the largest
     if not np.allclose(covariance, covariance.T) or power[0] < -1e-9 * power[-1]:

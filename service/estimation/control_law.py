@@ -100,7 +100,7 @@ class ControlLawCheck(Detector):
         return self if frames.terms is None else follow(self, frames.block, frames.terms)
 
     @override
-    def on_status(self, loop: LoopContext) -> ControlLawCheck:
+    def on_status(self, loop: LoopContext, *, fresh: bool) -> ControlLawCheck:
         """Judge the frames up to a status."""
         rtc = loop.rtc
         if rtc is None or self.cm_id != rtc.cm_id:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.estimation.description import Description, EdgeWatch
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import closed_loop
-from service.estimation.windows import SETTLING_S, ClosedLoop, ExpectedDither, Telemetry
+from service.estimation.windows import ClosedLoop, ExpectedDither, Telemetry
 from service.wire import Status
 
 
@@ -128,14 +128,6 @@ class FrameContext:
     marks: Mark = UNMARKED
     """What those before have said of it."""
 
-    def marked(self, marks: Mark) -> FrameContext:
-        """Return it with what one has said; where slopes stand, measurements begin after that."""
-        loop = self.loop
-        if Mark.STANDS in marks:
-            seq = self.block.next_seq + round(SETTLING_S * self.rtc.frame_rate_hz)
-            loop = replace(loop, from_seq=seq, settled_seq=seq)
-        return replace(self, loop=loop, marks=self.marks | marks)
-
     @property
     def moving(self) -> FrameBlock:
         """The block without what stands in controlled modes that have no gain.
@@ -173,8 +165,11 @@ class Streaming:
         """Return it after changes that it has declared: with nothing, unless some of it lasts."""
         return self.begin(loop)
 
-    def on_status(self, loop: LoopContext) -> Self:
-        """Return it after one more status: what was seen up to there may be judged."""
+    def on_status(self, loop: LoopContext, *, fresh: bool) -> Self:
+        """Return it once the status is known: what was seen up to there may be judged.
+
+        Asked again while frames up to the status may still come; ``fresh``: for the first time.
+        """
         return self
 
     def update(self, frames: FrameContext) -> Self:

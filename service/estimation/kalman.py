@@ -1,4 +1,4 @@
-"""One Kalman filter for α and the bias of passive estimates.
+"""One Kalman filter for α and the biases of passive estimates.
 
 Under frozen flow the passive watchdog reads ``α + b``: a look scatters by 0.3 to 0.5 % of a
 subaperture and is wrong by up to 9 % on the diffractive telescope, 24 % on the linear plant
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import BIAS_FLOOR
+from service.estimation.estimate import BiasBlock
 
 Array = NDArray[np.float64]
 
@@ -30,29 +30,31 @@ JUMP_INFLATION = 10.0
 SCATTER_LEARNING = 0.05
 """Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
 
-DITHERED = np.hstack([np.eye(4), np.zeros((4, 4))])
-"""What a dithered window sees of the mean, ``(4, 8)``: α."""
 
-PASSIVE = np.hstack([np.eye(4), np.eye(4)])
-"""What a look at ordinary telemetry sees: α and the bias together."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bias:
+    """What one kind of passive estimate has told of its bias, besides mean and covariance."""
+
+    block: BiasBlock
+    excess: Array = field(default_factory=lambda: np.zeros(4))
+    """``(4,)`` variance of the bias beyond its floor that looks have told of, and that is in the
+    covariance or has been learnt away since."""
+
+    scatter: float = 1.0
+    """How much more looks scatter than their covariances say, in variance; never less than 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Joint:
-    """The random walk of α, and the bias that forgets itself."""
+    """The random walk of α, and N biases that forget themselves."""
 
     mean: Array
-    """``(8,)`` α in numeric units, then the bias of the passive estimate."""
+    """``(4 + 4 N,)`` α in numeric units, then the bias of each passive estimate."""
 
     covariance: Array
-    """``(8, 8)``."""
+    """``(4 + 4 N, 4 + 4 N)``."""
 
-    excess: Array = field(default_factory=lambda: np.zeros(4))
-    """``(4,)`` variance of the bias beyond ``BIAS_FLOOR`` that looks have told of, and that is in
-    the covariance or has been learnt away since."""
-
-    scatter: float = 1.0
-    """How much more looks scatter than their covariances say, in variance; never less than 1."""
+    biases: tuple[Bias, ...] = ()
 
     @property
     def alpha(self) -> Array:
@@ -64,10 +66,32 @@ class Joint:
         """``(4, 4)`` of the registration alone."""
         return self.covariance[:4, :4]
 
-    @property
-    def bias(self) -> Array:
+    def place(self, block: BiasBlock) -> slice:
+        """Return where a bias is among the states; behind them all where nothing is known of it."""
+        names = [bias.block.name for bias in self.biases]
+        k = names.index(block.name) if block.name in names else len(names)
+        return slice(4 + 4 * k, 8 + 4 * k)
+
+    def bias_of(self, block: BiasBlock) -> Bias:
+        """Return what is known of a bias."""
+        known = (bias for bias in self.biases if bias.block.name == block.name)
+        return next(known, Bias(block=block))
+
+    def bias(self, block: BiasBlock) -> Array:
         """``(4,)`` what a passive estimate reads more than α."""
-        return self.mean[4:]
+        return self.mean[self.place(block)]
+
+    def seen(self, block: BiasBlock | None) -> Array:
+        """``(4, 4 + 4 N)`` what a look sees: α and its bias; None: what a window does, α alone."""
+        sees = np.eye(4, len(self.mean))
+        if block is not None:
+            sees[:, self.place(block)] = np.eye(4)
+        return sees
+
+    def with_bias(self, bias: Bias) -> Joint:
+        """Return the estimate with what is known of a bias replaced."""
+        others = (bias if one.block.name == bias.block.name else one for one in self.biases)
+        return replace(self, biases=tuple(others))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,35 +106,40 @@ class Drift:
 
 
 def begin_joint(measured: Array, covariance: Array) -> Joint:
-    """Return the estimate after a first dithered measurement: nothing is known of the bias."""
-    full = np.zeros((8, 8))
-    full[:4, :4] = covariance
-    return forget(Joint(mean=np.concatenate([measured, np.zeros(4)]), covariance=full))
+    """Return the estimate after a first dithered measurement: nothing is known of any bias."""
+    return Joint(mean=measured, covariance=covariance)
 
 
-def forget(joint: Joint, excess: Array | None = None) -> Joint:
-    """Return the estimate with nothing known of the bias any more; α stands.
+def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint:
+    """Return the estimate with nothing known of a bias any more, or yet; α stands.
 
-    ``excess`` ``(4,)`` is the bias' variance beyond ``BIAS_FLOOR`` by the look at hand, if any.
+    ``excess`` ``(4,)`` is the bias' variance beyond its floor by the look at hand, if any.
     """
     excess = np.zeros(4) if excess is None else excess
-    covariance = joint.covariance.copy()
-    covariance[4:] = covariance[:, 4:] = 0.0
-    covariance[4:, 4:] = np.diag(BIAS_FLOOR**2 + excess)
-    mean = np.concatenate([joint.alpha, np.zeros(4)])
-    return replace(joint, mean=mean, covariance=covariance, excess=excess)
+    place, n_states, biases = joint.place(block), len(joint.mean), joint.biases
+    n_more = place.stop - n_states if place.stop > n_states else 0
+    covariance = np.pad(joint.covariance, (0, n_more))
+    covariance[place] = covariance[:, place] = 0.0
+    covariance[place, place] = np.diag(np.square(block.floor) + excess)
+    mean = np.pad(joint.mean, (0, n_more))
+    mean[place] = 0.0
+    if n_more:
+        biases = (*biases, Bias(block=block))
+    fresh = replace(joint.bias_of(block), excess=excess)
+    return replace(joint, mean=mean, covariance=covariance, biases=biases).with_bias(fresh)
 
 
-def allowing(joint: Joint, excess: Array) -> Joint:
-    """Return the estimate with its covariance enlarged by so much excess scatter.
+def allowing(joint: Joint, block: BiasBlock, excess: Array) -> Joint:
+    """Return the estimate with the covariance of a bias enlarged by so much excess scatter.
 
     Only what is more than looks before have told is added: a steady wind adds it once, and what
     has been learnt of the bias stays learnt.
     """
-    more = np.maximum(excess - joint.excess, 0.0)
-    covariance = joint.covariance.copy()
-    covariance[4:, 4:] += np.diag(more)
-    return replace(joint, covariance=covariance, excess=joint.excess + more)
+    known, place, covariance = joint.bias_of(block), joint.place(block), joint.covariance.copy()
+    more = np.maximum(excess - known.excess, 0.0)
+    covariance[place, place] += np.diag(more)
+    told = replace(known, excess=known.excess + more)
+    return replace(joint, covariance=covariance).with_bias(told)
 
 
 def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | None = None) -> Joint:
@@ -119,31 +148,38 @@ def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | Non
     ``flexure`` ``(4,)`` is the 1 σ of what the telescope's own motion has added meanwhile.
     """
     elapsed = max(elapsed_s, 0.0)
-    keep = np.ones(8)
-    keep[4:] = np.exp(-elapsed / drift.bias_memory_s)
-    growth = np.zeros(8)
+    keep, growth = np.ones(len(joint.mean)), np.zeros(len(joint.mean))
+    keep[4:] = fading = float(np.exp(-elapsed / drift.bias_memory_s))
     growth[:4] = drift.alpha_rate**2 * elapsed
     if flexure is not None:
         growth[:4] += flexure**2
-    growth[4:] = BIAS_FLOOR**2 * (1.0 - keep[4:] ** 2)
+    for bias in joint.biases:
+        growth[joint.place(bias.block)] = np.square(bias.block.floor) * (1.0 - fading**2)
     covariance = joint.covariance * np.outer(keep, keep) + np.diag(growth)
     # what fades of the excess the next look that tells of it brings back
-    excess = keep[4:] ** 2 * joint.excess
-    return replace(joint, mean=keep * joint.mean, covariance=covariance, excess=excess)
+    biases = tuple(replace(bias, excess=fading**2 * bias.excess) for bias in joint.biases)
+    return replace(joint, mean=keep * joint.mean, covariance=covariance, biases=biases)
 
 
-def innovation(prior: Joint, measured: Array, noise: Array, sees: Array = DITHERED) -> float:
-    """Return how far a measurement lies from the prior: squared, normalised, expected 4."""
+def innovation(
+    prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None
+) -> float:
+    """Return how far a measurement lies from the prior: squared, normalised, expected 4.
+
+    Of a passive estimate with this bias; None: of a dithered window.
+    """
+    sees = prior.seen(block)
     difference = measured - sees @ prior.mean
     total = sees @ prior.covariance @ sees.T + noise
     return float(difference @ np.linalg.solve(total, difference))
 
 
-def corrected(prior: Joint, measured: Array, noise: Array, sees: Array = DITHERED) -> Joint:
+def corrected(prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None) -> Joint:
     """Fold in a measurement ``(4,)`` with the covariance ``(4, 4)`` of its own scatter."""
+    sees = prior.seen(block)
     total = sees @ prior.covariance @ sees.T + noise
     gain = np.linalg.solve(total, sees @ prior.covariance).T
-    keep = np.eye(8) - gain @ sees
+    keep = np.eye(len(prior.mean)) - gain @ sees
     posterior = keep @ prior.covariance @ keep.T + gain @ noise @ gain.T
     return replace(
         prior,
@@ -152,12 +188,13 @@ def corrected(prior: Joint, measured: Array, noise: Array, sees: Array = DITHERE
     )
 
 
-def scattered(joint: Joint, innovation: float) -> Joint:
+def scattered(joint: Joint, block: BiasBlock, innovation: float) -> Joint:
     """Return the estimate after an innovation, 4 expected, with ``scatter`` learnt from it.
 
     In fast wind the bias swings from look to look, and looks scatter by more than they say.
     """
-    return replace(joint, scatter=learnt(joint.scatter, innovation))
+    known = joint.bias_of(block)
+    return joint.with_bias(replace(known, scatter=learnt(known.scatter, innovation)))
 
 
 def learnt(scatter: float, innovation: float) -> float:
@@ -179,6 +216,6 @@ def widened(prior: Joint, noise: Array) -> Joint:
 
     The bias is kept: the wind has not moved with the mirror.
     """
-    moved = np.zeros(8)
+    moved = np.zeros(len(prior.mean))
     moved[:4] = np.diag(prior.covariance)[:4] + np.diag(noise)
     return replace(prior, covariance=prior.covariance + JUMP_INFLATION**2 * np.diag(moved))

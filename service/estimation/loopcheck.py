@@ -112,10 +112,10 @@ class LoopCheck(Detector):
         return self if frames.terms is None else observe(self, frames.block, frames.terms)
 
     @override
-    def on_status(self, loop: LoopContext) -> LoopCheck:
+    def on_status(self, loop: LoopContext, *, fresh: bool) -> LoopCheck:
         """Judge the frames up to a status that shows the same loop as the one before."""
         rtc = loop.rtc
-        if rtc is None:
+        if rtc is None or not fresh:
             return self
         seq, terms = last_seq(rtc), loop.terms(rtc.cm_id)
         if self.residual is None and seq < self.obeyed_seq + AT_EASE_S * rtc.frame_rate_hz:

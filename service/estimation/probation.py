@@ -134,7 +134,7 @@ class Comparison(Detector):
     """The loop that both must be of, but for how many modes are controlled."""
 
     @override
-    def on_status(self, loop: LoopContext) -> Comparison:
+    def on_status(self, loop: LoopContext, *, fresh: bool) -> Comparison:
         """Compare only what one loop does, under two matrices; gains may follow the seeing."""
         before, rtc = self.of_loop, loop.rtc
         if rtc is None or before is None or not same_but_for_modes(before, rtc):

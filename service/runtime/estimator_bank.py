@@ -76,12 +76,12 @@ class EstimatorBank:
 def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
     """Follow the RTC: another loop makes the open window and the passive sums void."""
     before = bank.loop.rtc
-    if rtc is before:
-        return bank
     if rtc is None:
+        if before is None:
+            return bank
         loop = replace(bank.loop, rtc=None, dither=None, edge=None, cm_id=None)
         return replace(_changed(bank, loop, Change.GONE), begun_with=None, dither=None)
-    changes = _changes(bank, before, rtc)
+    changes = NOTHING if rtc is before else _changes(bank, before, rtc)
     loop = replace(bank.loop, rtc=rtc)
     if changes & (Change.LOOP | Change.STATUS):
         seq = last_seq(rtc)
@@ -93,7 +93,9 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
     if Change.RATE in changes:
         bank, loop = replace(bank, dither=None), replace(loop, dither=None)
     bank = _changed(bank, loop, changes)
-    return replace(bank, members=tuple(member.on_status(loop) for member in bank.members))
+    fresh = before is None or before.seq != rtc.seq
+    members = tuple(member.on_status(loop, fresh=fresh) for member in bank.members)
+    return replace(bank, members=members)
 
 
 def _changes(bank: EstimatorBank, before: Status | None, rtc: Status) -> Change:
@@ -202,10 +204,19 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
         if (closed or not member.only_closed) and not frames.marks & member.unless:
             member = member.update(frames)
         if member.marks:
-            frames = frames.marked(member.marks)
+            frames = _marked(frames, member.marks)
             changes |= Change.STANDSTILL if Mark.STANDS in member.marks else NOTHING
         members.append(member)
     return _with_windows(replace(bank, loop=loop), members)
+
+
+def _marked(frames: FrameContext, marks: Mark) -> FrameContext:
+    """Return a block with what one has said; where slopes stand, measurements begin after that."""
+    loop = frames.loop
+    if Mark.STANDS in marks:
+        seq = frames.block.next_seq + round(SETTLING_S * frames.rtc.frame_rate_hz)
+        loop = replace(loop, from_seq=seq, settled_seq=seq)
+    return replace(frames, loop=loop, marks=frames.marks | marks)
 
 
 def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:

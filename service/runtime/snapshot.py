@@ -223,13 +223,14 @@ class Alpha:
     @property
     def passive_bias(self) -> NDArray[np.float64] | None:
         """What the passive estimate reads more than α, as far as learnt; null: nothing is known."""
-        return None if self.registration.bias is None else self.registration.bias.offset
+        biases = self.registration.biases
+        return biases[0].offset if biases else None
 
     @property
     def passive_bias_sigma(self) -> NDArray[np.float64] | None:
         """1 σ of it."""
-        bias = self.registration.bias
-        return None if bias is None else np.sqrt(np.diag(bias.covariance))
+        biases = self.registration.biases
+        return np.sqrt(np.diag(biases[0].covariance)) if biases else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

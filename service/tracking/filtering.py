@@ -1,4 +1,4 @@
-"""One measurement folded into the registration by the joint filter of α and of passive bias."""
+"""One measurement folded into the registration by the joint filter of α and of passive biases."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
 from service.estimation.estimate import DitheredEstimate, model_error
-from service.estimation.kalman import Drift, Joint, begin_joint, predicted
+from service.estimation.kalman import Bias, Drift, Joint, begin_joint, predicted
 from service.estimation.lockin import MAX_LAG_FRAMES
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, Why
@@ -166,34 +166,43 @@ def brought_forward(context: StepContext, registration: Registration, t_ns_utc: 
 
 def joint_of(registration: Registration) -> Joint:
     """Return the filter's state that a registration holds."""
-    fresh = begin_joint(registration.alpha.vector, registration.covariance)
-    bias = registration.bias
-    if bias is None:
-        return fresh
-    covariance = fresh.covariance.copy()
-    covariance[4:, 4:] = bias.covariance
-    covariance[4:, :4], covariance[:4, 4:] = bias.shared, bias.shared.T
-    mean = np.concatenate([registration.alpha.vector, bias.offset])
-    return Joint(mean=mean, covariance=covariance, excess=bias.excess, scatter=bias.scatter)
+    joint = begin_joint(registration.alpha.vector, registration.covariance)
+    for known in registration.biases:
+        bias = Bias(block=known.block, excess=known.excess, scatter=known.scatter)
+        joint = Joint(
+            mean=np.concatenate([joint.mean, known.offset]),
+            covariance=np.block(
+                [[joint.covariance, known.shared.T], [known.shared, known.covariance]]
+            ),
+            biases=(*joint.biases, bias),
+        )
+    return joint
 
 
-def bias_of(
-    joint: Joint,
-    looked_ns_utc: int,
-    loop: tuple[float, ...],
-    previous_estimate: PreviousEstimate | None = None,
-) -> PassiveBias:
-    """Return what the filter knows of the passive estimate's bias, in the loop of its last look."""
-    return PassiveBias(
-        loop=loop,
-        previous_estimate=previous_estimate,
-        offset=joint.bias,
-        covariance=joint.covariance[4:, 4:],
-        shared=joint.covariance[4:, :4],
-        looked_ns_utc=looked_ns_utc,
-        excess=joint.excess,
-        scatter=joint.scatter,
-    )
+def biases_of(joint: Joint, before: tuple[PassiveBias, ...]) -> tuple[PassiveBias, ...]:
+    """Return what the filter knows of the biases; when and in which loop is as it was before."""
+    known = {bias.block.name: bias for bias in before}
+    found = []
+    for bias in joint.biases:
+        place = joint.place(bias.block)
+        now = PassiveBias(
+            block=bias.block,
+            offset=joint.mean[place],
+            covariance=joint.covariance[place, place],
+            shared=joint.covariance[place, : place.start],
+            excess=bias.excess,
+            scatter=bias.scatter,
+        )
+        was = known.get(bias.block.name, now)
+        found.append(
+            replace(
+                now,
+                looked_ns_utc=was.looked_ns_utc,
+                loop=was.loop,
+                previous_estimate=was.previous_estimate,
+            )
+        )
+    return tuple(found)
 
 
 def remember(context: StepContext, entry: HistoryEntry) -> None:
@@ -216,9 +225,9 @@ def accept(
 ) -> None:
     """Take what the filter says after a window for what is known; it may be the second accepted."""
     joint, when, previous = update.joint, measured.when, context.registration
-    bias = None if previous is None else previous.bias
     doubted = _still_doubted(context.state, update, when)
     anew = update.jumped or (previous is not None and previous.suspected_jump is not None)
+    known = () if previous is None else previous.biases_anew if anew else previous.biases
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
@@ -231,12 +240,7 @@ def accept(
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
-        bias=bias_of(
-            joint,
-            0 if bias is None else bias.looked_ns_utc,
-            () if bias is None else bias.loop,
-            None if bias is None or anew else bias.previous_estimate,
-        ),
+        biases=biases_of(joint, known),
         passive_after_ns_utc=previous.passive_after_ns_utc if previous is not None else 0,
         previous_estimate=None if anew else _previous_estimate(previous, update, measured),
         jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),

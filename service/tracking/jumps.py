@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import BIAS_FLOOR
+from service.estimation.estimate import BiasBlock
 from service.estimation.kalman import JUMP_THRESHOLD, Joint
 from service.model.misregistration import Misregistration
 from service.tracking.policy import SECOND_NS, Policy
@@ -43,11 +43,6 @@ PASSIVE_LIMIT = 26.9
 """What a passive look's innovation exceeds once in 10 000: it is the larger of two, and the scatter
 that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
 half of that)."""
-
-PASSIVE_BIAS_SHARE = np.array([0.0, 0.0, 2.0, 4.0])
-"""By how many times its own scatter a look may be off, beside what is known of its bias: where 60
-modes look through bad seeing its magnification is 2 to 5 times that too large, every time, and on
-a bright star its rotation up to 2.5 times off."""
 
 SCATTERED = 1.5
 """How much more windows scatter than they say, in variance, that is no chance: twenty windows that
@@ -212,16 +207,21 @@ def wholly_after(
 
 
 def passive_innovation(
-    registration: Registration, joint: Joint, window: PointedEstimate, policy: Policy
+    registration: Registration,
+    joint: Joint,
+    block: BiasBlock,
+    window: PointedEstimate,
+    policy: Policy,
 ) -> float:
     """Return the same of a passive look, its bias allowed for; ``joint`` is at ``known``'s time."""
-    before = registration.bias.previous_estimate if registration.bias is not None else None
-    found, off = [], PASSIVE_BIAS_SHARE**2 * np.diag(window.covariance)
-    for earlier in (sum_of(registration, joint), before):
+    bias = registration.bias(block)
+    before = None if bias is None else bias.previous_estimate
+    found, off = [], np.square(block.wander) * np.diag(window.covariance)
+    for earlier in (sum_of(registration, joint, block), before):
         if earlier is not None:
             elapsed_s = max(window.t_ns_utc - earlier.t_ns_utc, 0) / SECOND_NS
             fading = -np.expm1(-2.0 * elapsed_s / policy.bias_memory_s)
-            forgot = BIAS_FLOOR**2 * fading + off
+            forgot = np.square(block.floor) * fading + off
             found.append(_innovation_from(earlier, window, policy, forgot).mahalanobis_squared)
     return max(found)
 
@@ -236,13 +236,12 @@ def as_previous(registration: Registration) -> PreviousEstimate:
     )
 
 
-def sum_of(registration: Registration, joint: Joint) -> PreviousEstimate:
+def sum_of(registration: Registration, joint: Joint, block: BiasBlock) -> PreviousEstimate:
     """Return what a passive look should read: α and its bias together, the filter as it stands."""
-    covariance = joint.covariance
-    shared = covariance[4:, :4]
+    sees = joint.seen(block)
     return PreviousEstimate(
-        alpha=Misregistration.from_vector(joint.alpha + joint.bias),
-        covariance=covariance[:4, :4] + covariance[4:, 4:] + shared + shared.T,
+        alpha=Misregistration.from_vector(sees @ joint.mean),
+        covariance=sees @ joint.covariance @ sees.T,
         t_ns_utc=registration.t_ns_utc,
         pointing=registration.pointing,
     )

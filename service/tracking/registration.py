@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
+from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
 from service.model.misregistration import Determination, Misregistration
 from service.wire import Pointing
 
@@ -89,7 +90,10 @@ class PreviousEstimate(PointedEstimate):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveBias:
-    """What has been learnt of how far the passive estimate is off, and how sure that is."""
+    """What has been learnt of how far a passive estimate is off, and how sure that is."""
+
+    block: BiasBlock = PASSIVE_BIAS
+    """Which bias it is."""
 
     offset: Array
     """``(4,)`` what a passive estimate reads more than α, numeric units."""
@@ -98,9 +102,9 @@ class PassiveBias:
     """``(4, 4)`` of it."""
 
     shared: Array
-    """``(4, 4)`` covariance of it (rows) with α (columns)."""
+    """``(4, 4 + 4 k)`` covariance of it (rows) with α and the ``k`` biases before it (columns)."""
 
-    looked_ns_utc: int
+    looked_ns_utc: int = 0
     """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
 
     excess: Array = field(default_factory=lambda: np.zeros(4))
@@ -173,8 +177,8 @@ class Registration:
     optical_gains: tuple[ModeGain, ...] = ()
     """Of every mode that was dithered, in the order of the modes, bounded."""
 
-    bias: PassiveBias | None = None
-    """Of the passive estimate; None: nothing is known of it."""
+    biases: tuple[PassiveBias, ...] = ()
+    """Of the passive estimates that have told anything, in the order of the filter."""
 
     passive_after_ns_utc: int = 0
     """End of the window in which α jumped, the RTC's clock: only a passive estimate that began
@@ -216,6 +220,15 @@ class Registration:
 
     config_id: str | None = None
     """Of the RTC's configuration; None: not known."""
+
+    def bias(self, block: BiasBlock) -> PassiveBias | None:
+        """Return what is known of a bias; None: nothing is."""
+        return next((bias for bias in self.biases if bias.block.name == block.name), None)
+
+    @property
+    def biases_anew(self) -> tuple[PassiveBias, ...]:
+        """The biases, without what was known before their last looks: it tells nothing of now."""
+        return tuple(replace(bias, previous_estimate=None) for bias in self.biases)
 
     @property
     def total_covariance(self) -> Array:

@@ -127,8 +127,12 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         orders_of(state),
     )
     if registration is not None:
-        bias = registration.bias and replace(registration.bias, previous_estimate=None)
-        registration = replace(registration, bias=bias, suspected_jump=None, previous_estimate=None)
+        registration = replace(
+            registration,
+            biases=registration.biases_anew,
+            suspected_jump=None,
+            previous_estimate=None,
+        )
     elif acquisition is None and state.alpha.offload is None and orders == Orders():
         return None
     return Saved(

@@ -49,10 +49,11 @@ def on_status(context: StepContext, rtc: Status) -> None:
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
         reconstructors.judge_again(context)
-    bias = None if registration is None else registration.bias
-    if bias is not None and bias.looked_ns_utc and not same_numbers(bias.loop, loop_numbers(rtc)):
-        # it was learnt in another loop, in whichever session
-        validity.forget_bias(context)
+    biases = () if registration is None else registration.biases
+    numbers = loop_numbers(rtc)
+    if any(bias.looked_ns_utc and not same_numbers(bias.loop, numbers) for bias in biases):
+        # they were learnt in another loop, in whichever session
+        validity.forget_biases(context)
     context.loop = replace(
         context.loop,
         rtc=rtc,

@@ -156,7 +156,6 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
     registration = context.registration
     if registration is None:
         return
-    bias = None if registration.bias is None else replace(registration.bias, previous_estimate=None)
     store_registration(
         context,
         replace(
@@ -166,7 +165,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
             n_windows=0,
             previous_estimate=None,
             suspected_jump=None,
-            bias=bias,
+            biases=registration.biases_anew,
             passive_after_ns_utc=max(registration.passive_after_ns_utc, still_ns_utc),
         ),
     )
@@ -179,10 +178,10 @@ def forget(context: StepContext) -> None:
     store_registration(context, None)
 
 
-def forget_bias(context: StepContext) -> None:
+def forget_biases(context: StepContext) -> None:
     """Forget how far the passive estimate is off."""
     if context.registration is not None:
-        store_registration(context, replace(context.registration, bias=None))
+        store_registration(context, replace(context.registration, biases=()))
 
 
 def require_confirmation(context: StepContext) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import kalman
-from service.estimation.estimate import PassiveEstimate
+from service.estimation.estimate import BiasBlock, PassiveEstimate
 from service.estimation.kalman import Joint
 from service.estimation.loop import loop_numbers, same_numbers
 from service.estimation.random_dither import RandomEstimate
@@ -31,8 +31,10 @@ from service.tracking.operations.acquisition_stages import count_miss
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
     HistoryEntry,
+    PassiveBias,
     PassiveState,
     PointedEstimate,
+    PreviousEstimate,
     Registration,
     Source,
     SuspectedJump,
@@ -249,49 +251,48 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     if registration is None:
         _show_passive_alone(context, event)
         return
-    registration = _expecting(registration, estimate.bias_excess)
+    block = estimate.bias
+    registration = _expecting(registration, estimate)
     forward = filtering.brought_forward(context, registration, event.t_ns_utc)
-    prior = kalman.allowing(forward, estimate.bias_excess)
-    if _mixed(registration):
+    prior = kalman.allowing(forward, block, estimate.bias_excess)
+    if _mixed(registration, block):
         text = "not used: its telemetry may be from both sides of a jump"
-        bias = filtering.bias_of(
-            filtering.joint_of(registration), event.t_ns_utc, _loop(context.state, registration)
-        )
-        validity.store_registration(context, replace(registration, bias=bias))
-        _show(context, event, _passive_sigma(estimate, prior), prior.bias, text)
+        looked = _looked(context.state, registration, filtering.joint_of(registration), event)
+        validity.store_registration(context, replace(registration, biases=looked))
+        _show(context, event, _passive_sigma(estimate, prior), prior.bias(block), text)
         return
     measured = estimate.alpha.vector
     window = PointedEstimate(
         alpha=estimate.alpha,
-        covariance=prior.scatter * estimate.covariance,
+        covariance=prior.bias_of(block).scatter * estimate.covariance,
         t_ns_utc=event.t_ns_utc,
         pointing=validity.pointing_at(context.state, event.t_ns_utc),
     )
     far = jumps.passive_innovation(
-        registration, filtering.joint_of(registration), window, context.policy
+        registration, filtering.joint_of(registration), block, window, context.policy
     )
     if far > jumps.PASSIVE_LIMIT:
         _ask_for_window(context, registration, event, prior, far)
         return
-    joint = kalman.scattered(
-        kalman.corrected(prior, measured, estimate.covariance, kalman.PASSIVE), far
-    )
+    joint = kalman.corrected(prior, measured, estimate.covariance, block)
+    joint = kalman.scattered(joint, block, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)
     validity.age(context)
     sigma = _passive_sigma(estimate, prior)
     entry = HistoryEntry(
         t_ns_utc=event.t_ns_utc,
-        measured=Misregistration.from_vector(measured - joint.bias),
+        measured=Misregistration.from_vector(measured - joint.bias(block)),
         measured_sigma=sigma,
         filtered=registration.alpha,
         filtered_sigma=registration.sigma,
-        innovation=kalman.innovation(prior, measured, estimate.covariance, kalman.PASSIVE),
+        innovation=kalman.innovation(prior, measured, estimate.covariance, block),
         misfit=estimate.misfit,
         source=Source.PASSIVE,
     )
     filtering.remember(context, entry)
-    _show(context, event, sigma, joint.bias, "agrees with α and with what is known of its own bias")
+    text = "agrees with α and with what is known of its own bias"
+    _show(context, event, sigma, joint.bias(block), text)
 
 
 def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
@@ -348,33 +349,53 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
     _show(context, event, event.estimate.sigma, np.zeros(4), text)
 
 
-def _expecting(registration: Registration, excess: Array) -> Registration:
+def _expecting(registration: Registration, estimate: PassiveEstimate) -> Registration:
     """Return what is known with the bias as large as the first look at it says that it may be.
 
     A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
     told with less patience.
     """
-    if registration.bias is not None and registration.bias.looked_ns_utc:
+    bias = registration.bias(estimate.bias)
+    if bias is not None and bias.looked_ns_utc:
         return registration
-    return replace(
-        registration,
-        bias=filtering.bias_of(kalman.forget(filtering.joint_of(registration), excess), 0, ()),
+    joint = kalman.forget(filtering.joint_of(registration), estimate.bias, estimate.bias_excess)
+    return replace(registration, biases=filtering.biases_of(joint, registration.biases))
+
+
+def _looked(
+    state: TrackerState,
+    registration: Registration,
+    joint: Joint,
+    event: ev.PassiveFitted,
+    previous: PreviousEstimate | None = None,
+) -> tuple[PassiveBias, ...]:
+    """Return the biases after a look, as the filter has them; ``previous``: what it saw it from."""
+    name, loop = event.estimate.bias.name, _loop(state, registration, event)
+    return tuple(
+        replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
+        if bias.block.name == name
+        else bias
+        for bias in filtering.biases_of(joint, registration.biases)
     )
 
 
-def _loop(state: TrackerState, registration: Registration) -> tuple[float, ...]:
+def _loop(
+    state: TrackerState, registration: Registration, event: ev.PassiveFitted
+) -> tuple[float, ...]:
     """Return the loop that is looked at; while no RTC is there, the one of the last look."""
     if state.loop.rtc is not None:
         return loop_numbers(state.loop.rtc)
-    return () if registration.bias is None else registration.bias.loop
+    bias = registration.bias(event.estimate.bias)
+    return () if bias is None else bias.loop
 
 
-def _mixed(registration: Registration) -> bool:
+def _mixed(registration: Registration, block: BiasBlock) -> bool:
     """Return whether a look may be at telemetry from before a jump and from after it.
 
     It began no earlier than the one before it ended.
     """
-    began_ns_utc = registration.bias.looked_ns_utc if registration.bias is not None else 0
+    bias = registration.bias(block)
+    began_ns_utc = 0 if bias is None else bias.looked_ns_utc
     jumped_ns_utc = registration.passive_after_ns_utc
     return registration.suspected_jump is not None or (
         jumped_ns_utc > 0 and began_ns_utc < jumped_ns_utc
@@ -400,10 +421,10 @@ def _ask_for_window(
     registration = context.registration or registration
     waits, void = bool(registration.doubt), bool(registration.doubt) and registration.doubt_voids
     why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
-    gone = kalman.forget(prior, event.estimate.bias_excess)
+    gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
-    bias = filtering.bias_of(gone, event.t_ns_utc, _loop(context.state, registration))
-    doubted = replace(_doubted(after, text, event.t_ns_utc), bias=bias, doubt_voids=void)
+    biases = _looked(context.state, registration, gone, event)
+    doubted = replace(_doubted(after, text, event.t_ns_utc), biases=biases, doubt_voids=void)
     validity.store_registration(context, doubted)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     validity.want_window(context, text)
@@ -418,26 +439,24 @@ def _registration_after_passive(
     context: StepContext, registration: Registration, joint: Joint, event: ev.PassiveFitted
 ) -> Registration:
     """Return the registration as the filter has it after a look."""
-    loop = _loop(context.state, registration)
+    block, was = event.estimate.bias, None
+    if registration.bias(block) is not None:
+        was = jumps.sum_of(registration, filtering.joint_of(registration), block)
     return replace(
         registration,
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
         arrived_ns_utc=context.now_ns,
-        bias=filtering.bias_of(
-            joint,
-            event.t_ns_utc,
-            loop,
-            jumps.sum_of(registration, filtering.joint_of(registration)),
-        ),
+        biases=_looked(context.state, registration, joint, event, was),
         pointing=validity.pointing_at(context.state, event.t_ns_utc),
     )
 
 
 def _passive_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
     """Return ``(4,)`` 1 σ of the estimate as a reading of α: its scatter, and that of its bias."""
-    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[4:])
+    place = prior.place(estimate.bias)
+    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[place])
 
 
 def _show(

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.kalman import (
-    PASSIVE,
     Drift,
     Joint,
     allowing,
     begin_joint,
     corrected,
+    forget,
     predicted,
 )
 from service.estimation.lockin import LockIn, LockInPlan, Spectra
@@ -165,8 +165,10 @@ class Watch:
         measured, sigma = {"passive": found.alpha.vector}, {"passive": found.sigma}
         prior = self._forward(t_s)
         if prior is not None:
-            prior = allowing(prior, found.bias_excess)
-            self._joint = corrected(prior, found.alpha.vector, found.covariance, PASSIVE)
+            if not prior.biases:
+                prior = forget(prior, found.bias)
+            prior = allowing(prior, found.bias, found.bias_excess)
+            self._joint = corrected(prior, found.alpha.vector, found.covariance, found.bias)
             measured["followed"] = self._joint.alpha
             own = np.diag(self._joint.alpha_covariance)
             sigma["followed"] = np.sqrt(own + self._floor**2)

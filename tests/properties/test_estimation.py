@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.estimation import kalman, lockin
+from service.estimation.estimate import PASSIVE_BIAS
 from service.estimation.health import LoopHealth, observe
 from tests.numerics import block_of, part, sines
 
@@ -73,11 +74,11 @@ def test_the_filters_covariance_stays_symmetric_and_positive(mean, prior, measur
     """Joseph's form, whatever arrives, dithered and passive in turn; 1e-9 of its largest axis is
     rounding."""
     drift = kalman.Drift(alpha_rate=np.full(4, 1e-3))
-    found = kalman.begin_joint(mean, prior)
+    found = kalman.forget(kalman.begin_joint(mean, prior), PASSIVE_BIAS)
     for measured, noise in measurements:
         found = kalman.predicted(found, drift, 1.0)
         found = kalman.corrected(
-            kalman.corrected(found, measured, noise), measured, noise, kalman.PASSIVE
+            kalman.corrected(found, measured, noise), measured, noise, PASSIVE_BIAS
         )
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     power = np.linalg.eigvalsh(found.covariance)

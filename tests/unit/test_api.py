@@ -371,11 +371,13 @@ async def test_alpha_says_what_it_is_worth_and_since_when_it_was_not_dithered(cl
         window_ns_utc=70 * SECOND,
         validity=ValidityState(level=Validity.AGEING, reason="σ grows", until_ns_utc=120 * SECOND),
         optical_gains=(ModeGain(mode=501, gain=0.6, sigma=0.01, scatter=0.03, t_ns_utc=1),),
-        bias=PassiveBias(
-            offset=np.array([0.05, 0.0, np.deg2rad(0.01), 0.0]),
-            covariance=np.diag(SIGMA**2),
-            shared=np.zeros((4, 4)),
-            looked_ns_utc=1,
+        biases=(
+            PassiveBias(
+                offset=np.array([0.05, 0.0, np.deg2rad(0.01), 0.0]),
+                covariance=np.diag(SIGMA**2),
+                shared=np.zeros((4, 4)),
+                looked_ns_utc=1,
+            ),
         ),
         pointing=Pointing(elevation_deg=61.0, azimuth_deg=120.0),
         restored_ns_utc=60 * SECOND,

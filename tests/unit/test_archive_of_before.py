@@ -10,6 +10,7 @@ import pytest
 from service.archive import Archive, AuditEntry
 from service.archive.serialisation import TrackingFile
 from service.control.gains import ModeGain
+from service.estimation.estimate import PASSIVE_BIAS
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.state import Mode, Orders
@@ -113,8 +114,9 @@ def test_the_registration_and_its_bias_are_what_they_were(archive):
     assert known.covariance.shape == (4, 4)
     assert known.pointing.elevation_deg == 61.0
     assert [gain.mode for gain in known.optical_gains] == [501, 509, 517, 525]
-    assert known.bias.excess[0] > 0.0
-    assert len(known.bias.loop) > 3
+    assert known.biases[0].excess[0] > 0.0
+    assert len(known.biases[0].loop) > 3
+    assert known.biases[0].block == PASSIVE_BIAS
     assert np.array_equal(known.grown, np.zeros(4))
 
 

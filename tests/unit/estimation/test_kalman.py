@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.estimation.estimate import BIAS_FLOOR, BIAS_OVER_SCATTER
+from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
 from service.estimation.kalman import (
     JUMP_THRESHOLD,
-    PASSIVE,
     Drift,
     Joint,
     allowing,
@@ -27,8 +26,17 @@ SCATTER = np.diag(np.array([0.003, 0.003, np.deg2rad(0.01), 0.0003]) ** 2)
 DRIFT = Drift(alpha_rate=np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005]) / np.sqrt(3600.0))
 STILL = Drift(alpha_rate=np.zeros(4), bias_memory_s=np.inf)
 NOWHERE = np.array([0.0, 0.0, 0.0, 1.0])
+BIAS_FLOOR, BIAS_OVER_SCATTER = np.array(PASSIVE_BIAS.floor), np.array(PASSIVE_BIAS.over_scatter)
 SIGMA = np.array([0.015, 0.015, np.deg2rad(0.01), 0.0005])
 """A window's 1 σ: 1.5 % of a subaperture."""
+
+
+def begun(measured: np.ndarray, covariance: np.ndarray, *blocks: BiasBlock) -> Joint:
+    """The filter after a window, nothing known of these biases: the passive estimate's, if none."""
+    joint = begin_joint(measured, covariance)
+    for block in blocks or (PASSIVE_BIAS,):
+        joint = forget(joint, block)
+    return joint
 
 
 def away(*step: float) -> np.ndarray:
@@ -109,55 +117,55 @@ class TestBias:
 
     def test_many_passive_readings_say_nothing_better_than_the_bias_allows(self):
         """Prior of α: 1 subaperture. A bias does not average out, of no parameter."""
-        joint = begin_joint(NOWHERE, np.diag([1.0, 1.0, 0.01, 0.01]))
+        joint = begun(NOWHERE, np.diag([1.0, 1.0, 0.01, 0.01]))
         for _ in range(50):
-            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
+            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
         assert np.all(np.sqrt(np.diag(joint.alpha_covariance)) > 0.99 * BIAS_FLOOR)
 
     def test_the_bias_is_the_difference_of_the_two_readings(self):
         """Both many times: to a tenth of a percent of a subaperture."""
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         for _ in range(400):
             joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, PASSIVE)
-        np.testing.assert_allclose(joint.bias, [0.06, -0.03, 3e-4, 0.0], atol=1e-3)
+            joint = corrected(joint, away(0.06, -0.03, 3e-4, 0.0), SCATTER, PASSIVE_BIAS)
+        np.testing.assert_allclose(joint.bias(PASSIVE_BIAS), [0.06, -0.03, 3e-4, 0.0], atol=1e-3)
         np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
 
     def test_once_the_bias_is_learnt_a_passive_reading_moves_the_registration(self):
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         for _ in range(100):
             joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE)
+            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
         later = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        found = corrected(later, away(0.08, 0, 0, 0), SCATTER, PASSIVE)
+        found = corrected(later, away(0.08, 0, 0, 0), SCATTER, PASSIVE_BIAS)
         assert found.alpha[0] == pytest.approx(0.02, abs=0.003)
         assert np.sqrt(found.covariance[0, 0]) < 0.005
 
     def test_a_change_of_wind_is_far_out_and_what_is_forgotten_is_the_bias_alone(self):
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         for _ in range(20):
             joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
-        assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, PASSIVE) > JUMP_THRESHOLD
-        gone = forget(joint)
+            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
+        assert innovation(joint, away(0.12, 0, 0, 0), SCATTER, PASSIVE_BIAS) > JUMP_THRESHOLD
+        gone = forget(joint, PASSIVE_BIAS)
         np.testing.assert_array_equal(gone.alpha, joint.alpha)
         np.testing.assert_array_equal(gone.alpha_covariance, joint.alpha_covariance)
         np.testing.assert_array_equal(gone.covariance[4:, 4:], np.diag(BIAS_FLOOR**2))
 
     def test_a_jump_seen_by_the_dither_keeps_the_bias(self):
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
             joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE)
+            joint = corrected(joint, away(0.05, 0, 0, 0), SCATTER, PASSIVE_BIAS)
         moved = corrected(widened(joint, DITHERED), away(0.1, 0, 0, 0), DITHERED)
         assert moved.alpha[0] == pytest.approx(0.1, abs=0.005)
-        assert moved.bias[0] == pytest.approx(0.05, abs=0.01)
+        assert moved.bias(PASSIVE_BIAS)[0] == pytest.approx(0.05, abs=0.01)
 
     def test_what_was_learnt_of_the_bias_fades_to_knowing_nothing(self):
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         learnt = replace(joint, mean=joint.mean + np.array([0, 0, 0, 0, 0.05, 0, 0, 0]))
         later = predicted(learnt, DRIFT, 20 * DRIFT.bias_memory_s)
-        np.testing.assert_allclose(later.bias, 0.0, atol=1e-9)
+        np.testing.assert_allclose(later.bias(PASSIVE_BIAS), 0.0, atol=1e-9)
         np.testing.assert_allclose(np.sqrt(np.diag(later.covariance)[4:]), BIAS_FLOOR)
 
 
@@ -167,49 +175,103 @@ class TestExcess:
     def test_where_nothing_is_learnt_a_reading_is_worth_what_the_estimate_says(self):
         """10 % and, at a scatter of 1.4 %, 14 % more of it: together with the scatter 17.3 %."""
         excess = np.array([0.14, 0.14, 0.0, 0.0]) ** 2
-        found = allowing(begin_joint(NOWHERE, DITHERED), excess)
+        found = allowing(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(found.covariance)[4:], BIAS_FLOOR**2 + excess)
         np.testing.assert_array_equal(found.alpha_covariance, DITHERED)
 
     def test_the_same_wind_adds_it_once_however_often_it_is_looked_at(self):
         """And the bias that was learnt meanwhile stays learnt."""
         excess = np.array([0.1, 0.1, 0.0, 0.0]) ** 2
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
             joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(allowing(joint, excess), away(0.15, 0, 0, 0), SCATTER, PASSIVE)
-        again = allowing(joint, excess)
+            joint = corrected(
+                allowing(joint, PASSIVE_BIAS, excess), away(0.15, 0, 0, 0), SCATTER, PASSIVE_BIAS
+            )
+        again = allowing(joint, PASSIVE_BIAS, excess)
         np.testing.assert_array_equal(again.covariance, joint.covariance)
         assert np.sqrt(again.covariance[4, 4]) < 0.002
-        assert again.bias[0] == pytest.approx(0.15, abs=0.005)
+        assert again.bias(PASSIVE_BIAS)[0] == pytest.approx(0.15, abs=0.005)
 
     def test_a_look_that_tells_of_more_moves_a_known_registration_less(self):
         """The bias may have changed with the wind: 1 % of a subaperture of drift, a step of 6 %."""
-        joint = begin_joint(NOWHERE, DITHERED)
+        joint = begun(NOWHERE, DITHERED)
         for _ in range(50):
             joint = corrected(joint, NOWHERE, DITHERED)
-            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE)
+            joint = corrected(joint, NOWHERE, SCATTER, PASSIVE_BIAS)
         joint = predicted(joint, Drift(alpha_rate=np.full(4, 0.01), bias_memory_s=np.inf), 1.0)
-        calm = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE)
-        windy = allowing(joint, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
-        stormy = corrected(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE)
+        calm = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+        windy = allowing(joint, PASSIVE_BIAS, np.array([0.12, 0.12, 0.0, 0.0]) ** 2)
+        stormy = corrected(windy, away(0.06, 0, 0, 0), 16 * SCATTER, PASSIVE_BIAS)
         assert calm.alpha[0] > 0.04
         assert stormy.alpha[0] < 0.001
-        assert stormy.bias[0] > 0.05
+        assert stormy.bias(PASSIVE_BIAS)[0] > 0.05
 
     def test_what_is_forgotten_is_as_uncertain_as_the_look_that_made_it_be(self):
         excess = np.array([0.05, 0.0, 0.0, 0.0])
-        gone = forget(allowing(begin_joint(NOWHERE, DITHERED), 3.0 * excess), excess)
+        much = allowing(begun(NOWHERE, DITHERED), PASSIVE_BIAS, 3.0 * excess)
+        gone = forget(much, PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(gone.covariance)[4:], BIAS_FLOOR**2 + excess)
-        np.testing.assert_array_equal(gone.excess, excess)
+        np.testing.assert_array_equal(gone.bias_of(PASSIVE_BIAS).excess, excess)
 
     def test_a_wind_that_lasts_keeps_it_while_the_filter_fades_it(self):
         """For days: one hour of memory, a look every minute."""
         excess = np.array([0.2, 0.2, 0.0, 0.0]) ** 2
-        joint = allowing(begin_joint(NOWHERE, DITHERED), excess)
+        joint = allowing(begun(NOWHERE, DITHERED), PASSIVE_BIAS, excess)
         for _ in range(3000):
-            joint = allowing(predicted(joint, DRIFT, 60.0), excess)
+            joint = allowing(predicted(joint, DRIFT, 60.0), PASSIVE_BIAS, excess)
         np.testing.assert_allclose(np.diag(joint.covariance)[4:], BIAS_FLOOR**2 + excess)
+
+
+OTHER = BiasBlock(
+    name="other",
+    floor=(0.05, 0.05, 0.002, 0.002),
+    over_scatter=(0.0,) * 4,
+    wander=(0.0,) * 4,
+)
+
+
+class TestSeveralBiases:
+    """Two kinds of passive estimate, each with a block of its own."""
+
+    def test_each_is_learnt_by_itself(self):
+        joint = begun(NOWHERE, DITHERED, PASSIVE_BIAS, OTHER)
+        for _ in range(400):
+            joint = corrected(joint, NOWHERE, DITHERED)
+            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, PASSIVE_BIAS)
+            joint = corrected(joint, away(-0.04, 0, 0, 0), SCATTER, OTHER)
+        assert joint.bias(PASSIVE_BIAS)[0] == pytest.approx(0.06, abs=1e-3)
+        assert joint.bias(OTHER)[0] == pytest.approx(-0.04, abs=1e-3)
+        np.testing.assert_allclose(joint.alpha, NOWHERE, atol=1e-3)
+
+    def test_together_they_say_what_two_independent_readings_do(self):
+        """Precisions add up: 10 % and 5 % of a subaperture make 4.5 %."""
+        joint = begun(NOWHERE, np.diag([1e4] * 4), PASSIVE_BIAS, OTHER)
+        for block in (PASSIVE_BIAS, OTHER):
+            joint = corrected(joint, NOWHERE, 1e-12 * np.eye(4), block)
+        expected = (0.10**-2 + 0.05**-2) ** -0.5
+        assert np.sqrt(joint.covariance[0, 0]) == pytest.approx(expected, rel=1e-4)
+
+    def test_one_that_says_nothing_changes_nothing(self):
+        one, two = begun(NOWHERE, DITHERED), begun(NOWHERE, DITHERED, OTHER, PASSIVE_BIAS)
+        for _ in range(20):
+            one, two = (predicted(joint, DRIFT, 10.0) for joint in (one, two))
+            one, two = (corrected(joint, NOWHERE, DITHERED) for joint in (one, two))
+            read = away(0.06, 0, 0, 0)
+            one, two = (corrected(joint, read, SCATTER, PASSIVE_BIAS) for joint in (one, two))
+        np.testing.assert_allclose(two.alpha, one.alpha, rtol=1e-12)
+        np.testing.assert_allclose(two.alpha_covariance, one.alpha_covariance, rtol=1e-9)
+        np.testing.assert_allclose(two.bias(PASSIVE_BIAS), one.bias(PASSIVE_BIAS), atol=1e-15)
+
+    def test_what_is_forgotten_of_one_leaves_the_other(self):
+        joint = begun(NOWHERE, DITHERED, PASSIVE_BIAS, OTHER)
+        for block in (PASSIVE_BIAS, OTHER):
+            joint = corrected(joint, away(0.06, 0, 0, 0), SCATTER, block)
+        gone = forget(joint, PASSIVE_BIAS)
+        np.testing.assert_array_equal(gone.bias(PASSIVE_BIAS), 0.0)
+        np.testing.assert_array_equal(gone.bias(OTHER), joint.bias(OTHER))
+        place = joint.place(OTHER)
+        np.testing.assert_array_equal(gone.covariance[place, place], joint.covariance[place, place])
 
 
 CALM = np.array([0.003, 0.003, np.deg2rad(0.01), 3e-4])
@@ -227,7 +289,7 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
     drift = Drift(alpha_rate=DRIFT.alpha_rate)
     coarse = np.diag([0.2, 0.2, 5e-3, 5e-3]) ** 2
     true = NOWHERE.copy()
-    joint = begin_joint(true + np.sqrt(np.diag(coarse)) * rng.normal(size=4), coarse)
+    joint = begun(true + np.sqrt(np.diag(coarse)) * rng.normal(size=4), coarse)
     bias, allowed, found = BIAS_FLOOR * rng.normal(size=4), np.zeros(4), []
     for t in range(6, 301, 6):
         scatter = scatters[t > 240]
@@ -240,7 +302,9 @@ def windy_night(seed: int, scatters: tuple[np.ndarray, np.ndarray]) -> np.ndarra
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
             joint = corrected(joint, read, DITHERED)
         read = true + bias + scatter * rng.normal(size=4)
-        joint = corrected(allowing(joint, excess), read, np.diag(scatter**2), PASSIVE)
+        joint = corrected(
+            allowing(joint, PASSIVE_BIAS, excess), read, np.diag(scatter**2), PASSIVE_BIAS
+        )
         error, covariance = joint.alpha - true, joint.alpha_covariance
         square = error @ np.linalg.solve(covariance, error)
         found.append([*error / np.sqrt(np.diag(covariance)), square])
@@ -275,11 +339,11 @@ def night(seed: int, dither_every_s: float) -> tuple[np.ndarray, np.ndarray]:
         joint = None if joint is None else predicted(joint, DRIFT, 10.0)
         if t % dither_every_s == 0.0:
             read = true + np.sqrt(np.diag(DITHERED)) * rng.normal(size=4)
-            begun = begin_joint(read, DITHERED)
-            joint = begun if joint is None else corrected(joint, read, DITHERED)
+            fresh = begun(read, DITHERED)
+            joint = fresh if joint is None else corrected(joint, read, DITHERED)
         assert joint is not None
         read = true + bias + np.sqrt(np.diag(SCATTER)) * rng.normal(size=4)
-        joint = corrected(joint, read, SCATTER, PASSIVE)
+        joint = corrected(joint, read, SCATTER, PASSIVE_BIAS)
         if t > 600.0:
             error = joint.alpha - true
             errors.append(error)

@@ -67,11 +67,11 @@ class Leaping(World):
         self.clock_ns = clock_of(self.machine)
         super().__init__(Mode.HOLD)
 
-    def tell(self, event, after_s=0.0):
+    def tell(self, event, after_s=0.0, cause=""):
         self.machine.pass_(after_s)
         kept = self.now_ns
         self.now_ns = self.clock_ns()
-        effects = super().tell(event)
+        effects = super().tell(event, cause=cause)
         self.now_ns = kept + round(after_s * SECOND)
         return effects
 

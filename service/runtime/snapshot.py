@@ -23,9 +23,6 @@ from service.tracking.sending import why_no_return
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
 
-WINDOW_REFUSED = "window.refused"
-"""Name of the line of the log that a refused window leaves."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLoad:
@@ -105,9 +102,8 @@ class Snapshot:
 
     @property
     def window_refusal(self) -> LogEntry | None:
-        """The last window that was refused, and why; null: none was, or it is long ago."""
-        log = reversed(self.tracker.log)
-        last = next((line for line in log if line.name == WINDOW_REFUSED), None)
+        """The last window that was refused, and why; null: none was."""
+        last = self.tracker.windows.refusal
         return last and replace(last, t_ns_utc=last.last_ns_utc or last.t_ns_utc)
 
     @property

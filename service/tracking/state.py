@@ -170,6 +170,9 @@ class WindowCounts:
     outlying: int = 0
     """Believable in themselves, but so far from all others that they were not believed."""
 
+    refusal: LogEntry | None = None
+    """The last one that was refused, and why, as the log has it; None: none was."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatrixStates:

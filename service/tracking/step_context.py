@@ -233,9 +233,10 @@ class StepContext:
         self.dithers = replace(self.dithers, no_dither_before_ns_utc=dither_ns)
         self.matrices = replace(self.matrices, no_making_before_ns_utc=make_ns)
 
-    def log(self, name: str, text: str, level: Level = Level.INFO) -> None:
-        """Add a line to the log; one that repeats is counted instead."""
+    def log(self, name: str, text: str, level: Level = Level.INFO) -> LogEntry:
+        """Add a line to the log, and return it; one that repeats is counted instead."""
         self.state = logged(self.state, name, text, self.now_ns, level, self.cause)
+        return next(line for line in reversed(self.state.log) if line.name == name)
 
     def warn(self, name: str, text: str) -> None:
         """Add a warning to the log."""

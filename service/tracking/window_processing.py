@@ -103,8 +103,13 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
     if kind is RefusalKind.MISTOLD:
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
-    context.log("window.refused", reason, level)
+    _note_refusal(context, reason, level)
     refusals.refuse(context, reason, kind)
+
+
+def _note_refusal(context: StepContext, reason: str, level: Level = Level.INFO) -> None:
+    line = context.log("window.refused", reason, level)
+    context.windows = replace(context.windows, refusal=line)
 
 
 def process_window(context: StepContext, measured: WindowEstimate) -> None:
@@ -129,7 +134,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
         and validity.precedes(context.state, measured.when, registration.doubted_ns_utc)
     ):
         refusals.count(context)
-        context.log("window.refused", TOO_EARLY)
+        _note_refusal(context, TOO_EARLY)
         return
     if registration.suspected_jump is not None:
         text = (

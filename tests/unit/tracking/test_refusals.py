@@ -1,5 +1,7 @@
 """Windows refused one after the other are an alarm, unless something else explains them."""
 
+from dataclasses import replace
+
 import pytest
 
 from service.estimation.windows import RefusalKind, WindowRefused
@@ -47,6 +49,17 @@ def test_hundreds_of_them_are_one_line_of_alarm(story):
     refuse(story, 145)
     assert story.logged.count(WINDOWS_REFUSED) == 1
     assert story.state.windows.refused == 145
+
+
+def test_the_last_one_is_known_without_the_log(story):
+    assert story.state.windows.refusal is None
+    last = refuse(story, 3).state.windows.refusal
+    assert (last.text, last.times, last.last_ns_utc) == (MISSING, 3, story.now_ns)
+    story.state = replace(story.state, log=())
+    story.see()
+    assert story.state.windows.refusal is last
+    other = refuse(story, reason="edge slip").state.windows.refusal
+    assert (other.text, other.times) == ("edge slip", 1)
 
 
 def test_its_text_stays_while_the_cause_does_and_changes_with_it(story):

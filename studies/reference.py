@@ -18,7 +18,6 @@ from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.tracking.alarms import ALARMS
 from studies.contract_tables import described
-from studies.demo.arguments import demo_parser
 
 Schema = Mapping[str, Any]
 
@@ -151,13 +150,10 @@ def commands() -> str:
     """Return docs/reference/cli.md: every command with its options."""
     intro = (
         "`make` puts `pyrcal` into `.venv/bin`. `--help` of each command says the same; "
-        "`pyrcal sim --help` and `pyrcal campaign --help` are manuals of their own. What several "
-        "commands share is explained once, first."
+        "those of `pyrcal sim`, `demo` and `campaign` are manuals of their own. Options that several "
+        "commands share are explained once, first."
     )
-    parsers = dict(_parsers(command_line())) | {
-        "pyrcal demo": demo_parser(),
-        "pyrcal check-rtc": check_parser(),
-    }
+    parsers = dict(_parsers(command_line())) | {"pyrcal check-rtc": check_parser()}
     texts = {name: _texts(parser) for name, parser in parsers.items()}
     rows = {name: list(_options(parser)) for name, parser in parsers.items()}
     often = [

@@ -60,7 +60,7 @@ class MirrorTable(InfluenceShape):
     """``[mirror]``: analytic (``layout``) or measured (``modes``, ``influence_functions``)."""
 
     layout: Literal["rings", "grid", "positions"] | None = None
-    """How the actuators of an analytic mirror are placed."""
+    """Placement of an analytic mirror's actuators."""
 
     pitch_m: Positive | None = None
     """Distance between neighbours, metres; None: 0.30 for rings, measured for positions."""
@@ -102,7 +102,7 @@ class MirrorTable(InfluenceShape):
     """Grid step of the measured modes."""
 
     modes_kind: Literal["opd", "surface"] = "opd"
-    """What the user's own modes are heights of."""
+    """Meaning of the user's modes: OPD, or surface."""
 
     influence_functions: str | None = None
     """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``."""

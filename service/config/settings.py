@@ -26,23 +26,23 @@ class ServiceTable(Table):
     """``[service]``: the service as a whole."""
 
     instrument: str = Field(default="flao-lbt", min_length=1)
-    """Packaged name or path of the instrument file."""
+    """Packaged name, or path of the instrument file."""
 
     system: Id | None = None
     """The ``{system}`` of the wire; None: the instrument's name."""
 
     mode: Literal["auto", "propose", "hold"] = "propose"
-    """How much the service may do by itself when it starts."""
+    """Mode at the start."""
 
     data_dir: Path = Path("var")
-    """Where products, index and audit trail live; relative to the working directory."""
+    """Folder of products, index and audit trail."""
 
     cache_dir: Path | None = None
-    """Where what takes long to compute and is always the same is kept; it may be deleted at any
-    time. None: ``pyrcal`` in the user's cache folder."""
+    """Folder of cached computations; may be deleted at any time. None: ``pyrcal`` in the user's
+    cache folder."""
 
     log_format: Literal["auto", "text", "json"] = "auto"
-    """How a line of the log is written; "auto": as text on a terminal, else as a JSON object."""
+    """Format of the log; "auto": text on a terminal, else JSON."""
 
 
 class ZenohTable(Table):
@@ -68,21 +68,21 @@ class ApiTable(Table):
     """TCP port; 0: any free one."""
 
     allowed_hosts: tuple[str, ...] = ()
-    """Names under which it may be asked for besides loopback and ``host``, without a port: that of
-    the machine where ``host`` is all of its interfaces, or of a proxy before it."""
+    """Names under which it may be asked besides loopback and ``host``, without a port: the
+    machine's, or a proxy's."""
 
 
 class DitherTable(Table):
-    """``[dither]``: the small signal that tells the truth."""
+    """``[dither]``: the small signal that measures α."""
 
     enabled: bool = True
-    """Whether the service asks for it by itself."""
+    """Dither without being asked."""
 
     budget_m: float = Field(default=8e-9, gt=0.0, le=2e-7)
-    """Largest RMS of all modes together on the mirror, metres OPD; never exceeded by itself."""
+    """Largest RMS of all modes together on the mirror, metres OPD."""
 
     sigma_shift_subap: Positive = 0.01
-    """1 σ of each shift to be kept by as little dither as will do, subapertures."""
+    """1 σ of each shift to keep, subapertures."""
 
     sigma_rotation_deg: Positive = 0.02
     """Of the rotation, degrees."""
@@ -91,7 +91,7 @@ class DitherTable(Table):
     """Of the magnification."""
 
     longest_pause_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    """Longest time between two windows, seconds: so long may a jump go unseen. 0: no pause."""
+    """Longest pause between two windows, seconds; a jump may go unseen as long."""
 
     amplitude_m: float | None = Field(default=None, gt=0.0, le=1e-7)
     """RMS of each mode, metres OPD; None: the service chooses, within the budget."""
@@ -103,13 +103,13 @@ class DitherTable(Table):
     """One for each mode; None: spread over 0.2-0.35 of the frame rate."""
 
     avoid_hz: tuple[Positive, ...] = ()
-    """Vibrations to keep clear of besides those that are heard in the slopes."""
+    """Vibrations to avoid, besides those found in the slopes."""
 
     window_s: float = Field(default=2.0, ge=0.1, le=60.0)
-    """Least telemetry in one estimate, seconds."""
+    """Shortest window, seconds."""
 
     longest_window_s: float = Field(default=20.0, ge=0.1, le=300.0)
-    """Most of it, seconds; faint stars and small budgets need long windows."""
+    """Longest window, seconds; faint stars and small budgets need long ones."""
 
     @model_validator(mode="after")
     def _one_frequency_for_each_mode(self) -> DitherTable:
@@ -134,7 +134,7 @@ class DitherTable(Table):
 
 
 class TrackingTable(Table):
-    """``[tracking]``: how fast α may move and how far the model itself is to be trusted."""
+    """``[tracking]``: drift of α, and errors of the model."""
 
     drift_subap_per_minute: Positive = 0.05
     """Random walk of each shift, 1 σ after a minute, subapertures."""
@@ -146,8 +146,7 @@ class TrackingTable(Table):
     """Of the magnification."""
 
     floor_shift_subap: float | None = Field(default=None, ge=0.0)
-    """1 σ model error of each shift, subapertures; no integration removes it. None: as measured for
-    the model in use, see ``service.config.policy``."""
+    """1 σ model error of each shift, subapertures. None: as measured."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
     """Of the rotation, degrees."""
@@ -156,23 +155,22 @@ class TrackingTable(Table):
     """Of the magnification."""
 
     bias_memory_s: Positive = 3600.0
-    """How long the wind's bias of the passive estimate lasts: after it, what was learnt is worth
-    1/e."""
+    """Time in which the learnt bias of the passive estimate decays to 1/e, seconds."""
 
     flexure_subap_per_degree: float = Field(default=0.02, ge=0.0)
-    """What a degree of elevation does to a shift, 1 σ, subapertures."""
+    """Shift per degree of elevation, 1 σ, subapertures."""
 
     flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
-    """To the rotation, degrees."""
+    """The same for the rotation, degrees."""
 
     flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
-    """To the magnification."""
+    """The same for the magnification."""
 
     slew_limit_deg: Positive = 5.0
-    """A telescope that has moved further since the last window makes α invalid, degrees."""
+    """α is invalid when the telescope has moved further since the last window, degrees."""
 
     stale_shift_subap: Positive = 0.05
-    """1 σ of a shift from which on α is stale, subapertures."""
+    """α is stale from this 1 σ of a shift on, subapertures."""
 
     stale_rotation_deg: Positive = 0.1
     """Of the rotation, degrees."""
@@ -182,10 +180,10 @@ class TrackingTable(Table):
 
 
 class AcquisitionTable(Table):
-    """``[acquisition]``: finding α from nothing, with the loop open."""
+    """``[acquisition]``: finding α from nothing."""
 
     auto: bool = True
-    """Whether it begins by itself, in mode auto, when the loop diverges or α is out of reach."""
+    """Begin by itself, in mode auto, when the loop diverges or α is out of range."""
 
     amplitude_m: float = Field(default=50e-9, gt=0.0, le=2e-7)
     """RMS of each of up to eight modes dithered meanwhile, metres OPD, as far as the RTC allows;
@@ -193,16 +191,16 @@ class AcquisitionTable(Table):
 
 
 class ControlTable(Table):
-    """``[control]``: when a reconstructor is made and what it must withstand."""
+    """``[control]``: making reconstructors."""
 
     n_modes_target: int = Field(default=500, ge=1)
-    """Modes to control once the registration is known."""
+    """Modes to control."""
 
     pole_radius_bound: float = Field(default=0.95, gt=0.0, lt=1.0)
-    """Largest closed-loop pole radius, anywhere in α ± 3σ, of a matrix that may be published."""
+    """Largest closed-loop pole radius, anywhere in α ± 3σ."""
 
     method: Literal["svd", "map"] = "svd"
-    """How the interaction matrix is inverted: "svd", or "map", which knows noise and turbulence."""
+    """Inversion: "svd", or "map", which weighs noise and turbulence."""
 
     max_condition: float = Field(default=100.0, gt=1.0)
     """svd: singular values below the largest over this are left out."""
@@ -211,13 +209,13 @@ class ControlTable(Table):
     """map: 1 sigma of one slope in one frame; the turbulence is the instrument's ``[modes]``."""
 
     update_gain_nm: Positive = 0.5
-    """Expected loss of wavefront error that makes a new reconstructor worthwhile, nanometres."""
+    """Gain in wavefront error that makes a new reconstructor worthwhile, nanometres."""
 
     update_margin: float = Field(default=0.08, gt=0.0, lt=1.0)
-    """Loss of stability margin that does, as a share of what a new one would have."""
+    """Gain in stability margin that does, as a share of the new one's."""
 
     update_shift_subap: Positive = 0.08
-    """Change of a shift that makes a new reconstructor whatever it wins, subapertures."""
+    """A new reconstructor at this change of a shift, whatever it wins, subapertures."""
 
     update_rotation_deg: Positive = 0.08
     """Of the rotation, degrees."""
@@ -226,13 +224,13 @@ class ControlTable(Table):
     """Of the magnification."""
 
     wind_m_s: Positive = 15.0
-    """Wind at which the expected loss is computed, metres per second."""
+    """Wind for the expected loss, metres per second."""
 
     minimum_interval_s: float = Field(default=5.0, ge=0.0)
-    """Least time between two reconstructors, seconds."""
+    """Shortest time between two reconstructors, seconds."""
 
     open_lost_loop: bool | None = None
-    """Whether the RTC is asked to open a loop that is lost with a matrix just applied, where going
+    """Ask the RTC to open a loop that is lost with a matrix just applied, where going
     back to the one before does not help; left out: if the mode was auto when it was applied."""
 
 
@@ -248,32 +246,32 @@ class OffloadTable(Table):
     """
 
     enabled: bool = False
-    """Whether moves are asked for at all."""
+    """Ask for moves."""
 
     gain: float = Field(default=0.8, gt=0.0, le=1.0)
     """Share of the way back to the nominal registration that is asked for at once."""
 
     dead_band: FourAxes = (0.015, 0.015, 0.015, 0.002)
-    """Nearer to the nominal registration than this nothing is asked for."""
+    """Distance within which nothing is asked for."""
 
     most_step: FourAxes = (0.1, 0.1, 0.2, 0.005)
-    """Of one move."""
+    """Largest single move."""
 
     reach: FourAxes = (1.0, 1.0, 1.0, 0.02)
-    """Of all moves together, either way, also before a restart; 0: what cannot be moved."""
+    """Largest sum of all moves, either way, across restarts; 0: cannot be moved."""
 
     settle_s: float = Field(default=3.0, ge=0.0, le=50.0)
-    """From the reply until the image stands still, where the reply does not say, seconds."""
+    """Time from the reply until the image stands still, unless the reply says it, seconds."""
 
 
 class ComputeTable(Table):
-    """``[compute]``: what the heavy work may use, and how finely it samples the optics."""
+    """``[compute]``: processor time and sampling of the optics."""
 
     threads: int = Field(default=2, ge=1, le=256)
     """Threads of the worker process."""
 
     nice: int = Field(default=10, ge=0, le=19)
-    """Its niceness: the ingest of telemetry goes first."""
+    """Niceness of the worker."""
 
     pupil_sampling: int = Field(default=3, ge=1, le=16)
     """Pupil points per subaperture (q of the model)."""
@@ -282,8 +280,8 @@ class ComputeTable(Table):
     """Quadrature nodes per detector pixel and axis (nd of the model)."""
 
     working_point_modes: int | None = Field(default=None, ge=1)
-    """Compare telemetry with the response of a loop that controls this many modes at the
-    instrument's r0, less biased on sky and slower; None: with that of a flat wavefront."""
+    """Use the response around the residual of a loop of this many modes at the instrument's r0:
+    less biased on sky, and slower. None: around a flat wavefront."""
 
 
 class FitsTable(Table):
@@ -293,7 +291,7 @@ class FitsTable(Table):
     """Largest upload, megabytes; a zip archive must stay below it unpacked, too."""
 
     waiting: int = Field(default=4, ge=1, le=100)
-    """Fits that may be unfinished at once: as many uploads may lie on the disk."""
+    """Largest number of unfinished fits."""
 
     time_limit_s: Positive = 600.0
     """A fit that takes longer is stopped."""
@@ -303,14 +301,14 @@ class FitsTable(Table):
 
 
 class ArchiveTable(Table):
-    """``[archive]``: what is kept, and how it is told."""
+    """``[archive]``: how long things are kept."""
 
     keep_days: float = Field(default=0.0, ge=0.0)
-    """Matrices older than this are removed, but for those in use, referenced or pinned, and the
-    newest; what is known of them stays, as do α over time and the audit trail. 0: for ever."""
+    """Matrices older than this are removed, but for those in use, referenced, pinned or newest. 0:
+    never."""
 
     keep_gb: float = Field(default=100.0, ge=0.0)
-    """So much of them is kept, the oldest go first, gigabytes; 0: no limit."""
+    """Largest size of all matrices, gigabytes, the oldest go first; 0: no limit."""
 
     reserve_gb: float = Field(default=2.0, ge=0.0)
     """Less free space than this raises an alarm, gigabytes."""
@@ -319,17 +317,17 @@ class ArchiveTable(Table):
     """UTC hour of local noon, where one night ends and the next begins."""
 
     last_telemetry_s: float = Field(default=60.0, ge=0.0, le=3600.0)
-    """So much of the last telemetry is held in memory, to be kept when somebody asks; 0: none."""
+    """Telemetry held in memory for recordings that begin before now, seconds."""
 
     last_telemetry_mb: int = Field(default=256, ge=1, le=1_000_000)
-    """It takes no more than this, megabytes: half a minute of FLAO at 1 kHz."""
+    """Its largest size, megabytes: half a minute of FLAO at 1 kHz."""
 
 
 Scalar = bool | float | str
 
 
 class RuleTable(Table):
-    """``[[rules]]``: what operators want forbidden, and when."""
+    """``[[rules]]``: operators' own alarms."""
 
     name: Id
     """Its alarm is ``rule.NAME``."""
@@ -339,16 +337,16 @@ class RuleTable(Table):
     ``state.elevation_deg``; how it is compared; with what."""
 
     blocks: tuple[Literal["measure", "decide", "send_new", "send_known", "ask"], ...] = ()
-    """What is forbidden while it holds, as docs/reference/states.md says of alarms."""
+    """What it forbids, as docs/operate/runbook.md explains."""
 
     severity: Literal["warning", "serious", "critical"] = "serious"
     """How much it matters."""
 
     text: str = Field(min_length=1, max_length=300)
-    """What is the matter and what to do, in a sentence."""
+    """What is wrong and what to do, in a sentence."""
 
     unknown: Literal["holds", "does-not-hold"] = "holds"
-    """While nobody tells the value."""
+    """Whether it holds while the value is unknown."""
 
     @model_validator(mode="after")
     def _compared_with_sense(self) -> RuleTable:

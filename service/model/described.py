@@ -32,7 +32,7 @@ class Telescope(Read):
     """A telescope as a whole."""
 
     name: str
-    """Also the ``{system}`` of the wire unless configured otherwise."""
+    """Also the ``{system}`` of the wire."""
 
     diameter_m: Positive
     """Pupil diameter, metres."""
@@ -41,10 +41,10 @@ class Telescope(Read):
     """Linear central obscuration."""
 
     stop: Stop
-    """Which element limits the beam."""
+    """Element that limits the beam."""
 
     double_pass: bool = False
-    """Whether a measured matrix sees the mirror twice."""
+    """A measured matrix sees the mirror twice."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,13 +78,13 @@ class KarhunenLoeve(Read):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopFacts(Read):
-    """The loop: what the RTC's status would say of it, for work without an RTC."""
+    """The loop: the loop, for work without an RTC."""
 
     frame_rate_hz: Positive | None = None
     """Frames per second."""
 
     delay_frames: Annotated[float, Ge(1.0)] | None = None
-    """From a frame to the first one that sees its correction."""
+    """Frames from an exposure to the first one that sees its correction."""
 
     n_controlled: Count | None = None
     """Modes in the loop, the first ones."""

@@ -49,7 +49,7 @@ class SensorDescription(Protocol):
 
     @property
     def flux_threshold(self) -> float:
-        """Least flux of a valid subaperture, relative to a full one."""
+        """Smallest flux of a valid subaperture, relative to a full one."""
 
     @property
     def valid_subapertures(self) -> NDArray[np.bool_] | None:

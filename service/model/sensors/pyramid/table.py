@@ -38,7 +38,7 @@ class PyramidNumbers(Read):
     """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
 
     flux_threshold: Annotated[float, Gt(0.0), Le(1.0)] = 0.5
-    """Least flux of a valid subaperture, relative to a full one."""
+    """Smallest flux of a valid subaperture, relative to a full one."""
 
     @property
     def pupil_diameter(self) -> float:
@@ -61,7 +61,7 @@ class PyramidTable(PyramidNumbers):
     """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
 
     input: Literal["slopes", "frames"] = "slopes"
-    """What the RTC sends."""
+    """Signals that the RTC sends."""
 
     pupil_centres_px: Centres | None = None
     """Of the four pupil images, row and column; "auto": from a flux frame. Frames only."""

@@ -383,14 +383,30 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     if found is None:
         return None
     modes = slice(0, state.n_modes)
+    estimate = fit_matrix(
+        found,
+        linearisation.matrix[:, modes],
+        linearisation.derivatives[:, :, modes],
+        linearisation.alpha,
+    )
+    return replace(estimate, misfit=estimate.misfit / _slope_variance(state, found.matrix))
+
+
+def fit_matrix(
+    found: PassiveMatrix, model: Array, derivatives: Array, near: Misregistration
+) -> PassiveEstimate:
+    """Fit α and a free gain per column to a noisy matrix, about ``near``.
+
+    ``model`` is what it should be there, ``derivatives`` ``(4, ...)`` how that changes with α. The
+    misfit is the variance of an error where the shape has 1: nobody here knows the noise.
+    """
     noise = np.diag(found.shape)
     # a mode that never moves has no noise, and no weight
     least = noise[noise > 0.0].min()
     weights = np.where(noise > 0.0, least / np.maximum(noise, least), 0.0)
     every = np.ones(len(found.matrix), dtype=np.bool_)
-    seen = Columns(matrix=found.matrix, weights=weights, rows=every).project(
-        linearisation.matrix[:, modes], linearisation.derivatives[:, :, modes]
-    )
+    measured = Columns(matrix=found.matrix, weights=weights, rows=every)
+    seen = measured.project(model, derivatives)
     normal = np.linalg.inv(seen.normal)
     step = normal @ seen.scores.sum(axis=1)
     left = seen.residual - np.tensordot(step, seen.jacobian, axes=1)
@@ -400,10 +416,10 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
-        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        alpha=Misregistration.from_vector(near.vector + step),
         covariance=(1.0 - SHRUNK) * covariance + SHRUNK * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,
-        misfit=variance / _slope_variance(state, found.matrix),
+        misfit=variance,
         step=step,
     )
 

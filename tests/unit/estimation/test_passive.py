@@ -8,9 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.estimation.estimate import BIAS_FLOOR, PassiveEstimate
+from service.estimation.estimate import PASSIVE_BIAS, PassiveEstimate
 from service.estimation.frames import FrameBlock
-from service.estimation.passive import MIN_FRAMES_PER_MODE, Passive, accumulate, fit, passive_matrix
+from service.estimation.passive import Passive, accumulate, fit, passive_matrix
+from service.estimation.passive_sums import MIN_FRAMES_PER_MODE
 from service.model.misregistration import Misregistration
 from tests.numerics import (
     N_CONTROLLED,
@@ -155,7 +156,7 @@ def test_a_sensor_that_is_not_the_modelled_one_shows_in_the_misfit():
 def test_sigma_is_never_below_the_bias_that_no_dither_has_taught():
     """10 % of a subaperture, more where the scatter says that the signal is weak."""
     found = fit(fed(night()), small_linearisation())
-    assert np.all(found.sigma > BIAS_FLOOR)
+    assert np.all(found.sigma > PASSIVE_BIAS.floor)
     strong, weak = (replace(found, covariance=np.eye(4) * s**2) for s in (1e-4, 0.014))
     np.testing.assert_allclose(strong.sigma[:2], 0.10, rtol=1e-3)
     np.testing.assert_allclose(weak.sigma[:2], np.hypot(0.10, 0.14), rtol=0.01)
@@ -166,7 +167,7 @@ def test_noise_widens_sigma_beyond_the_floor():
     block = quiet_block(700)
     noise = 30.0 * np.random.default_rng(4).normal(size=block.slopes.shape)
     found = fit(fed(block_of(block.slopes + noise, block.commands_m, None)), small_linearisation())
-    assert np.all(found.sigma > 2 * BIAS_FLOOR)
+    assert np.all(found.sigma > 2 * np.array(PASSIVE_BIAS.floor))
 
 
 def test_too_few_frames_give_no_estimate_rather_than_a_poor_one():

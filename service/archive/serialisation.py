@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from service.errors import ArchiveError, ModelError, StorageError
 from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE, Misregistration
 from service.tracking.filtering import joint_of
-from service.tracking.registration import Registration
+from service.tracking.registration import Purpose, Registration
 from service.tracking.state import Saved
+from service.tracking.void_intervals import BEFORE_DOUBT, BOTH_SIDES, MOVING
 
 NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
 """What reading a record of another version, or a damaged one, raises."""
@@ -218,6 +219,8 @@ def _saved_of(values: dict[str, Any]) -> Saved:
         known["alpha"] = dict(zip(_NUMERIC, known["alpha"], strict=True))
         # written when there was one passive estimate
         known.setdefault("biases", [bias for bias in (known.pop("bias", None),) if bias])
+    of_before = _voids_of_before(known or {}, values.get("offload"))
+    values.setdefault("void_intervals", []).extend(of_before)
     saved = msgspec.convert(
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
@@ -236,6 +239,23 @@ def _saved_of(values: dict[str, Any]) -> Saved:
     if orders is not None and (orders.mode is None) is not (orders.settings_mode is None):
         raise ValueError(f"mode is {orders.mode!r} and of the settings {orders.settings_mode!r}")
     return saved
+
+
+def _voids_of_before(known: dict[str, Any], offload: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """Return what was void by the fields that services before the list of it have written."""
+    doubted_ns, passive_ns = (
+        known.pop(name, 0) for name in ("doubted_ns_utc", "passive_after_ns_utc")
+    )
+    found = {
+        (Purpose.MEASURE, MOVING): (offload or {}).pop("still_ns_utc", 0),
+        (Purpose.PASSIVE, BOTH_SIDES): passive_ns,
+        (Purpose.SETTLE, BEFORE_DOUBT): doubted_ns if known.get("doubt") else 0,
+    }
+    return [
+        {"until_ns_utc": until_ns, "because": because, "purpose": purpose.value}
+        for (purpose, because), until_ns in found.items()
+        if until_ns
+    ]
 
 
 def _check_shapes(arrays: list[tuple[NDArray[Any], tuple[int, ...]]]) -> None:

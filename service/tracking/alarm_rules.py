@@ -17,7 +17,15 @@ from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import why_open
-from service.tracking import alarms, dither, dither_plan, mode_proof, refusals, validity
+from service.tracking import (
+    alarms,
+    dither,
+    dither_plan,
+    mode_proof,
+    refusals,
+    validity,
+    void_intervals,
+)
 from service.tracking import commands as cmd
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
@@ -43,7 +51,7 @@ def derive_alarms(context: StepContext) -> None:
     for alarm in context.alarms.active:
         lasts = LASTING.get(alarm.name)
         if lasts is not None and not lasts(context):
-            validity.end_alarm(context, alarm.name)
+            void_intervals.end_alarm(context, alarm.name)
     for own in context.policy.rules:
         _set(context, f"{RULE_PREFIX}{own.name}", _rule_text(context, own), _own_definition(own))
 
@@ -55,7 +63,7 @@ def _set(
     raised = context.state.alarm(name)
     if text is None:
         if raised is not None:
-            validity.end_alarm(context, name)
+            void_intervals.end_alarm(context, name)
     elif raised is None or (raised.text, raised.own) != (text, definition):
         context.raise_alarm(name, text, definition)
 

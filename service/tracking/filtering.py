@@ -15,7 +15,7 @@ from service.estimation.lockin import MAX_LAG_FRAMES
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, Why
 from service.model.misregistration import Misregistration
-from service.tracking import mode_proof, validity
+from service.tracking import mode_proof, validity, void_intervals
 from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.jumps import as_previous
 from service.tracking.policy import SECOND_NS, Policy
@@ -24,12 +24,13 @@ from service.tracking.registration import (
     PassiveBias,
     PointedEstimate,
     PreviousEstimate,
+    Purpose,
     Registration,
     Source,
 )
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import TelemetrySpan
+from service.tracking.void_intervals import TelemetrySpan
 
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""
@@ -155,7 +156,7 @@ class FilterUpdate:
 def brought_forward(context: StepContext, registration: Registration, t_ns_utc: int) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - registration.t_ns_utc
-    if elapsed_ns < -validity.CLOCK_SET_BACK_S * SECOND_NS:
+    if elapsed_ns < -void_intervals.CLOCK_SET_BACK_S * SECOND_NS:
         # a clock that was set back, or another night played again: the service's own must do
         elapsed_ns = context.now_ns - registration.arrived_ns_utc
     policy = context.policy
@@ -241,11 +242,9 @@ def accept(
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
         biases=biases_of(joint, known),
-        passive_after_ns_utc=previous.passive_after_ns_utc if previous is not None else 0,
         previous_estimate=None if anew else _previous_estimate(previous, update, measured),
         jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),
         doubt=previous.doubt if previous is not None and doubted else "",
-        doubted_ns_utc=previous.doubted_ns_utc if previous is not None and doubted else 0,
         doubt_voids=previous is None or previous.doubt_voids,
         pointing=measured.pointing,
         window_pointing=validity.pointing_at(context.state, when.began_ns_utc),
@@ -256,6 +255,7 @@ def accept(
     validity.store_registration(context, registration)
     context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
     if not doubted:
+        void_intervals.make_valid(context, Purpose.SETTLE)
         validity.have_window(context)
     remember(context, entry_of(measured, registration, update.innovation))
     validity.age(context)
@@ -272,7 +272,7 @@ def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpa
         return False
     if update.jumped:
         when = replace(when, began_ns_utc=when.ended_ns_utc)
-    return validity.precedes(state, when, registration.doubted_ns_utc)
+    return void_intervals.why_void(state, when, Purpose.SETTLE) is not None
 
 
 def _jumped_ns_utc(
@@ -380,5 +380,6 @@ def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:
     """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
     alarm = blocking_alarm(state.alarms.active, Interlock.MEASURE)
     if alarm is None:
-        return validity.why_telemetry_invalid(state, when)
+        because = void_intervals.why_void(state, when)
+        return because and f"{because} when it was taken: its telemetry is no measurement"
     return f"{alarm.definition.because}: its telemetry is no measurement"

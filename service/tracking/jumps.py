@@ -22,7 +22,8 @@ from service.tracking.registration import (
     Registration,
     TimedEstimate,
 )
-from service.tracking.validity import CLOCK_SET_BACK_S, flexure
+from service.tracking.validity import flexure
+from service.tracking.void_intervals import CLOCK_SET_BACK_S
 
 STEADY_S = 60.0
 """The drift of a minute is what the settings tell: over less it is that share of it."""

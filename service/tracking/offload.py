@@ -19,10 +19,11 @@ from service.tracking import validity
 from service.tracking.alarms import Interlock
 from service.tracking.operations.running import ramping
 from service.tracking.policy import SECOND_NS, Offloading, Policy
-from service.tracking.registration import Offload, OffloadState, Registration, Validity
+from service.tracking.registration import Offload, OffloadState, Purpose, Registration, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import settled
+from service.tracking.void_intervals import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
 DISOBEDIENCE = 0.3
@@ -63,8 +64,8 @@ def demand(context: StepContext) -> None:
         total=np.zeros(4) if last is None else last.total,
         asked_ns_utc=context.now_ns,
         n_moves=0 if last is None else last.n_moves,
-        still_ns_utc=_clock_ns(context, limits.settle_s),
     )
+    void_until(context, _clock_ns(context, limits.settle_s), MOVING)
     context.alpha = replace(context.alpha, offload=offload)
     named = dict(zip(PARAMETERS, (step * BOUNDARY_SCALE).tolist(), strict=True))
     context.ask(ev.Ask(request=OffloadRequest(id=offload.id, **named)))
@@ -98,7 +99,8 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     if offload is None or limits is None or offload.id != request.id:
         return
     if not reply.accepted:
-        _end(context, replace(offload, still_ns_utc=0), OffloadState.REFUSED, reply.reason)
+        make_valid(context, Purpose.MEASURE, MOVING)
+        _end(context, offload, OffloadState.REFUSED, reply.reason)
         context.warn("offload.refused", f"{offload.id}: {reply.reason}")
         return
     lasts_s = limits.settle_s
@@ -108,7 +110,8 @@ def on_answer(context: StepContext, request: OffloadRequest, reply: Reply) -> No
     spread = DISOBEDIENCE * np.abs(offload.step) + _cross_talk(offload.step, limits)
     still_ns = _clock_ns(context, lasts_s)
     done = replace(offload, total=offload.total + offload.step, n_moves=offload.n_moves + 1)
-    _end(context, replace(done, still_ns_utc=still_ns), OffloadState.MOVED, "")
+    void_until(context, still_ns, MOVING)
+    _end(context, done, OffloadState.MOVED, "")
     validity.shift_estimate(context, offload.step, spread, still_ns)
     context.log("offload.moved", f"{offload.id}: α is expected {step_text(offload.step)} away")
 
@@ -118,8 +121,9 @@ def on_failure(context: StepContext, name: str, text: str) -> None:
     offload, limits = context.alpha.offload, context.policy.offloading
     if offload is None or limits is None or offload.id != name:
         return
-    still_ns = max(offload.still_ns_utc, _clock_ns(context, limits.settle_s))
-    _end(context, replace(offload, still_ns_utc=still_ns), OffloadState.FAILED, text)
+    still_ns = max(end_of(context.state, MOVING), _clock_ns(context, limits.settle_s))
+    void_until(context, still_ns, MOVING)
+    _end(context, offload, OffloadState.FAILED, text)
     spread = np.abs(offload.step) + _cross_talk(offload.step, limits)
     validity.shift_estimate(context, np.zeros(4), spread, still_ns)
     context.warn("offload.failed", f"{offload.id}: {text}; whether it was made must be measured")

@@ -45,6 +45,32 @@ class Validity(StrEnum):
     """α may be somewhere else: nothing is made or published from it by itself."""
 
 
+class Purpose(StrEnum):
+    """What telemetry may be void for."""
+
+    MEASURE = "measure"
+    """As a measurement of α, in a dithered window or without one."""
+
+    PASSIVE = "passive"
+    """As a passive estimate: it is of two places at once."""
+
+    SETTLE = "settle"
+    """To settle a doubt about α: it was taken before what cast the doubt."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VoidInterval:
+    """Telemetry that began before a time is void."""
+
+    until_ns_utc: int
+    """That time, by the RTC's clock."""
+
+    because: str
+    """What was the matter."""
+
+    purpose: Purpose = Purpose.MEASURE
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidityState:
     """Whether α may be relied on, why, and until when."""
@@ -180,10 +206,6 @@ class Registration:
     biases: tuple[PassiveBias, ...] = ()
     """Of the passive estimates that have told anything, in the order of the filter."""
 
-    passive_after_ns_utc: int = 0
-    """End of the window in which α jumped, the RTC's clock: only a passive estimate that began
-    after it is of the new place."""
-
     pointing: Pointing | None = None
     """Of the telescope at ``t_ns_utc``; None: not known."""
 
@@ -204,10 +226,6 @@ class Registration:
 
     doubt_voids: bool = True
     """Whether α is invalid for that: a look at ordinary telemetry alone only asks for a window."""
-
-    doubted_ns_utc: int = 0
-    """End of the telemetry that cast the doubt, the RTC's clock: a window that began before it
-    cannot end it."""
 
     validity: ValidityState = ValidityState()
     """How much it is worth now."""
@@ -313,10 +331,6 @@ class Offload:
     asked_ns_utc: int
     n_moves: int = 0
     """Demands that were carried out."""
-
-    still_ns_utc: int = 0
-    """When the image stands still, by the RTC's clock: telemetry that began earlier measures
-    nothing; 0: it did not move, or nobody tells."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,7 +19,8 @@ from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import prune
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import age, restore
+from service.tracking.validity import age, forget, restore
+from service.tracking.void_intervals import restore_intervals
 
 CLOCKS_AGREE_S = 60.0
 """A state from further in the future than this was saved under another clock."""
@@ -145,6 +146,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
         acquisition=acquisition,
         orders=None if orders == Orders() else orders,
         offload=state.alpha.offload,
+        void_intervals=state.alpha.void_intervals,
         mode_proof=None if registration is None else mode_proof.proof_to_keep(state),
     )
 
@@ -171,6 +173,8 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
         stopped = saved.orders.stopped
         context.operator = replace(context.operator, stopped_because=stopped)
         take_over(context, saved.orders)
+    if saved.system == state.system:
+        restore_intervals(context, saved.void_intervals)
     _take_over_alpha(context, saved, now_ns)
     if saved.offload is not None and saved.system == state.system:
         offload.go_on(context, saved.offload)
@@ -183,6 +187,7 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"
         context.warn("registration.not-restored", text)
+        forget(context)
         return
     if saved.acquisition is not None:
         inherit(context, saved.acquisition)

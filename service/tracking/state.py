@@ -18,7 +18,13 @@ from service.tracking.products import (
     Probation,
     ReconstructorRecord,
 )
-from service.tracking.registration import HistoryEntry, Offload, PassiveState, Registration
+from service.tracking.registration import (
+    HistoryEntry,
+    Offload,
+    PassiveState,
+    Registration,
+    VoidInterval,
+)
 from service.wire import Pointing, Status
 
 
@@ -131,11 +137,8 @@ class AlphaState:
     passive_unavailable_reason: str = ""
     """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
 
-    void_before_ns_utc: int = 0
-    """Telemetry that began before this time of the RTC's clock measures nothing."""
-
-    void_because: str = ""
-    """What was the matter with it."""
+    void_intervals: tuple[VoidInterval, ...] = ()
+    """Which telemetry is void, for what and why: in the order in which that was found, bounded."""
 
     dither_due_since_ns_utc: int | None = None
     """Since when a dithered window is wanted before anything else is believed; None: it is not."""
@@ -422,6 +425,9 @@ class Saved:
 
     offload: Offload | None = None
     """The last demand to move the mirror's image, with all before it; None: there was none."""
+
+    void_intervals: tuple[VoidInterval, ...] = ()
+    """Which telemetry is void, for what and why."""
 
     mode_proof: ModeProof | None = None
     """Which modes have shown how they answer, in ``session``; None: none has."""

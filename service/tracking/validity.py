@@ -1,31 +1,21 @@
-"""What is known of α, when telemetry was taken that can tell of it, and how long it is valid.
-
-A window is fitted seconds after it was taken, by a busy worker later still. What casts a doubt, or
-says that nothing the loop does is a measurement, has a time by the RTC's clock; what was taken
-before that time ends neither, whenever it is worked out.
-"""
+"""What is known of α, and how long it is valid."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
-from service.tracking.alarms import STALE, Interlock, alarm_blocks
+from service.tracking.alarms import STALE
 from service.tracking.loop import separation_deg
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Registration, Validity, ValidityState
+from service.tracking.registration import Purpose, Registration, Validity, ValidityState
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.void_intervals import MOVING, make_valid, void_until
 from service.wire import Pointing
-
-CLOCK_SET_BACK_S = 60.0
-"""Telemetry is never so much older than what is known: the RTC's clock has gone back."""
-
-_ROUNDING_NS = 1_000_000
-"""A window that follows another begins where that one ends, but for the rounding of a frame."""
 
 _POINTINGS_KEPT = 120
 _TURNED_DEG = 0.05
@@ -50,71 +40,9 @@ FIRST_WINDOWS_S = 10.0
 SUSPECTED_FOR_S = 60.0
 """A jump that nothing has confirmed or denied for so long is no longer waited for."""
 
-MOVING = "the mirror's image was being moved"
-
 _WORTHLESS = (Validity.STALE, Validity.INVALID)
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TelemetrySpan:
-    """A stretch of telemetry, by the RTC's clock."""
-
-    began_ns_utc: int
-    ended_ns_utc: int
-
-
-def telemetry_span(began_ns_utc: int, ended_ns_utc: int) -> TelemetrySpan:
-    """Return the stretch that ended then; 0: nobody says when it began, it is taken for short."""
-    return TelemetrySpan(began_ns_utc=began_ns_utc or ended_ns_utc, ended_ns_utc=ended_ns_utc)
-
-
-def precedes(state: TrackerState, when: TelemetrySpan, since_ns_utc: int) -> bool:
-    """Return whether telemetry began before a time, and so cannot tell of what is since then."""
-    if (
-        state.loop.rtc is not None
-        and since_ns_utc - state.loop.rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS
-    ):
-        return False
-    return when.began_ns_utc < since_ns_utc - _ROUNDING_NS
-
-
-def why_telemetry_invalid(state: TrackerState, when: TelemetrySpan) -> str | None:
-    """Return why telemetry taken then measures nothing, whatever is the matter now; None: it may.
-
-    What is the matter now is asked of the alarms.
-    """
-    voids = [(state.alpha.void_before_ns_utc, state.alpha.void_because)]
-    if state.alpha.offload is not None:
-        voids.append((state.alpha.offload.still_ns_utc, MOVING))
-    because = next((why for before_ns, why in voids if precedes(state, when, before_ns)), None)
-    if because is None:
-        return None
-    return f"{because} when it was taken: its telemetry is no measurement"
-
-
-def invalidate_telemetry(context: StepContext, because: str, t_ns_utc: int = 0) -> None:
-    """Note that nothing taken until now is a measurement any more.
-
-    ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
-    """
-    before_ns = max(t_ns_utc, 0 if context.rtc is None else context.rtc.t_ns)
-    context.alpha = replace(context.alpha, void_before_ns_utc=before_ns, void_because=because)
-
-
-def end_alarm(context: StepContext, name: str, t_ns_utc: int = 0) -> None:
-    """End an alarm; telemetry that it was of stays what it was."""
-    alarm = context.state.alarm(name)
-    context.clear_alarm(name)
-    if alarm is not None and alarm_blocks(alarm, Interlock.MEASURE):
-        invalidate_telemetry(context, alarm.definition.because, t_ns_utc)
-
-
-def tells_of(state: TrackerState, name: str, when: TelemetrySpan) -> bool:
-    """Return whether telemetry was taken since this alarm was raised, or there is no such alarm."""
-    alarm = state.alarm(name)
-    return alarm is None or not precedes(state, when, alarm.t_ns_utc)
 
 
 def point(context: StepContext, pointing: Pointing | None) -> None:
@@ -166,15 +94,17 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
             previous_estimate=None,
             suspected_jump=None,
             biases=registration.biases_anew,
-            passive_after_ns_utc=max(registration.passive_after_ns_utc, still_ns_utc),
         ),
     )
+    void_until(context, still_ns_utc, MOVING, Purpose.PASSIVE)
     want_window(context, MOVING)
     age(context)
 
 
 def forget(context: StepContext) -> None:
-    """Know nothing of α any more."""
+    """Know nothing of α any more, nor of what has been doubted of it."""
+    make_valid(context, Purpose.PASSIVE)
+    make_valid(context, Purpose.SETTLE)
     store_registration(context, None)
 
 

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import kalman
-from service.estimation.estimate import BiasBlock, PassiveEstimate
+from service.estimation.estimate import PassiveEstimate
 from service.estimation.kalman import Joint
 from service.estimation.loop import loop_numbers, same_numbers
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind
 from service.model.misregistration import Misregistration, step_text
-from service.tracking import alarms, filtering, jumps, refusals, validity
+from service.tracking import alarms, filtering, jumps, refusals, validity, void_intervals
 from service.tracking import events as ev
 from service.tracking.dither import found_again
 from service.tracking.dither_plan import why_none as why_no_dither
@@ -35,6 +35,7 @@ from service.tracking.registration import (
     PassiveState,
     PointedEstimate,
     PreviousEstimate,
+    Purpose,
     Registration,
     Source,
     SuspectedJump,
@@ -42,30 +43,26 @@ from service.tracking.registration import (
 )
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import StepContext
+from service.tracking.void_intervals import BEFORE_DOUBT, BOTH_SIDES, TelemetrySpan
 
 Array = NDArray[Any]
-
-TOO_EARLY = (
-    "it began before α came into doubt and agrees with what was known then: only one taken since "
-    "can tell"
-)
 
 
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
-    when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+    when = void_intervals.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
     why = filtering.why_no_window(context, estimate, when)
     if why is not None:
         kind, reason = why
         reject_window(context, reason, kind)
         return
     refusals.use(context)
-    if validity.tells_of(context.state, alarms.DITHER_LOST, when):
+    if void_intervals.tells_of(context.state, alarms.DITHER_LOST, when):
         found_again(context)
     random = isinstance(estimate, RandomEstimate)
     for name in (alarms.MISALIGNED, *(() if random else (alarms.WRONG_ANSWER,))):
-        if validity.tells_of(context.state, name, when):
+        if void_intervals.tells_of(context.state, name, when):
             context.clear_alarm(name)
     registration = context.registration
     modes, gains, gain_sigma = filtering.gains_of(estimate)
@@ -128,13 +125,10 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             _suspect_jump(context, registration, measured, both, first)
         return
     far = jumps.window_innovation(registration, measured, context.policy)
-    if (
-        registration.doubt
-        and not far.is_outlier
-        and validity.precedes(context.state, measured.when, registration.doubted_ns_utc)
-    ):
+    too_early = void_intervals.why_void(context.state, measured.when, Purpose.SETTLE)
+    if too_early is not None and not far.is_outlier:
         refusals.count(context)
-        _note_refusal(context, TOO_EARLY)
+        _note_refusal(context, too_early)
         return
     if registration.suspected_jump is not None:
         text = (
@@ -189,8 +183,9 @@ def _suspect_jump(
     )
     doubt = "a jump is suspected"
     validity.store_registration(
-        context, replace(_doubted(registration, doubt, measured.t_ns_utc), suspected_jump=candidate)
+        context, replace(registration, doubt=doubt, doubt_voids=True, suspected_jump=candidate)
     )
+    _cast_doubt(context, measured.t_ns_utc)
     filtering.remember(
         context, filtering.entry_of(measured, registration, innovation, entered=False)
     )
@@ -224,7 +219,8 @@ def _jump(
         scatter=registration.scatter,
         jumped=True,
     )
-    validity.store_registration(context, replace(registration, passive_after_ns_utc=first.t_ns_utc))
+    validity.store_registration(context, registration)
+    void_intervals.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
     both = whole and registration.suspected_jump is not None
     filtering.accept(context, update, measured, n_accepted=2 if both else 1)
     context.warn(
@@ -232,10 +228,10 @@ def _jump(
     )
 
 
-def _doubted(registration: Registration, doubt: str, since_ns_utc: int) -> Registration:
-    """Return what is known in doubt, not since earlier than it already is."""
-    since_ns = max(registration.doubted_ns_utc if registration.doubt else 0, since_ns_utc)
-    return replace(registration, doubt=doubt, doubted_ns_utc=since_ns, doubt_voids=True)
+def _cast_doubt(context: StepContext, since_ns_utc: int) -> None:
+    """Let no window settle the doubt that began before what has cast it, or has done so before."""
+    until_ns = max(void_intervals.end_of(context.state, BEFORE_DOUBT), since_ns_utc)
+    void_intervals.void_until(context, until_ns, BEFORE_DOUBT, Purpose.SETTLE)
 
 
 def _innovation(prior: Joint, measured: WindowEstimate) -> float:
@@ -260,11 +256,12 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     registration = _expecting(registration, estimate)
     forward = filtering.brought_forward(context, registration, event.t_ns_utc)
     prior = kalman.allowing(forward, block, estimate.bias_excess)
-    if _mixed(registration, block):
-        text = "not used: its telemetry may be from both sides of a jump"
+    mixed = _why_of_two_places(context.state, registration, event)
+    if mixed is not None:
         looked = _looked(context.state, registration, filtering.joint_of(registration), event)
         validity.store_registration(context, replace(registration, biases=looked))
-        _show(context, event, _passive_sigma(estimate, prior), prior.bias(block), text)
+        sigma = _passive_sigma(estimate, prior)
+        _show(context, event, sigma, prior.bias(block), f"not used: {mixed}")
         return
     measured = estimate.alpha.vector
     window = PointedEstimate(
@@ -323,7 +320,7 @@ def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str |
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
     return filtering.why_no_measurement(
-        state, validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
+        state, void_intervals.telemetry_span(event.began_ns_utc, event.t_ns_utc)
     )
 
 
@@ -332,10 +329,10 @@ def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | No
     registration = state.alpha.registration
     if registration is None or not registration.window_began_ns_utc:
         return None
-    since = validity.telemetry_span(
+    since = void_intervals.telemetry_span(
         registration.window_began_ns_utc, registration.window_began_ns_utc
     )
-    if validity.precedes(state, since, event.t_ns_utc):
+    if void_intervals.precedes(state, since, event.t_ns_utc):
         return None
     return "a dithered window taken since has been fitted before it"
 
@@ -394,17 +391,19 @@ def _loop(
     return () if bias is None else bias.loop
 
 
-def _mixed(registration: Registration, block: BiasBlock) -> bool:
-    """Return whether a look may be at telemetry from before a jump and from after it.
+def _why_of_two_places(
+    state: TrackerState, registration: Registration, event: ev.PassiveFitted
+) -> str | None:
+    """Return why a passive estimate may be of telemetry from before a jump and after it, or None.
 
     It began no earlier than the one before it ended.
     """
-    bias = registration.bias(block)
-    began_ns_utc = 0 if bias is None else bias.looked_ns_utc
-    jumped_ns_utc = registration.passive_after_ns_utc
-    return registration.suspected_jump is not None or (
-        jumped_ns_utc > 0 and began_ns_utc < jumped_ns_utc
-    )
+    if registration.suspected_jump is not None:
+        return BOTH_SIDES
+    bias = registration.bias(event.estimate.bias)
+    began_ns = 0 if bias is None else bias.looked_ns_utc
+    span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
+    return void_intervals.why_void(state, span, Purpose.PASSIVE)
 
 
 def _ask_for_window(
@@ -429,8 +428,9 @@ def _ask_for_window(
     gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
     biases = _looked(context.state, registration, gone, event)
-    doubted = replace(_doubted(after, text, event.t_ns_utc), biases=biases, doubt_voids=void)
+    doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
     validity.store_registration(context, doubted)
+    _cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     validity.want_window(context, text)
     if why_none is not None or waits:

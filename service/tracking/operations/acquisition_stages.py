@@ -19,7 +19,7 @@ from service.control.dither import (
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import validity
+from service.tracking import validity, void_intervals
 from service.tracking.acquisition_state import Acquisition, AcquisitionStage, LoopFound
 from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import ask_for, ask_to_stop, make_way
@@ -179,7 +179,7 @@ def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> No
             cause=context.cause,
         ),
     )
-    validity.invalidate_telemetry(context, "the acquisition had not begun")
+    void_intervals.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget(context)
     forget_verdict(context)
 
@@ -288,7 +288,7 @@ def restart(context: StepContext, reason: str, *, slipped: bool = False) -> None
         most = half_of(acquisition.n_modes)
         limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    validity.invalidate_telemetry(context, "the acquisition had not begun anew")
+    void_intervals.invalidate_telemetry(context, "the acquisition had not begun anew")
     make_way(context)
     validity.forget(context)
     go_on(
@@ -363,8 +363,8 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
     if (
-        validity.why_telemetry_invalid(
-            context.state, validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+        void_intervals.why_void(
+            context.state, void_intervals.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
         )
         is not None
     ):

@@ -14,9 +14,10 @@ from service.runtime.archiving import is_urgent
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.policy import Offloading
-from service.tracking.registration import OffloadState, Validity
+from service.tracking.registration import OffloadState, Purpose, Validity
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode
+from service.tracking.void_intervals import MOVING, end_of
 from service.wire import OffloadRequest, Reply
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, rtc
@@ -220,9 +221,27 @@ def test_a_file_from_before_the_end_of_a_move_was_saved_is_read(tmp_path):
     file = TrackingFile(tmp_path / "tracking.json")
     file.write(saved_of(story.state, story.now_ns))
     values = json.loads((tmp_path / "tracking.json").read_text())
-    del values["offload"]["still_ns_utc"]
+    del values["void_intervals"]
     (tmp_path / "tracking.json").write_text(json.dumps(values))
-    assert file.read().offload.still_ns_utc == 0
+    assert file.read().void_intervals == ()
+
+
+def test_a_file_that_kept_the_end_of_a_move_with_it_is_read(tmp_path):
+    story = a_story()
+    answer(story)
+    file = TrackingFile(tmp_path / "tracking.json")
+    file.write(saved_of(story.state, story.now_ns))
+    values = json.loads((tmp_path / "tracking.json").read_text())
+    still_ns = values["void_intervals"][0]["until_ns_utc"]
+    del values["void_intervals"]
+    values["offload"]["still_ns_utc"] = still_ns
+    values["registration"] |= {"passive_after_ns_utc": 7, "doubted_ns_utc": 8, "doubt": "a jump"}
+    (tmp_path / "tracking.json").write_text(json.dumps(values))
+    assert {(void.purpose, void.until_ns_utc) for void in file.read().void_intervals} == {
+        (Purpose.MEASURE, still_ns),
+        (Purpose.PASSIVE, 7),
+        (Purpose.SETTLE, 8),
+    }
 
 
 def test_what_else_happens_meanwhile_does_not_make_the_image_stand_still():
@@ -258,6 +277,4 @@ def test_the_reply_may_say_from_which_frame_on_the_image_stands_still():
     story.meet(seq=10_000)
     now_ns = story.state.loop.rtc.t_ns
     answer(story, start_seq=17_000)
-    assert story.state.alpha.offload.still_ns_utc == pytest.approx(
-        now_ns + 8 * SECOND, abs=SECOND / 10
-    )
+    assert end_of(story.state, MOVING) == pytest.approx(now_ns + 8 * SECOND, abs=SECOND / 10)

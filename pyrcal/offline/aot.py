@@ -20,6 +20,7 @@ from service.files.recording import RecordedKind, Recording
 from service.model.instrument import Instrument, Mirror
 from service.model.misregistration import Misregistration, rotation
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures
+from service.model.sensors.registry import kind_of
 from service.model.slopes import to_conventions
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry
@@ -152,10 +153,11 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, .
     valid = valid_subapertures(instrument)
     places = np.full(valid.shape, -1, dtype=np.int32)
     places[valid] = np.arange(valid.sum())
-    sensor = aotpy.Pyramid(
+    aot_class, own = kind_of(instrument).aot
+    sensor = getattr(aotpy, aot_class)(
+        **own,
         uid="sensor",
         source=source,
-        n_sides=4,
         dimensions=instrument.slopes.kind.n_planes,
         n_valid_subapertures=int(valid.sum()),
         subaperture_mask=aotpy.Image("subaperture mask", places),

@@ -33,13 +33,14 @@ class BasisKind(StrEnum):
 
 
 class SignalKind(StrEnum):
-    """Kinds of signals that an RTC makes of the four pupil images."""
+    """Kinds of signals of a subaperture; each kind of sensor says which it has."""
 
     XY = "xy"
     """Two slopes for each subaperture."""
 
     INTENSITY = "intensity"
-    """The four pixels of each subaperture, normalised, those of a flat wavefront subtracted."""
+    """Four pixels of each subaperture of a pyramid, normalised, those of a flat wavefront
+    subtracted."""
 
     @property
     def n_planes(self) -> int:

@@ -4,6 +4,10 @@ An RTC has its own order of components, its own corner of the detector where row
 and its own idea of which half of the light counts as positive. All of it is one permutation of the
 signal vector with one sign per element, so nothing is interpolated and the inverse is exact. Of
 pixels it is a permutation only: a sign of theirs says which images are at which side.
+
+Of any sensor: planes over the valid subapertures, their order in the list, and how the grid lies.
+Of each kind of signal, and so of the sensors that have it: which planes there are, what they become
+when the grid is turned or a sign is, and the orders that only they can have.
 """
 
 from __future__ import annotations

@@ -61,6 +61,9 @@ class SensorKind(ABC):
     signals: ClassVar[tuple[SignalKind, ...]]
     """What its subapertures give."""
 
+    aot: ClassVar[tuple[str, Mapping[str, Any]]]
+    """Class of AOT files that it is, and the fields that only this class has."""
+
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return ``[wfs]`` as it is to be held against the table.
 

@@ -67,7 +67,9 @@ def pyramid_in(instrument: Instrument) -> Pyramid:
         If its sensor is another.
     """
     if not isinstance(instrument.wfs, Pyramid):
-        raise ModelError(f"{instrument.name}: found a {instrument.wfs.kind}, expected a pyramid")
+        raise ModelError(
+            f"{instrument.name}: found wfs.kind = {instrument.wfs.kind}, expected pyramid"
+        )
     return instrument.wfs
 
 

@@ -37,6 +37,7 @@ class PyramidKind(SensorKind):
         "modulation_lambda_over_d": 3.0,
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
+    aot: ClassVar[tuple[str, Mapping[str, Any]]] = ("Pyramid", {"n_sides": 4})
 
     @override
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -81,10 +81,13 @@ class PyramidSensor:
         n_points, side = int(optics.pupil.lit.sum()), len(optics.pupil.coordinates)
         local = optics.recipe.normalisation is Normalisation.LOCAL
         gradients = rows + (n_valid if local else int(self.valid.any(axis=1).sum()))
+        n_lines = 2 * optics.wfs.n_subapertures * optics.n_nodes
+        fields = 4.0 * optics.n_pairs * n_lines * (n_lines + side)
         of_source = 8.0 * optics.n_pairs * optics.n_nodes * side
         folded = of_source * (side * gradients + 8.0 * optics.n_nodes * n_valid)
+        itemsize = np.dtype(optics.dtype).itemsize
         return Work(
-            memory_bytes=2.0 * gradients * n_points * np.dtype(optics.dtype).itemsize,
+            memory_bytes=itemsize * (fields + 2.0 * gradients * n_points),
             flop=folded + 2.0 * gradients * n_points * n_shapes,
         )
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from service.control.loop import ControlLoop, loop_modes
 from service.model.instrument import Instrument
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -230,12 +231,8 @@ READ_NOISE_ELECTRONS = 4.0
 def noise_of_star(
     instrument: Instrument, *, magnitude: float, frame_rate_hz: float, n_valid: int
 ) -> float:
-    """Return 1 σ of a slope of a star whose light falls evenly on the valid subapertures.
-
-    A slope is a difference of four pixels over the mean flux of a subaperture: its variance is that
-    of the four pixels, x and y alike.
-    """
+    """Return 1 σ of a slope of a star whose light falls evenly on the valid subapertures."""
     area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
     flux = ZERO_POINT_PHOTONS * 10 ** (-0.4 * magnitude) * area_m2
     own = flux * THROUGHPUT / frame_rate_hz / n_valid
-    return float(np.sqrt(own + 4 * READ_NOISE_ELECTRONS**2) / own)
+    return kind_of(instrument).slope_noise(own, READ_NOISE_ELECTRONS)

@@ -61,6 +61,9 @@ class SensorKind(ABC):
     signals: ClassVar[tuple[SignalKind, ...]]
     """What its subapertures give."""
 
+    edge_slips: ClassVar[bool] = False
+    """Whether it can take the mirror's edge for one a fringe away, and hold it there."""
+
     aot: ClassVar[tuple[str, Mapping[str, Any]]]
     """Class of AOT files that it is, and the fields that only this class has."""
 
@@ -123,6 +126,10 @@ class SensorKind(ABC):
             If it cannot be binned.
         """
         raise ModelError(f"a {self.name}: found binning {binning}, expected none")
+
+    @abstractmethod
+    def slope_noise(self, electrons: float, read_noise: float) -> float:
+        """Return 1 σ of a slope of a subaperture with so many electrons, read with this noise."""
 
     @abstractmethod
     def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:

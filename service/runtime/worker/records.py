@@ -20,6 +20,7 @@ from service.model.interaction import RtcInteractionModel
 from service.model.kinds import Influence
 from service.model.misregistration import Determination
 from service.model.modes import ModalBasis
+from service.model.sensors.registry import kind_of
 
 _Job = TypeVar("_Job", bound=Callable[..., Any])
 
@@ -117,9 +118,10 @@ def actuators_of(model: RtcInteractionModel) -> Actuators | None:
 
 
 def outer_of(model: RtcInteractionModel) -> NDArray[np.float64] | None:
-    """Return the outermost ring as a ``ControlLoop`` has it; None: strokes are no metres."""
+    """Return the outermost ring as a ``ControlLoop`` has it; None: no metres, or it cannot slip."""
     actuators, mirror = actuators_of(model), model.instrument.mirror
-    if actuators is None or not isinstance(mirror, Mirror):
+    can_slip = kind_of(model.instrument).edge_slips
+    if actuators is None or not isinstance(mirror, Mirror) or not can_slip:
         return None
     if mirror.shape.influence is not Influence.THIN_PLATE or not mirror.stroke_known:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -37,6 +38,7 @@ class PyramidKind(SensorKind):
         "modulation_lambda_over_d": 3.0,
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
+    edge_slips = True
     aot: ClassVar[tuple[str, Mapping[str, Any]]] = ("Pyramid", {"n_sides": 4})
 
     @override
@@ -103,6 +105,11 @@ class PyramidKind(SensorKind):
             pupil_separation_subap=sensor.image_separation_subap / binning,
             pupil_diameter_subap=sensor.pupil_diameter / binning,
         )
+
+    @override
+    def slope_noise(self, electrons: float, read_noise: float) -> float:
+        # a difference of four pixels over the mean flux: their variances add up, in x and y alike
+        return math.sqrt(electrons + 4 * read_noise**2) / electrons
 
     @override
     def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:

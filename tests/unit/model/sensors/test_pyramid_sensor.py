@@ -131,7 +131,7 @@ class Plain(SensorKind):
     """A kind that has only what it must."""
 
     name = "plain"
-    described = sensor = pixels = None
+    described = sensor = pixels = slope_noise = None
 
 
 def test_a_kind_without_light_frames_or_working_point_says_so():
@@ -140,6 +140,7 @@ def test_a_kind_without_light_frames_or_working_point_says_so():
     assert isinstance(seen, CannotTell)
     assert seen.reason == "the light of a plain does not tell where the pupil lies"
     assert plain.working_point(instrument, n_controlled=10, sampling=2) is None
+    assert not plain.edge_slips
     assert plain.fitted_key(instrument.wfs) is None
     assert plain.frames(None, frozenset()) is None
     with pytest.raises(ModelError, match="expected signals of a plain"):

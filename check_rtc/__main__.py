@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 
 from pyrcal.offline.arguments import seconds
 from pyrcal.options import add, words
-from service.cli.arguments import OneLineParser
-from service.cli.program import imported_and_run, leave
+from service.cli.program import OneLineParser, imported_and_run, leave
 
 _EPILOG = """
 One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it

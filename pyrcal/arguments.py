@@ -12,8 +12,8 @@ from typing_extensions import override
 from pyrcal.client import remote
 from pyrcal.offline import arguments as offline_arguments
 from service import __version__
-from service.cli import arguments as service_arguments
-from service.cli.arguments import OneLineParser
+from service.cli import program
+from service.cli.program import OneLineParser
 
 OTHER_PROGRAMS = {
     "demo": ("studies.demo", "service and simulated telescope, end to end"),
@@ -38,7 +38,7 @@ def command_line() -> argparse.ArgumentParser:
         help="print what teaches a shell these words: source <(pyrcal --completion bash)",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    service_arguments.declare(commands)
+    program.declare(commands)
     remote.declare(commands)
     offline_arguments.declare(commands)
     for name, (_, purpose) in OTHER_PROGRAMS.items():

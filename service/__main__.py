@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from service.cli.arguments import OneLineParser, check_settings, declare
-from service.cli.program import run_command
+from service.cli.program import OneLineParser, check_settings, declare, run_command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

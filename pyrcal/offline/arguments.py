@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pyrcal.options import add, words
-from service.cli.arguments import check_settings, such, whole
+from service.cli.program import check_settings, such, whole
 from service.errors import ConfigurationError
 from service.files import kind_of, numbers_in, parse_alpha, parse_modes
 

@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
-from service.archive.nights import Nights
-from service.archive.notes import Annotations
+from service.archive.nights import Nights, TrendSample
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
 from service.archive.recordings import Recordings
 from service.archive.serialisation import TrackingFile
 from service.archive.store import Store
-from service.archive.trends import Trends, TrendSample
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -57,12 +55,8 @@ class Archive:
         )
         self.tracking = TrackingFile(directory / "tracking.json")
         """What is known of the registration, for the service after this one."""
-        self.nights = Nights(self.index.asked, noon_utc_h)
-        """Every estimate of α, and what happened beside it."""
-        self.trends = Trends(self.index.asked)
-        """What was known at every moment, a sample every few seconds."""
-        self.annotations = Annotations(self.index.asked, self.index.add_row)
-        """What operators have noted about a moment."""
+        self.nights = Nights(self.index.asked, self.index.add_row, noon_utc_h)
+        """How the nights went: estimates of α, what happened beside them, trends, notes."""
         self._lock: IO[str] | None = None
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""

@@ -12,10 +12,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
-from service.archive import nights, notes, trends
-from service.archive.nights import Values
+from service.archive import nights
+from service.archive.nights import TrendSample, Values
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
-from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError, shown
 from service.tracking.products import MeasurementRecord, ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -56,8 +55,6 @@ CREATE TABLE IF NOT EXISTS audit (
 );
 CREATE INDEX IF NOT EXISTS audit_by_time ON audit (t_ns_utc);
 {nights.SCHEMA}
-{trends.SCHEMA}
-{notes.SCHEMA}
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_entries BEFORE DELETE ON audit
     BEGIN SELECT RAISE(ABORT, 'the audit trail only grows'); END;
 CREATE TRIGGER IF NOT EXISTS audit_keeps_its_words BEFORE UPDATE ON audit
@@ -281,8 +278,8 @@ class Index:
                 f"INSERT INTO audit ({_COLUMNS}) VALUES ({', '.join('?' * _N_COLUMNS)})",
                 [tuple(map(_storable, astuple(entry)[:_N_COLUMNS])) for entry in entries],
             )
-            connection.executemany(nights.INSERT, nights.rows_of(estimates))
-            connection.executemany(trends.INSERT, trends.rows_of(samples))
+            connection.executemany(nights.INSERT_ESTIMATE, nights.rows_of_estimates(estimates))
+            connection.executemany(nights.INSERT_SAMPLE, nights.rows_of_samples(samples))
             connection.execute("COMMIT")
 
     def add_row(self, insertion: str, values: tuple[str | int, ...]) -> int:

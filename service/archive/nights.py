@@ -1,11 +1,11 @@
-"""Every estimate of α over the nights, and the events beside it."""
+"""Every estimate of α over the nights, the events beside it, a sample of the state, notes."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
@@ -26,6 +26,56 @@ _FILTERED = tuple(f"filtered_{parameter}" for parameter in PARAMETERS)
 _NUMBERS = ("innovation", "misfit", *(f"{four}_{name}" for four in _FOURS for name in PARAMETERS))
 _COLUMNS = ", ".join(("t_ns_utc", "source", "entered", "in_use", *_NUMBERS))
 
+TREND_S = 15.0
+"""From one sample to the next, seconds: 1 MB a day."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrendSample:
+    """The service's state at one moment; without a sample no service ran."""
+
+    t_ns_utc: int
+    """When, the service's clock."""
+
+    telemetry_ns_utc: int | None = None
+    """End of the telemetry that had come since the sample before, the RTC's clock; None: none."""
+
+    alpha: Misregistration | None = None
+    """The registration as it was known; None: it was not."""
+
+    sigma: NDArray[np.float64] | None = None
+    """``(4,)`` 1 σ of it then, grown since the last measurement, numeric units."""
+
+    wavefront_m: float | None = None
+    """Wavefront error with the reconstructor in use, by the linear model, metres RMS."""
+
+    residual_m: float | None = None
+    """What the reconstructor in use reads in the residual slopes, all its modes together, metres
+    RMS: turbulence left over and noise, optical gain not undone."""
+
+    margin: float | None = None
+    """Largest closed-loop pole radius within α ± 3 σ over its bound: beyond 1 nothing is sent."""
+
+    optical_gain: float | None = None
+    """Mean over the modes of which it was measured."""
+
+    n_controlled: int | None = None
+    """Modes that the RTC controls."""
+
+    magnitude: float | None = None
+    """Of the guide star, as the RTC tells."""
+
+    flux: float | None = None
+    """Mean of the flux map, in the RTC's unit."""
+
+    elevation_deg: float | None = None
+    azimuth_deg: float | None = None
+
+
+_PLAIN = tuple(field.name for field in fields(TrendSample) if field.name not in {"alpha", "sigma"})
+_OF_SAMPLE = (*_PLAIN, *(f"{four}_{name}" for four in ("alpha", "sigma") for name in PARAMETERS))
+_INTEGERS = ("t_ns_utc", "telemetry_ns_utc", "n_controlled")
+
 SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS estimate (
     t_ns_utc INTEGER NOT NULL, source TEXT NOT NULL, entered INTEGER NOT NULL, in_use TEXT,
@@ -33,10 +83,24 @@ CREATE TABLE IF NOT EXISTS estimate (
 );
 CREATE INDEX IF NOT EXISTS estimate_by_time ON estimate (t_ns_utc);
 CREATE INDEX IF NOT EXISTS audit_by_name ON audit (name, t_ns_utc);
+CREATE TABLE IF NOT EXISTS trend (
+    {", ".join(f"{name} {'INTEGER' if name in _INTEGERS else 'REAL'}" for name in _OF_SAMPLE)}
+);
+CREATE INDEX IF NOT EXISTS trend_by_time ON trend (t_ns_utc);
+CREATE TABLE IF NOT EXISTS annotation (
+    t_ns_utc INTEGER NOT NULL, written_ns_utc INTEGER NOT NULL,
+    who TEXT NOT NULL, note TEXT NOT NULL
+);
+CREATE INDEX IF NOT EXISTS annotation_by_time ON annotation (t_ns_utc);
 """
-"""Columns are the fields of a line of history, in the units of their names."""
+"""Columns are the fields of a line of history, a sample, a note, in the units of their names."""
 
-INSERT = f"INSERT INTO estimate ({_COLUMNS}) VALUES ({', '.join('?' * (4 + len(_NUMBERS)))})"
+INSERT_ESTIMATE = (
+    f"INSERT INTO estimate ({_COLUMNS}) VALUES ({', '.join('?' * (4 + len(_NUMBERS)))})"
+)
+INSERT_SAMPLE = (
+    f"INSERT INTO trend ({', '.join(_OF_SAMPLE)}) VALUES ({', '.join('?' * len(_OF_SAMPLE))})"
+)
 
 HOUR_NS = 3_600_000_000_000
 DAY_NS = 24 * HOUR_NS
@@ -79,6 +143,7 @@ _KINDS = {
     **dict.fromkeys(ALARMS, MarkKind.ALARM),
 }
 _NOTE = "note by "
+_OF_NOTE = "t_ns_utc, written_ns_utc, who, note"
 _OF_KINDS = f"who = 'service' AND name IN ({', '.join(map(repr, _KINDS))})"
 
 
@@ -116,8 +181,24 @@ class Night:
     n_alarms: int = 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Annotation:
+    """An operator's note."""
+
+    t_ns_utc: int
+    """Of what time it is."""
+
+    written_ns_utc: int
+    """When it was written."""
+
+    who: str
+    note: str
+    id: int = 0
+    """From 1 on, growing; 0: not kept yet."""
+
+
 class Nights:
-    """Reads what the nights have left; never waits for a writer, nor has one wait.
+    """Reads what the nights have left, and takes notes; a reader never waits for a writer.
 
     A question that the disk does not answer raises StorageError.
 
@@ -125,12 +206,20 @@ class Nights:
     ----------
     asked
         Returns the rows that a question to the index finds.
+    add
+        Carries out an insertion; returns the id of the row.
     noon_utc_h
         UTC hour of local noon, where one night ends and the next begins.
     """
 
-    def __init__(self, asked: Callable[[str, Values], list[Any]], noon_utc_h: int = 12) -> None:
+    def __init__(
+        self,
+        asked: Callable[[str, Values], list[Any]],
+        add: Callable[[str, tuple[str | int, ...]], int],
+        noon_utc_h: int = 12,
+    ) -> None:
         self._asked = asked
+        self._add = add
         self._noon_ns = noon_utc_h * HOUR_NS
 
     def estimates(
@@ -227,6 +316,52 @@ class Nights:
             for day in sorted({*spans, *(day for day, _ in counts)})
         )
 
+    def samples(self, first_ns: int, last_ns: int, n_most: int) -> tuple[TrendSample, ...]:
+        """Return at most so many samples of a time, oldest first.
+
+        Of more, the last one and the one of the largest residual in equal parts of the time.
+        """
+        within = "WHERE t_ns_utc BETWEEN :first AND :last"
+        times = {"first": first_ns, "last": last_ns}
+        ((begin_ns, end_ns, n_there),) = self._asked(
+            f"SELECT min(t_ns_utc), max(t_ns_utc), count(*) FROM trend {within}", times
+        )
+        if n_there > n_most:
+            part = f"FROM trend {within} GROUP BY (t_ns_utc - :begin) / :width"
+            within = (
+                f"WHERE rowid IN (SELECT id FROM (SELECT rowid AS id, max(t_ns_utc) {part})"
+                f" UNION SELECT id FROM (SELECT rowid AS id, max(residual_m) {part}))"
+            )
+            width = (end_ns - begin_ns) // (n_most // 2) + 1
+            times |= {"begin": begin_ns, "width": width}
+        rows = self._asked(
+            f"SELECT {', '.join(_OF_SAMPLE)} FROM trend {within} ORDER BY t_ns_utc", times
+        )
+        return tuple(map(_sample, rows))
+
+    def add_note(self, made: Annotation) -> int:
+        """Keep a note, on the disk when it returns; return its id.
+
+        Raises
+        ------
+        StorageError
+            If the disk refuses.
+        """
+        question = f"INSERT INTO annotation ({_OF_NOTE}) VALUES (?, ?, ?, ?)"
+        return self._add(question, (made.t_ns_utc, made.written_ns_utc, made.who, made.note))
+
+    def notes(self, first_ns: int, last_ns: int, n_most: int) -> tuple[Annotation, ...]:
+        """Return the newest notes about a time, which has both ends; oldest first."""
+        rows = self._asked(
+            f"SELECT {_OF_NOTE}, rowid FROM annotation WHERE t_ns_utc BETWEEN ? AND ?"
+            " ORDER BY t_ns_utc DESC, rowid DESC LIMIT ?",
+            (first_ns, last_ns, n_most),
+        )
+        return tuple(
+            Annotation(t_ns_utc=t_ns, written_ns_utc=written_ns, who=who, note=note, id=number)
+            for t_ns, written_ns, who, note, number in reversed(rows)
+        )
+
     def _night(
         self, day: int, n_estimates: int, duration_s: float, counts: Counter[tuple[int, MarkKind]]
     ) -> Night:
@@ -243,8 +378,8 @@ class Nights:
         )
 
 
-def rows_of(entries: Iterable[HistoryEntry]) -> list[tuple[object, ...]]:
-    """Return the rows that :data:`INSERT` takes."""
+def rows_of_estimates(entries: Iterable[HistoryEntry]) -> list[tuple[object, ...]]:
+    """Return the rows that :data:`INSERT_ESTIMATE` takes."""
     return [
         (
             entry.t_ns_utc,
@@ -262,9 +397,21 @@ def rows_of(entries: Iterable[HistoryEntry]) -> list[tuple[object, ...]]:
     ]
 
 
-def _with_names(four: NDArray[np.float64]) -> list[float]:
-    found: list[float] = (four * BOUNDARY_SCALE).tolist()
-    return found
+def rows_of_samples(samples: Iterable[TrendSample]) -> list[tuple[object, ...]]:
+    """Return the rows that :data:`INSERT_SAMPLE` takes."""
+    return [
+        (
+            *(getattr(sample, name) for name in _PLAIN),
+            *_with_names(None if sample.alpha is None else sample.alpha.vector),
+            *_with_names(sample.sigma),
+        )
+        for sample in samples
+    ]
+
+
+def _with_names(four: NDArray[np.float64] | None) -> list[float | None]:
+    found: list[float | None] = [None] * len(PARAMETERS)
+    return found if four is None else (four * BOUNDARY_SCALE).tolist()
 
 
 def _entry(row: tuple[Any, ...]) -> HistoryEntry:
@@ -289,3 +436,11 @@ def _kind(name: str, text: str) -> MarkKind:
     if name.startswith(_NOTE):
         return MarkKind.NOTE
     return MarkKind.OVER if text == f"{name}: over" else _KINDS[name]
+
+
+def _sample(row: tuple[Any, ...]) -> TrendSample:
+    plain = dict(zip(_PLAIN, row[: len(_PLAIN)], strict=True))
+    if row[-1] is None:
+        return TrendSample(**plain)
+    alpha, sigma = np.array(row[len(_PLAIN) :], dtype=np.float64).reshape(2, 4) / BOUNDARY_SCALE
+    return TrendSample(**plain, alpha=Misregistration.from_vector(alpha), sigma=sigma)

@@ -19,19 +19,11 @@ from service.errors import CommandError, LinkError, UnknownIdError
 from service.estimation.loop import same_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
-from service.runtime.estimates import NoisySums
-from service.runtime.ports import RtcPort, StorePort, WorkerPort
+from service.runtime import estimates, ports
 from service.runtime.worker import Conditions, OpticsWorker
+from service.tracking import alarms, loop, products
 from service.tracking import events as ev
-from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.events import Effect, Event
-from service.tracking.loop import commanded_gains, extended_gains
-from service.tracking.products import (
-    Judged,
-    MatrixState,
-    MeasurementRecord,
-    ReconstructorRecord,
-)
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 
@@ -58,9 +50,9 @@ class Actions:
     def __init__(
         self,
         *,
-        bridge: RtcPort,
-        workers: WorkerPort,
-        archive: StorePort,
+        bridge: ports.RtcPort,
+        workers: ports.WorkerPort,
+        archive: ports.StorePort,
         instrument: Instrument,
         publishing: Publishing,
         clock_ns: Callable[[], int],
@@ -76,7 +68,7 @@ class Actions:
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
         self._commanded_modes: int | None = None
         self._judging: set[str] = set()
-        self.noisy = NoisySums(workers=workers, archive=archive, instrument=instrument)
+        self.noisy = estimates.NoisySums(workers=workers, archive=archive, instrument=instrument)
         """Sums of the noisy interaction matrix under way."""
 
     async def perform(  # noqa: C901 - one line for each effect
@@ -145,7 +137,7 @@ class Actions:
         ArchiveError
             If it cannot be written, or another one has its id.
         """
-        record = MeasurementRecord.sent(received.manifest)
+        record = products.MeasurementRecord.sent(received.manifest)
         if received.matrix is not None:
             instrument = self.instrument.name
             store = self._archive.measured.store
@@ -162,7 +154,7 @@ class Actions:
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
-        gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
+        gains = (effect.gains or loop.extended_gains(rtc, effect.n_modes))[: effect.n_modes]
         conditions = self._conditions(state, gains)
         made = await self._workers.call(OpticsWorker.make, conditions, effect.fewer)
         accepted = made.gate.accepted
@@ -170,7 +162,7 @@ class Actions:
         record = self._record(len(made.matrix), effect.why, registration, parent)
         record = replace(
             record,
-            state=MatrixState.PROPOSED if accepted else MatrixState.REFUSED,
+            state=products.MatrixState.PROPOSED if accepted else products.MatrixState.REFUSED,
             condition_number=made.condition_number,
             gate=made.gate,
             judged=judged_now(state, gains[: len(made.matrix)]),
@@ -186,7 +178,7 @@ class Actions:
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
         gate, judged, why = None, None, effect.why
-        gains = commanded_gains(rtc, len(matrix))
+        gains = loop.commanded_gains(rtc, len(matrix))
         if not effect.judged and source is not None:
             # the loop ran with it: what the gate has against it since does not count
             held = source.gate is not None and source.gate.accepted
@@ -202,7 +194,7 @@ class Actions:
             why, gate, judged, refused = f"{why}, though {gate.reason}", None, None, False
         record = replace(
             self._record(len(matrix), why, None, effect.source),
-            state=MatrixState.REFUSED if refused else MatrixState.PROPOSED,
+            state=products.MatrixState.REFUSED if refused else products.MatrixState.PROPOSED,
             alpha=None if source is None else source.alpha,
             sigma=None if source is None else source.sigma,
             condition_number=None if source is None else source.condition_number,
@@ -282,7 +274,7 @@ class Actions:
         manifest, matrix = await self._bridge.fetch_applied()
         if matrix_id not in {None, manifest.id}:
             raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
-        record = ReconstructorRecord.brought(manifest)
+        record = products.ReconstructorRecord.brought(manifest)
         known = state.reconstructor(record.id)
         if known is not None and known.sha256 not in {"", record.sha256}:
             return ev.MatrixFetched(record=record)  # the tracker says what that means
@@ -317,12 +309,12 @@ class Actions:
 
     def _record(
         self, n_modes: int, why: str, registration: Registration | None, parent: str | None
-    ) -> ReconstructorRecord:
+    ) -> products.ReconstructorRecord:
         now_ns = self._clock_ns()
         stamp = datetime.fromtimestamp(now_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S.%f")[:-3]
-        return ReconstructorRecord(
+        return products.ReconstructorRecord(
             id=f"cm-{stamp}-{n_modes}",
-            state=MatrixState.PROPOSED,
+            state=products.MatrixState.PROPOSED,
             n_modes=n_modes,
             created_ns_utc=now_ns,
             alpha=None if registration is None else registration.alpha,
@@ -334,7 +326,7 @@ class Actions:
 
     async def _keep(
         self,
-        record: ReconstructorRecord,
+        record: products.ReconstructorRecord,
         matrix: NDArray[np.float32],
         registration: Registration | None,
         why: str,
@@ -356,7 +348,9 @@ class Actions:
         while len(self._matrices) > MATRICES_KEPT:
             self._matrices.popitem(last=False)
 
-    def _store_foreign(self, record: ReconstructorRecord, matrix: NDArray[np.float32]) -> None:
+    def _store_foreign(
+        self, record: products.ReconstructorRecord, matrix: NDArray[np.float32]
+    ) -> None:
         """Archive the RTC's own matrix, once; another one under the same id is an error."""
         try:
             same = wire.checksum(self._archive.reconstructors.matrix(record.id)) == record.sha256
@@ -399,10 +393,10 @@ def expected_gains(registration: Registration, n_modes: int) -> NDArray[np.float
     return np.full(n_modes, registration.optical_gain or 1.0)
 
 
-def judged_now(state: TrackerState, gains: tuple[float, ...]) -> Judged:
+def judged_now(state: TrackerState, gains: tuple[float, ...]) -> products.Judged:
     """Return what a verdict that is asked for now will be of."""
     rtc, registration = _there(state), _registered(state)
-    return Judged(
+    return products.Judged(
         session=rtc.session,
         gains=tuple(gains),
         leak=rtc.leak,
@@ -418,7 +412,7 @@ def modes_that_hold(state: TrackerState, gains: tuple[float, ...]) -> int | None
     if (
         rtc is None
         or rtc.loop == "open"
-        or blocking_alarm(state.alarms.active, Interlock.MEASURE) is not None
+        or alarms.blocking_alarm(state.alarms.active, alarms.Interlock.MEASURE) is not None
     ):
         return None
     n_modes = rtc.n_controlled

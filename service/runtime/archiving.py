@@ -18,8 +18,8 @@ import msgspec
 import structlog
 
 from service.archive import Actor, Archive, AuditEntry
+from service.archive.nights import TrendSample
 from service.archive.retention import RetentionPolicy, due, items, low_on_space, remove
-from service.archive.trends import TrendSample
 from service.errors import ArchiveError, StorageError
 from service.runtime.command_results import GivenCommand
 from service.tracking import events as ev

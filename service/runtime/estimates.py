@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
-from service.estimation import lockin, random_dither
+from service.estimation import lockin, openloop, orientation, random_dither
 from service.estimation.dither_windows import EndedWindow
-from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.loop import loop_numbers
-from service.estimation.openloop import WideCaptureEstimate
-from service.estimation.orientation import setting_written
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
 from service.estimation.windows import ClosedLoop, Telemetry, WindowRefused
@@ -26,15 +23,9 @@ from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
 from service.runtime.worker import OpticsWorker, run_job
 from service.runtime.worker.records import waits
+from service.tracking import alarms, products
 from service.tracking import events as ev
-from service.tracking.alarms import WRONG_MATRIX, Interlock, blocking_alarm
 from service.tracking.events import Event
-from service.tracking.products import (
-    MeasurementRecord,
-    MeasureState,
-    NoisyFinding,
-    ReconstructorRecord,
-)
 from service.tracking.state import Level, TrackerState
 from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
@@ -92,7 +83,7 @@ class PendingWindow:
 
 
 def _joined(one: EndedWindow, other: EndedWindow) -> EndedWindow | None:
-    if isinstance(one, Spectra) and isinstance(other, Spectra):
+    if isinstance(one, lockin.Spectra) and isinstance(other, lockin.Spectra):
         return lockin.joined(one, other)
     if isinstance(one, Correlated) and isinstance(other, Correlated) and one.is_like(other):
         return random_dither.joined(one, other)
@@ -113,14 +104,14 @@ async def fitted(
     if state.loop.rtc is not None:
         n_frames = window.n_windows * window.plan.n_frames
         began_ns = window.t_end_ns_utc - round(n_frames * 1e9 / state.loop.rtc.frame_rate_hz)
-    if isinstance(outcome, WideCaptureEstimate):
+    if isinstance(outcome, openloop.WideCaptureEstimate):
         return ev.WideCaptureFitted(found=outcome, began_ns_utc=began_ns)
     return ev.WindowFitted(estimate=outcome, began_ns_utc=began_ns)
 
 
 async def _outcome(
     window: EndedWindow, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
-) -> LockInEstimate | RandomEstimate | WideCaptureEstimate | WindowRefused:
+) -> lockin.LockInEstimate | RandomEstimate | openloop.WideCaptureEstimate | WindowRefused:
     rtc, registration = state.loop.rtc, state.alpha.registration
     start = None if registration is None else registration.alpha
     if isinstance(window, Correlated):
@@ -143,7 +134,7 @@ async def _outcome(
 
 
 def _reconstructor(
-    spectra: Spectra, state: TrackerState, matrix_of: MatrixOf
+    spectra: lockin.Spectra, state: TrackerState, matrix_of: MatrixOf
 ) -> NDArray[np.float32]:
     """Return the matrix that made the commands; one that nobody has tells nothing of the loop.
 
@@ -190,7 +181,7 @@ async def fit_passive(
 
 
 async def read_own_matrix(
-    record: ReconstructorRecord,
+    record: products.ReconstructorRecord,
     matrix: NDArray[np.float32],
     state: TrackerState,
     workers: WorkerPort,
@@ -216,14 +207,14 @@ async def read_own_matrix(
     events: list[Event] = []
     slopes = dialect.found if dialect.adopted else None
     if slopes is not None:
-        text = f'orientation "auto": found {setting_written(slopes)} by {record.id}'
+        text = f'orientation "auto": found {orientation.setting_written(slopes)} by {record.id}'
         events.append(ev.LogEvent(name="slopes.adopted", text=text))
     if not dialect.wrong:
         workers.first = partial(run_job, OpticsWorker.adopt, slopes, response)
     wrong = dialect.wrong or (own.wrong if own is not None else "")
-    if wrong or state.alarm(WRONG_MATRIX) is not None:
+    if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} is as told"
-        events.append(ev.ConditionChanged(name=WRONG_MATRIX, text=text, over=not wrong))
+        events.append(ev.ConditionChanged(name=alarms.WRONG_MATRIX, text=text, over=not wrong))
     if own is not None:
         strange = tuple(own.columns[~own.known].tolist())
         events.append(
@@ -264,7 +255,7 @@ class NoisySums:
             return
         if (
             window.plan.modes != record.modes
-            or blocking_alarm(state.alarms.active, Interlock.MEASURE) is not None
+            or alarms.blocking_alarm(state.alarms.active, alarms.Interlock.MEASURE) is not None
         ):
             return
         total = self._total if self._id == record.id else None
@@ -274,7 +265,7 @@ class NoisySums:
         except ModelError:  # the RTC has started anew: what came before is of another loop
             self._total = window
 
-    async def finish(self, record: MeasurementRecord, state: TrackerState) -> Event:
+    async def finish(self, record: products.MeasurementRecord, state: TrackerState) -> Event:
         """Fit what has been summed, archive it and return what came of it.
 
         Raises
@@ -298,10 +289,10 @@ class NoisySums:
 @waits(at_most_s=5.0)
 def work_out(
     bench: OpticsWorker,
-    record: MeasurementRecord,
+    record: products.MeasurementRecord,
     total: Correlated,
     start: Misregistration | None,
-) -> tuple[MeasurementRecord, NoisyNumbers]:
+) -> tuple[products.MeasurementRecord, NoisyNumbers]:
     """Return the record of a matrix, ready for the archive, and its numbers; runs in the worker."""
     noisy = noisy_matrix(total)
     outcome, reason = bench.fit_random(total, start), ""
@@ -318,7 +309,7 @@ def work_out(
         gain_sigma=unknown if estimate is None else estimate.gain_sigma,
         snr=noisy.snr_of_modes,
     )
-    finding = NoisyFinding(
+    finding = products.NoisyFinding(
         n_slopes=len(numbers.matrix),
         n_frames=total.sums.n_pairs,
         n_missing=total.n_missing,
@@ -332,7 +323,7 @@ def work_out(
         created_ns_utc=total.t_end_ns_utc,
         sha256=checksum(numbers.matrix),
     )
-    record = replace(record, state=MeasureState.STORED, reason=reason, finding=finding)
+    record = replace(record, state=products.MeasureState.STORED, reason=reason, finding=finding)
     return record, numbers
 
 

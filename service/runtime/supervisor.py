@@ -14,52 +14,33 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from service import rtc_bridge, wire
 from service.archive import Actor, Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError, WorkerError
+from service.estimation import dither_windows, frames, lockin, passive_sums, random_dither
 from service.estimation.description import Description
-from service.estimation.dither_windows import EndedWindow
-from service.estimation.frames import FrameBlock
-from service.estimation.lockin import Spectra
-from service.estimation.passive_sums import PASSIVE_INTERVAL_S
-from service.estimation.random_dither import Correlated
-from service.link.matrices import MeasuredMatrix
-from service.link.statistics import LinkStatistics
+from service.link import matrices, statistics
 from service.model.instrument import Instrument
-from service.rtc_bridge import Bridge
+from service.runtime import archiving, command_results, readiness, worker
 from service.runtime.actions import Actions
-from service.runtime.archiving import ArchiveWriter, ids_of
 from service.runtime.clock import ServiceClock
-from service.runtime.command_results import GivenCommand
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
-from service.runtime.readiness import (
-    Losses,
-    ReadinessInputs,
-    ReadinessLog,
-    Revival,
-    detect_link_changes,
-    state_message,
-    waiting_for,
-)
 from service.runtime.refits import Refits
 from service.runtime.snapshot import Snapshot
-from service.runtime.telemetry_recorder import TelemetryRecorder
-from service.runtime.trends import TrendSampler
-from service.runtime.worker import OpticsWorker
+from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarm_rules import changes_value
 from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
-from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import Policy
 from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
-from service.wire import TEXT_LIMIT, AlarmMessage
 
 GATHER_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
@@ -84,7 +65,7 @@ class Supervisor:
         *,
         state: TrackerState,
         policy: Policy,
-        bridge: Bridge,
+        bridge: rtc_bridge.Bridge,
         workers: WorkerPool,
         archive: Archive,
         actions: Actions,
@@ -97,9 +78,9 @@ class Supervisor:
         self._workers = workers
         self.archive = archive
         """Products and their history; a call waits for the disk."""
-        self.newest_frames: FrameBlock | None = None
+        self.newest_frames: frames.FrameBlock | None = None
         """The last telemetry that came; None: none has."""
-        self._writer = ArchiveWriter(archive, lambda: self._engine.state, self._post)
+        self._writer = archiving.ArchiveWriter(archive, lambda: self._engine.state, self._post)
         self._actions = actions
         self._retention = retention
         self.recordings = TelemetryRecorder(
@@ -158,21 +139,23 @@ class Supervisor:
             archive_waiting=self._writer.waiting,
         )
 
-    def _waiting_for(self, link: LinkStatistics) -> tuple[Prerequisite, ...]:
+    def _waiting_for(self, link: statistics.LinkStatistics) -> tuple[Prerequisite, ...]:
         """Return whom the service waits for now."""
-        inputs = ReadinessInputs(
+        inputs = readiness.ReadinessInputs(
             state=self._engine.state,
             link=link,
             preparing=self._engine.bank is None,
             worker_problem=self._workers.problem,
         )
-        return waiting_for(inputs)
+        return readiness.waiting_for(inputs)
 
     def audit(self, entry: AuditEntry) -> None:
         """Take a line of the audit trail that is of no command."""
         self._writer.add(entry)
 
-    async def submit(self, command: Command, actor: Actor = OPERATOR, order_id: str = "") -> str:
+    async def submit(
+        self, command: cmd.Command, actor: Actor = OPERATOR, order_id: str = ""
+    ) -> str:
         """Carry out an operator's command; return one sentence on what came of it.
 
         It is on record before it is done, and so is why it is refused. What it leads to has its
@@ -188,7 +171,9 @@ class Supervisor:
             If it cannot be recorded; nothing has been done.
         """
         state, now_ns = self._engine.state, self._clock.now_ns()
-        order = GivenCommand(command, order_id or ev.new_id(ev.kebab(type(command)), now_ns))
+        order = command_results.GivenCommand(
+            command, order_id or ev.new_id(ev.kebab(type(command)), now_ns)
+        )
         again = isinstance(command, cmd.SetValue) and not changes_value(state, command, now_ns)
         if again or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
             return await self._result_of(order)
@@ -209,7 +194,7 @@ class Supervisor:
             await self._writer.keep_orders()
         return answer
 
-    async def _result_of(self, order: GivenCommand) -> str:
+    async def _result_of(self, order: command_results.GivenCommand) -> str:
         """Do what is asked, and say what the RTC says to it where that takes but a moment."""
         running = set(self._running)
         effects = self._post(order.command, order.id)
@@ -263,10 +248,10 @@ class Supervisor:
         """Return what the model expects of telemetry; a worker that dies is replaced."""
         for _ in range(DESCRIBE_ATTEMPTS - 1):
             try:
-                return await self._workers.call(OpticsWorker.describe)
+                return await self._workers.call(worker.OpticsWorker.describe)
             except WorkerError as error:
                 self._note("worker.lost", str(error), Level.WARNING)
-        return await self._workers.call(OpticsWorker.describe)
+        return await self._workers.call(worker.OpticsWorker.describe)
 
     async def _listen(self) -> None:
         """Take in what the link has: frames, then what was told after them."""
@@ -282,7 +267,7 @@ class Supervisor:
             rung.clear()
             await self._feed()
             for event in self._bridge.events():
-                if isinstance(event, MeasuredMatrix):
+                if isinstance(event, matrices.MeasuredMatrix):
                     self._start(self._keep_measured(event))
                     continue
                 with self._surviving("an event of the link"):
@@ -295,7 +280,7 @@ class Supervisor:
             bank = self._engine.checkout()
             if bank is None:
                 return
-            blocks: list[FrameBlock] = []
+            blocks: list[frames.FrameBlock] = []
             found: Fed = bank, []
             with self._surviving("telemetry"):
                 try:
@@ -308,7 +293,7 @@ class Supervisor:
             for block in blocks:
                 self._worker_load.count_frames(block.n_frames * block.dt_ns * 1e-9)
 
-    def _taken_in(self, bank: EstimatorBank) -> tuple[list[FrameBlock], Fed]:
+    def _taken_in(self, bank: EstimatorBank) -> tuple[list[frames.FrameBlock], Fed]:
         blocks = self._bridge.drain(before_events=True)
         return blocks, process_blocks(bank, blocks)
 
@@ -328,9 +313,9 @@ class Supervisor:
             self._engine.begin_anew()
             self._note("internal.error", text, Level.ALARM)
 
-    def fit(self, window: EndedWindow) -> None:
+    def fit(self, window: dither_windows.EndedWindow) -> None:
         """Put a window where the worker finds it."""
-        if isinstance(window, Correlated):
+        if isinstance(window, random_dither.Correlated):
             self._actions.noisy.take(window, self._engine.state)
         if self._pending_window.waits:
             self._worker_load.was_late()
@@ -340,7 +325,7 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, revival, losses = ReadinessLog(), Revival(), Losses()
+        told, revival, losses = readiness.ReadinessLog(), readiness.Revival(), readiness.Losses()
         while True:
             link = self._bridge.statistics()
             if revival.due(link, time.monotonic()):
@@ -354,21 +339,21 @@ class Supervisor:
             now_ns = self._clock.now_ns()
             lost = losses.complaint(link, time.monotonic())
             also = {FRAMES_LOST: lost, CLOCK_LEAPT: self._clock.complaint()}
-            for event in detect_link_changes(link, self._engine.state, now_ns, also):
+            for event in readiness.detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting_for(link)
             for text in told.due_lines(waiting, self._engine.state.alarms.active, now_ns):
                 self._note("waiting", text, Level.INFO)
-            self._bridge.publish_state(state_message(self._engine.state, now_ns, waiting))
+            self._bridge.publish_state(readiness.state_message(self._engine.state, now_ns, waiting))
             raised = frozenset((a.name, a.text) for a in self._engine.state.alarms.active)
             for name, text in raised ^ alarms:
                 self._bridge.publish_alarm(
-                    AlarmMessage(
+                    wire.AlarmMessage(
                         system=self._engine.state.system,
                         t_ns=now_ns,
                         name=name,
                         active=(name, text) in raised,
-                        text=text[:TEXT_LIMIT],
+                        text=text[: wire.TEXT_LIMIT],
                     )
                 )
             alarms = raised
@@ -390,11 +375,11 @@ class Supervisor:
     async def _fit(self) -> None:
         while True:
             await self._pending_window.some()
-            async with self._workers.turn(OpticsWorker.fit):
+            async with self._workers.turn(worker.OpticsWorker.fit):
                 window = self._pending_window.take()
                 if window is None:
                     continue
-                if isinstance(window, Spectra):
+                if isinstance(window, lockin.Spectra):
                     self._worker_load.fitted(window.window_s)
                 state, matrix = self._engine.state, self._actions.matrix
                 event = await fitted(window, state, self._workers, matrix)
@@ -402,8 +387,8 @@ class Supervisor:
 
     async def _fit_passive(self) -> None:
         while True:
-            await asyncio.sleep(PASSIVE_INTERVAL_S)
-            async with self._workers.turn(OpticsWorker.fit_passive):
+            await asyncio.sleep(passive_sums.PASSIVE_INTERVAL_S)
+            async with self._workers.turn(worker.OpticsWorker.fit_passive):
                 async with self._telemetry_lock:
                     sums = self._engine.take_sums()
                 events = await fit_passive(sums, self._engine.state, self._workers)
@@ -471,7 +456,7 @@ class Supervisor:
         if event is not None:
             self._post(event, effect.cause)
 
-    async def _keep_measured(self, heard: MeasuredMatrix) -> None:
+    async def _keep_measured(self, heard: matrices.MeasuredMatrix) -> None:
         known = self._engine.state.measurement(heard.manifest.id)
         given_up = known is not None and known.state is MeasureState.GIVEN_UP
         if known is not None and (given_up or known.pattern is None):
@@ -493,7 +478,7 @@ class Supervisor:
         """Log what is new in the state's log, at its level, and have it recorded."""
         entries = new_lines(before, self._engine.state)
         for entry in entries:
-            ids = ids_of(entry.text, self._engine.state)
+            ids = archiving.ids_of(entry.text, self._engine.state)
             told = getattr(self._log, _LEVELS.get(entry.level, entry.level.value))
             told(entry.name, text=entry.text, **ids)
         self._writer.changed(before, self._engine.state, entries)

@@ -9,6 +9,7 @@ import itertools
 import json
 import shutil
 import time
+from asyncio.subprocess import DEVNULL, PIPE
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,21 +20,8 @@ from typing import IO, Any
 
 import structlog
 
-from service.errors import (
-    ArchiveError,
-    BusyError,
-    CommandError,
-    MatrixError,
-    PyrcalError,
-    StorageError,
-    TooLargeError,
-    TooSlowError,
-    UnknownIdError,
-    WorkerError,
-)
-from service.files import NUMPY_BEGINS
+from service import errors, files
 from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, UPLOAD, FitRequest
-from service.runtime.programs import run_program
 
 FITS_KEPT = 50
 """Finished fits that are remembered."""
@@ -50,7 +38,7 @@ SLOWEST_BYTES_S = 200_000
 _BLOCK = 1 << 20
 """Bytes written to the disk at once."""
 
-_BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", NUMPY_BEGINS, b"PK\x03\x04")
+_BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", files.NUMPY_BEGINS, b"PK\x03\x04")
 """First bytes of HDF5, FITS, anything gzipped, NumPy, and zip."""
 
 
@@ -166,7 +154,9 @@ class FitQueue:
         try:
             self._folder.mkdir(parents=True)
         except OSError as error:
-            raise ArchiveError(f"{self._folder}: cannot be made: {error.strerror}") from error
+            raise errors.ArchiveError(
+                f"{self._folder}: cannot be made: {error.strerror}"
+            ) from error
 
     async def close(self) -> None:
         """End the fit that runs, drop those that wait, and remove their files."""
@@ -190,7 +180,7 @@ class FitQueue:
         """
         found = self._jobs.get(fit_id)
         if found is None:
-            raise UnknownIdError(f"unknown fit {fit_id}: the service has begun no such fit")
+            raise errors.UnknownIdError(f"unknown fit {fit_id}: the service has begun no such fit")
         return self._staged(found)
 
     async def give_up(self, fit_id: str) -> FitJob:
@@ -205,7 +195,7 @@ class FitQueue:
         """
         job, task = self.job(fit_id), self._running.get(fit_id)
         if task is None or job.state not in UNFINISHED:
-            raise CommandError(f"fit {fit_id} is {job.state}: there is nothing to give up")
+            raise errors.CommandError(f"fit {fit_id} is {job.state}: there is nothing to give up")
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         if self._jobs[fit_id].state in UNFINISHED:  # else it was over at the last moment
@@ -251,7 +241,9 @@ class FitQueue:
                 await self._receive(job.id, file, body)
         except OSError as error:
             await self._forget(job.id)
-            raise StorageError(f"fit: the upload cannot be kept: {error.strerror}") from error
+            raise errors.StorageError(
+                f"fit: the upload cannot be kept: {error.strerror}"
+            ) from error
         except BaseException:
             await self._forget(job.id)
             raise
@@ -265,7 +257,9 @@ class FitQueue:
             raise _too_large(f"{n_bytes / 1e6:.0f} MB", most)
         unfinished = sum(job.state in UNFINISHED for job in self._jobs.values())
         if unfinished >= self._limits.waiting:
-            raise BusyError(f"found {unfinished} fits unfinished, the most there may be: try later")
+            raise errors.BusyError(
+                f"found {unfinished} fits unfinished, the most there may be: try later"
+            )
 
     def _remember(self, name: str) -> FitJob:
         now_ns = self._clock_ns()
@@ -303,7 +297,7 @@ class FitQueue:
                 await flush()
         await flush()
         if n_bytes == 0:
-            raise MatrixError(
+            raise errors.MatrixError(
                 "upload: found an empty body, expected an HDF5, FITS, NumPy or zip file"
             )
         self._put(replace(self._jobs[fit_id], n_bytes=n_bytes, sha256=digest.hexdigest()))
@@ -319,7 +313,7 @@ class FitQueue:
             done = replace(self._jobs[fit_id], state=FitState.DONE, document=found, figures=drawn)
             self._put(done)
             self._log.info("fit.done", id=fit_id, verdict=found["verdict"])
-        except PyrcalError as error:
+        except errors.PyrcalError as error:
             self._put(replace(self._jobs[fit_id], state=FitState.FAILED, reason=str(error)))
             self._log.warning("fit.failed", id=fit_id, text=str(error))
         finally:
@@ -344,7 +338,7 @@ def _answered(folder: Path) -> tuple[dict[str, Any], bytes]:
         found: dict[str, Any] = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
         return found, (folder / FIGURES).read_bytes()
     except (OSError, ValueError) as error:
-        raise WorkerError(f"the fit has ended and left no answer: {error}") from error
+        raise errors.WorkerError(f"the fit has ended and left no answer: {error}") from error
 
 
 async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
@@ -359,8 +353,8 @@ async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
             return
         except TimeoutError as error:
             if left_s > STALL_S:
-                raise TooSlowError(f"upload: nothing came for {STALL_S:g} s") from error
-            raise TooSlowError(
+                raise errors.TooSlowError(f"upload: nothing came for {STALL_S:g} s") from error
+            raise errors.TooSlowError(
                 f"upload: found {n_bytes} bytes in {time.monotonic() - began_s:.0f} s, expected at "
                 f"least {SLOWEST_BYTES_S / 1e6:g} MB a second"
             ) from error
@@ -370,13 +364,53 @@ async def _in_time(body: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 def _check_kind(first: bytes) -> None:
     if not first.startswith(_BEGINS):
-        raise MatrixError(
+        raise errors.MatrixError(
             f"upload: found a body that begins with {first[:8]!r}, expected an HDF5, FITS, NumPy "
             "or zip file (curl -X POST -T FILE)"
         )
 
 
-def _too_large(found: str, max_bytes: int) -> TooLargeError:
-    return TooLargeError(
+def _too_large(found: str, max_bytes: int) -> errors.TooLargeError:
+    return errors.TooLargeError(
         f"upload: found {found}, expected at most {max_bytes / 1e6:.0f} MB (fits.upload_limit_mb)"
     )
+
+
+# --- the program that does it
+
+
+async def run_program(words: Sequence[str], *, limit_s: float) -> None:
+    """Run a program to its end; it is ended when the time is over, or nobody waits for it.
+
+    It holds the other end of its standard input: one that reads it sees when the service ends,
+    however that does. Ctrl-C in the service's terminal does not reach it.
+
+    Raises
+    ------
+    WorkerError
+        If it cannot be started, dies, takes longer than ``limit_s``, or ends with another status
+        than 0: what it said last on standard error.
+    """
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *words, stdin=PIPE, stdout=DEVNULL, stderr=PIPE, start_new_session=True
+        )
+    except OSError as error:
+        raise errors.WorkerError(f"{words[0]}: cannot be started: {error.strerror}") from error
+    assert process.stderr is not None  # noqa: S101 - asked for above
+    try:
+        async with asyncio.timeout(limit_s):
+            said = await process.stderr.read()
+            status = await process.wait()
+    except TimeoutError as error:
+        raise errors.WorkerError(f"took longer than {limit_s:g} s and was stopped") from error
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    if status < 0:
+        raise errors.WorkerError("the process of the job died; out of memory?")
+    if status > 0:
+        lines = said.decode(errors="replace").split("\n")
+        last = next((line for line in reversed(lines) if line.strip()), "it said nothing")
+        raise errors.WorkerError(last)

@@ -13,20 +13,11 @@ from fastapi.responses import JSONResponse
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from starlette.requests import ClientDisconnect
 
-from service.errors import MatrixError
-from service.files import parse_alpha, parse_modes
+from service import errors, files
 from service.model.kinds import Method
 from service.runtime.uploads import FitJob, FitQueue, FitState
+from service.web import views
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.views import (
-    SCHEMAS,
-    ServiceDep,
-    answer,
-    define_view,
-    found_or_refuse,
-    shows,
-    to_json,
-)
 
 router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
 
@@ -39,10 +30,10 @@ class FitJobs:
     """Oldest first."""
 
 
-FIT_JOB = define_view(
+FIT_JOB = views.define_view(
     "FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason"
 )
-FIT_JOBS = define_view("FitJobsView", FitJobs)
+FIT_JOBS = views.define_view("FitJobsView", FitJobs)
 
 
 async def _fits_of(request: Request) -> FitQueue:
@@ -87,10 +78,10 @@ class FitParameters(BaseModel):
     method: Method = Method.JOINT
     """"joint", "paper" or "sensitivity"."""
 
-    modes: Annotated[str, Field(max_length=10_000), _understood(parse_modes)] | None = None
+    modes: Annotated[str, Field(max_length=10_000), _understood(files.parse_modes)] | None = None
     """Basis indices, like 0:400 or 3,5,9; default all."""
 
-    start: Annotated[str, Field(max_length=_TEXT), _understood(parse_alpha)] | None = None
+    start: Annotated[str, Field(max_length=_TEXT), _understood(files.parse_alpha)] | None = None
     """X,Y,ROT,MAG: subapertures, degrees, ratio."""
 
     gain_map: bool = False
@@ -196,7 +187,7 @@ _UPLOAD: dict[str, Any] = {
 )
 async def fit(
     request: Request,
-    service: ServiceDep,
+    service: views.ServiceDep,
     fits: FitsDep,
     response: Response,
     parameters: Annotated[FitParameters, Query()],
@@ -211,7 +202,7 @@ async def fit(
     body = _body(request)
     if parameters.measurement is not None:
         if content_length:
-            raise MatrixError("found a body beside ?measurement=, expected one of the two")
+            raise errors.MatrixError("found a body beside ?measurement=, expected one of the two")
         content = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
         body, content_length = _kept(content), len(content)
     name = parameters.name or parameters.measurement or ""
@@ -221,13 +212,15 @@ async def fit(
     return FitAcceptedView(id=job.id, links=links)
 
 
-@router.get("/fits", responses={200: shows(FIT_JOBS)})
+@router.get("/fits", responses={200: views.shows(FIT_JOBS)})
 async def fits_known(fits: FitsDep) -> Response:
     """Return the fits the service remembers, oldest first."""
-    return answer(FitJobs(fits=tuple(fits.jobs())))
+    return views.answer(FitJobs(fits=tuple(fits.jobs())))
 
 
-_FOUND = {"anyOf": [{"$ref": f"{SCHEMAS}FitDocument"}, {"$ref": f"{SCHEMAS}{FIT_JOB.name}"}]}
+_FOUND = {
+    "anyOf": [{"$ref": f"{views.SCHEMAS}FitDocument"}, {"$ref": f"{views.SCHEMAS}{FIT_JOB.name}"}]
+}
 
 
 @router.get(
@@ -239,7 +232,7 @@ _FOUND = {"anyOf": [{"$ref": f"{SCHEMAS}FitDocument"}, {"$ref": f"{SCHEMAS}{FIT_
             "its `state` and the `reason`",
             "content": {"application/json": {"schema": _FOUND}},
         },
-        202: shows(FIT_JOB) | {"description": "Not finished yet"},
+        202: views.shows(FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
     },
 )
@@ -253,7 +246,7 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
     if job.document is not None:
         return JSONResponse(dict(job.document))
     ended = job.state in {FitState.FAILED, FitState.GIVEN_UP}
-    return JSONResponse(to_json(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
+    return JSONResponse(views.to_json(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
 
 
 class FitMap(BaseModel):
@@ -302,15 +295,15 @@ async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
     """Return what the figures of a finished fit are drawn from; 404 while there are none."""
     job = fits.job(fit_id)
     return Response(
-        found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
+        views.found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
         media_type="application/json",
     )
 
 
-@router.delete("/fits/{id}", responses={200: shows(FIT_JOB), **UNKNOWN, **COMMAND})
+@router.delete("/fits/{id}", responses={200: views.shows(FIT_JOB), **UNKNOWN, **COMMAND})
 async def give_up_fit(fits: FitsDep, fit_id: FitId) -> Response:
     """End a fit that waits or runs; 409 where it is over."""
-    return answer(await fits.give_up(fit_id))
+    return views.answer(await fits.give_up(fit_id))
 
 
 async def _kept(content: bytes) -> AsyncIterator[bytes]:
@@ -322,4 +315,4 @@ async def _body(request: Request) -> AsyncIterator[bytes]:
         async for chunk in request.stream():
             yield chunk
     except ClientDisconnect as error:
-        raise MatrixError("upload: the client went away half-way") from error
+        raise errors.MatrixError("upload: the client went away half-way") from error

@@ -12,23 +12,15 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
 
 from service.archive import Archive, Mark, Night
-from service.archive.nights import FOREVER_NS
-from service.archive.notes import Annotation
-from service.archive.trends import TREND_S, TrendSample
+from service.archive.nights import FOREVER_NS, TREND_S, Annotation, TrendSample
 from service.runtime.supervisor import Supervisor
 from service.runtime.telemetry_recorder import AnnotationChoice
 from service.tracking.registration import HistoryEntry
-from service.web import views
-from service.web.commands import AcceptedView, ClientDep, body
-from service.web.connections import not_modified, tag_of
-from service.web.numbers import (
-    Parameters,
-)
-from service.web.problems import COMMAND, INVALID
+from service.web import commands, connections, numbers, problems, views
 from service.web.views import ServiceDep, answer, define_view, shows
 
-router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
-notes = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**problems.INVALID})
+notes = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**problems.INVALID})
 
 Points = Annotated[int, Field(ge=8, le=2000)]
 Nanoseconds = Annotated[int, Field(ge=0, le=(1 << 63) - 1)]
@@ -43,7 +35,7 @@ def _said_as_a_clock_does(value: object) -> object:
 Clock = Annotated[AwareDatetime, BeforeValidator(_said_as_a_clock_does)]
 
 
-class TimeParameters(Parameters):
+class TimeParameters(numbers.Parameters):
     """A time, from its beginning to its end."""
 
     since_ns: Nanoseconds | None = None
@@ -118,8 +110,8 @@ def _history(request: Request, service: Supervisor, asked: RangeParameters) -> R
     found = tuple(entry for entry in tracker.alpha.history if first_ns <= entry.t_ns_utc <= last_ns)
     n_older = service.archive.nights.n_estimates(first_ns, last_ns)
     ends = [entry.t_ns_utc for entry in (*found[:1], *found[-1:])]
-    tag = tag_of(asked, n_older, len(found), *ends)
-    if (same := not_modified(request, tag)) is not None:
+    tag = connections.tag_of(asked, n_older, len(found), *ends)
+    if (same := connections.not_modified(request, tag)) is not None:
         return same
     if asked.points or asked.after is not None or len(found) < asked.limit:
         last_ns = min([last_ns, *(entry.t_ns_utc - 1 for entry in tracker.alpha.history)])
@@ -252,7 +244,7 @@ async def trends(service: ServiceDep, parameters: Annotated[TrendParameters, Que
     """
     first_ns, last_ns = parameters.between
     found = await run_in_threadpool(
-        service.archive.trends.between, first_ns, last_ns, parameters.points
+        service.archive.nights.samples, first_ns, last_ns, parameters.points
     )
     interval_s = TREND_S
     if len(found) > parameters.points // 2:  # there may have been more
@@ -280,7 +272,7 @@ define_view("AnnotationView", Annotation)
 ANNOTATIONS = define_view("AnnotationsView", AnnotationList)
 
 
-class AnnotationAcceptedView(AcceptedView):
+class AnnotationAcceptedView(commands.AcceptedView):
     """A note that is kept."""
 
     id: int
@@ -293,20 +285,20 @@ async def list_annotations(
 ) -> Response:
     """Return what operators have noted about a time, oldest first."""
     found = await run_in_threadpool(
-        service.archive.annotations.between, *parameters.between, parameters.limit
+        service.archive.nights.notes, *parameters.between, parameters.limit
     )
     return answer(AnnotationList(annotations=found))
 
 
-@notes.post("/annotations", status_code=201, responses={**COMMAND})
+@notes.post("/annotations", status_code=201, responses={**problems.COMMAND})
 async def annotate(
-    client: ClientDep, choice: Annotated[AnnotationChoice, body(AnnotationChoice)]
+    client: commands.ClientDep, choice: Annotated[AnnotationChoice, commands.body(AnnotationChoice)]
 ) -> AnnotationAcceptedView:
     """Note something about a moment: it is kept for ever, in the history and the audit trail."""
     entry = client.actor.entry("annotation", choice.note, by=choice.by, why=choice.reason)
     t_ns = entry.t_ns_utc if choice.t_ns_utc is None else choice.t_ns_utc
     note = Annotation(t_ns_utc=t_ns, written_ns_utc=entry.t_ns_utc, who=entry.who, note=choice.note)
-    number = await run_in_threadpool(client.service.archive.annotations.add, note)
+    number = await run_in_threadpool(client.service.archive.nights.add_note, note)
     client.service.audit(replace(entry, answer=f"note {number}"))
     where = f"/v1/annotations?since_ns={t_ns}&until_ns={t_ns}"
     accepted = client.accepted("it is kept, in the history of that time", annotation=where)

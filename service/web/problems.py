@@ -13,36 +13,23 @@ from fastapi.routing import iter_route_contexts
 from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
-from service.errors import (
-    ArchiveError,
-    BusyError,
-    CommandError,
-    LinkError,
-    MatrixError,
-    PyrcalError,
-    StaleError,
-    StorageError,
-    TooLargeError,
-    TooSlowError,
-    UnknownIdError,
-    UntaggedError,
-)
+from service import errors
 
 MEDIA_TYPE = "application/problem+json"
 
-_OF_ERROR: dict[type[PyrcalError], tuple[HTTPStatus, str]] = {
-    UnknownIdError: (HTTPStatus.NOT_FOUND, "unknown-id"),
-    StaleError: (HTTPStatus.PRECONDITION_FAILED, "stale"),
-    UntaggedError: (HTTPStatus.PRECONDITION_REQUIRED, "if-match"),
-    TooLargeError: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large"),
-    TooSlowError: (HTTPStatus.REQUEST_TIMEOUT, "too-slow"),
-    BusyError: (HTTPStatus.SERVICE_UNAVAILABLE, "busy"),
-    MatrixError: (HTTPStatus.UNPROCESSABLE_ENTITY, "unusable-matrix"),
-    CommandError: (HTTPStatus.CONFLICT, "not-now"),
-    LinkError: (HTTPStatus.GATEWAY_TIMEOUT, "rtc-silent"),
-    StorageError: (HTTPStatus.INSUFFICIENT_STORAGE, "archive-failed"),
-    ArchiveError: (HTTPStatus.INTERNAL_SERVER_ERROR, "archive"),
-    PyrcalError: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal"),
+_OF_ERROR: dict[type[errors.PyrcalError], tuple[HTTPStatus, str]] = {
+    errors.UnknownIdError: (HTTPStatus.NOT_FOUND, "unknown-id"),
+    errors.StaleError: (HTTPStatus.PRECONDITION_FAILED, "stale"),
+    errors.UntaggedError: (HTTPStatus.PRECONDITION_REQUIRED, "if-match"),
+    errors.TooLargeError: (HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too-large"),
+    errors.TooSlowError: (HTTPStatus.REQUEST_TIMEOUT, "too-slow"),
+    errors.BusyError: (HTTPStatus.SERVICE_UNAVAILABLE, "busy"),
+    errors.MatrixError: (HTTPStatus.UNPROCESSABLE_ENTITY, "unusable-matrix"),
+    errors.CommandError: (HTTPStatus.CONFLICT, "not-now"),
+    errors.LinkError: (HTTPStatus.GATEWAY_TIMEOUT, "rtc-silent"),
+    errors.StorageError: (HTTPStatus.INSUFFICIENT_STORAGE, "archive-failed"),
+    errors.ArchiveError: (HTTPStatus.INTERNAL_SERVER_ERROR, "archive"),
+    errors.PyrcalError: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal"),
 }
 
 RETRY_S = 30
@@ -128,20 +115,20 @@ def problem(
 
 def install(app: FastAPI) -> None:
     """Make every error of ``app`` a problem."""
-    app.exception_handler(PyrcalError)(_known)
+    app.exception_handler(errors.PyrcalError)(_known)
     app.exception_handler(RequestValidationError)(_invalid)
     app.exception_handler(HTTPException)(_http)
     app.exception_handler(Exception)(_fault)
 
 
-def known_problem(request: Request, error: PyrcalError) -> JSONResponse:
+def known_problem(request: Request, error: errors.PyrcalError) -> JSONResponse:
     """Return the problem that an error of this service is."""
     status, kind = next(_OF_ERROR[cls] for cls in type(error).__mro__ if cls in _OF_ERROR)
     later = {"Retry-After": str(RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
     return problem(request, status, kind, str(error), later)
 
 
-async def _known(request: Request, error: PyrcalError) -> JSONResponse:
+async def _known(request: Request, error: errors.PyrcalError) -> JSONResponse:
     return known_problem(request, error)
 
 

@@ -12,21 +12,14 @@ from pydantic import Field
 from service.control.gains import ModeGain, gain_table
 from service.errors import CommandError
 from service.runtime.snapshot import ModeGainTable
-from service.web import views
-from service.web.numbers import (
-    MatrixId,
-    MatrixParameters,
-    Parameters,
-    describes_numbers,
-    numbers_of,
-)
+from service.web import numbers, views
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.web.views import ServiceDep, answer, found_or_refuse, shows, tagged
 
 router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
 
 
-class LimitParameters(Parameters):
+class LimitParameters(numbers.Parameters):
     """How much of a list to return."""
 
     limit: int = Field(default=200, ge=1, le=100_000)
@@ -67,7 +60,7 @@ async def reconstructors(service: ServiceDep) -> Response:
 
 
 @router.get("/reconstructors/{id}", responses={200: shows(views.RECONSTRUCTOR), **UNKNOWN})
-async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
+async def reconstructor(service: ServiceDep, matrix_id: numbers.MatrixId) -> Response:
     """Return what is known of one reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
     return tagged(found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
@@ -77,7 +70,7 @@ async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
     "/reconstructors/{id}/matrix",
     response_class=Response,
     responses={
-        200: describes_numbers(
+        200: numbers.describes_numbers(
             "The reconstructor, metres OPD per slope",
             "Rows (modes) and columns (slopes)",
             "400,1384",
@@ -88,8 +81,8 @@ async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
 async def reconstructor_matrix(
     request: Request,
     service: ServiceDep,
-    matrix_id: MatrixId,
-    parameters: Annotated[MatrixParameters, Query()],
+    matrix_id: numbers.MatrixId,
+    parameters: Annotated[numbers.MatrixParameters, Query()],
 ) -> Response:
     """Return a reconstructor's numbers, ``(n_modes, n_slopes)``, metres OPD per slope.
 
@@ -97,7 +90,7 @@ async def reconstructor_matrix(
     whose SHA-256 is the reconstructor's ``sha256``, ``hdf5`` the archived product, ``fits`` an
     image.
     """
-    return await numbers_of(
+    return await numbers.numbers_of(
         request,
         matrix_id,
         parameters.format,
@@ -134,7 +127,7 @@ async def gains(service: ServiceDep) -> Response:
 
 
 @router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})
-async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
+async def reconstructor_gains(service: ServiceDep, matrix_id: numbers.MatrixId) -> Response:
     """Return the optical gains that were measured when a reconstructor was made, for its modes."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
     record = found_or_refuse(found, f"unknown reconstructor {matrix_id}")

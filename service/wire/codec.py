@@ -160,9 +160,9 @@ class Form(Generic[_R]):
 _FORMS: dict[type, Form[Any]] = {}
 
 
-def travels(form: Form[Any]) -> None:
-    """Let records of a kind travel."""
-    _FORMS[form.kind] = form
+def travels(kind: type[_R], where: str, **how: Any) -> None:  # noqa: ANN401 - as Form has it
+    """Let records of a kind travel, in the :class:`Form` that the rest describes."""
+    _FORMS[kind] = Form(kind, where, **how)
 
 
 def encode(record: DataclassInstance) -> bytes:

@@ -10,33 +10,15 @@ from typing import Annotated, Final
 from msgspec import Meta
 
 from service.errors import WireError
-from service.wire.codec import (
-    Count,
-    Form,
-    FourNumbers,
-    Id,
-    Map,
-    Positive,
-    Text,
-    above,
-    applicable,
-    decode,
-    get,
-    integer,
-    number,
-    reason_or_none,
-    refusal,
-    travels,
-    unpack,
-)
+from service.wire import codec
 from service.wire.keys import checked_id
 
 AVERAGE_LIMIT: Final = 10_000
 RAMP_LIMIT: Final = 1_000_000
 """Most frames at one gain of a ramp."""
 
-_Duration = Annotated[float, above(0.0, 86_400.0)]
-_Pair = Annotated[tuple[Count, Count], Meta(description="pairs of integers")]
+_Duration = Annotated[float, codec.above(0.0, 86_400.0)]
+_Pair = Annotated[tuple[codec.Count, codec.Count], Meta(description="pairs of integers")]
 
 
 class CommandKind(StrEnum):
@@ -92,14 +74,14 @@ class Pattern(StrEnum):
 class Strokes:
     """Modes of the mirror that are moved, and how far."""
 
-    id: Id
+    id: codec.Id
     """Of the command, and of a matrix that follows: repeated with the same id it is carried out
     once."""
 
-    modes: tuple[Count, ...]
+    modes: tuple[codec.Count, ...]
     """0-based basis indices."""
 
-    amplitude_m: tuple[Positive, ...]
+    amplitude_m: tuple[codec.Positive, ...]
     """RMS of each mode, metres OPD."""
 
 
@@ -110,13 +92,13 @@ class DitherRequest(Strokes):
     kind: DitherKind
     """Sines, or random signs."""
 
-    frequency_hz: tuple[Positive, ...] | None = None
+    frequency_hz: tuple[codec.Positive, ...] | None = None
     """Of each mode, below half the frame rate; None: binary."""
 
     duration_s: _Duration
     """It ends by itself after ``round(duration_s * frame_rate_hz)`` frames."""
 
-    seed: Count | None = None
+    seed: codec.Count | None = None
     """Of the binary sequence; None: sine."""
 
 
@@ -124,7 +106,7 @@ class DitherRequest(Strokes):
 class DitherStop:
     """Stop the dither, whichever plays; this always succeeds."""
 
-    id: Id
+    id: codec.Id
     """Of this command, not of the dither that it stops."""
 
 
@@ -132,19 +114,19 @@ class DitherStop:
 class LoopRequest:
     """Change the loop; None leaves a value as it is, opening zeroes the integrator."""
 
-    id: Id
+    id: codec.Id
     """Of the command: repeated with the same id it is carried out once."""
 
     loop: Loop | None = None
     """Open or close it; the service never asks for partial."""
 
-    gains: tuple[Annotated[float, number(0.0)], ...] | None = None
+    gains: tuple[Annotated[float, codec.number(0.0)], ...] | None = None
     """One per mode of the basis, 0 where uncontrolled."""
 
-    leak: Annotated[float, number(0.0, 1.0)] | None = None
+    leak: Annotated[float, codec.number(0.0, 1.0)] | None = None
     """Per frame, 0..1; 1 forgets nothing."""
 
-    n_controlled: Count | None = None
+    n_controlled: codec.Count | None = None
     """Takes effect with the next reconstructor of that many rows."""
 
 
@@ -152,7 +134,7 @@ class LoopRequest:
 class MatrixStrokes(Strokes):
     """Strokes that an interaction matrix is measured with."""
 
-    frequency_hz: tuple[Positive, ...] | None = None
+    frequency_hz: tuple[codec.Positive, ...] | None = None
     """Of each mode; None unless it is a sine."""
 
     duration_s: _Duration | None = None
@@ -166,7 +148,7 @@ class MeasureRequest(MatrixStrokes):
     pattern: Pattern
     """How; the first is mandatory, the others are optional."""
 
-    n_average: Annotated[int, integer(1, AVERAGE_LIMIT)] | None = None
+    n_average: Annotated[int, codec.integer(1, AVERAGE_LIMIT)] | None = None
     """Repetitions; None: the pattern has none."""
 
 
@@ -178,24 +160,24 @@ class RampRequest:
     status' ``gains`` (Heritier et al. 2018: tip and tilt, then modes to 100, then to 400).
     """
 
-    id: Id
+    id: codec.Id
     """Of the command: repeated with the same id it is carried out once."""
 
     groups: tuple[_Pair, ...]
     """First and last mode of each group, 0-based basis indices, both included; none overlap."""
 
-    gains: tuple[Positive, ...]
+    gains: tuple[codec.Positive, ...]
     """Loop gains, tried in this order on every group."""
 
-    frames_per_gain: Annotated[int, integer(1, RAMP_LIMIT)]
+    frames_per_gain: Annotated[int, codec.integer(1, RAMP_LIMIT)]
     """Frames each gain is tried for, settling included."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OffloadRequest(FourNumbers):
+class OffloadRequest(codec.FourNumbers):
     """Move the mirror's image on the sensor, with a lens or a stage: so much α is to change."""
 
-    id: Id
+    id: codec.Id
     """Of the command: repeated with the same id it is carried out once."""
 
 
@@ -206,16 +188,16 @@ Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampReques
 class Reply:
     """The RTC's answer to a command."""
 
-    id: Id | None
+    id: codec.Id | None
     """The command's; None when the command had none that could be read."""
 
     accepted: bool
     """Whether it is, or has been, carried out."""
 
-    reason: Text
+    reason: codec.Text
     """Empty, or begins with missing, v, id, busy, range or unsupported."""
 
-    start_seq: Count | None
+    start_seq: codec.Count | None
     """First frame whose exposure contains what was asked for; None where that means nothing."""
 
 
@@ -227,6 +209,7 @@ _KINDS: dict[type[Command], CommandKind] = {
     RampRequest: CommandKind.RAMP,
     OffloadRequest: CommandKind.OFFLOAD,
 }
+_STARTING = {kind: command for command, kind in _KINDS.items() if command is not DitherStop}
 _START, _STOP = "start", "stop"
 
 
@@ -238,7 +221,7 @@ def command_kind(command: Command) -> CommandKind:
 def command_id(data: bytes) -> str | None:
     """Return the id of a command, for the reply that refuses the rest of it; None: unreadable."""
     try:
-        return checked_id(unpack(data, "a command").get("id"), "a command")
+        return checked_id(codec.unpack(data, "a command").get("id"), "a command")
     except WireError:
         return None
 
@@ -253,35 +236,27 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
     WireError
         If a key is missing or out of range; the text is fit for the reply's ``reason``.
     """
-    match kind:
-        case CommandKind.DITHER:
-            stops = unpack(data, "a dither command").get("action") == _STOP
-            return decode(DitherStop, data) if stops else decode(DitherRequest, data)
-        case CommandKind.LOOP:
-            return decode(LoopRequest, data)
-        case CommandKind.MEASURE:
-            return decode(MeasureRequest, data)
-        case CommandKind.RAMP:
-            return decode(RampRequest, data)
-        case CommandKind.OFFLOAD:
-            return decode(OffloadRequest, data)
+    dither = kind is CommandKind.DITHER
+    if dither and codec.unpack(data, "a dither command").get("action") == _STOP:
+        return codec.decode(DitherStop, data)
+    return codec.decode(_STARTING[kind], data)
 
 
-def _starts(values: Map, where: str) -> Map:
-    if get(values, "action", where) != _START:
-        raise refusal("action", values["action"], f"{_START} or {_STOP}", where)
+def _starts(values: codec.Map, where: str) -> codec.Map:
+    if codec.get(values, "action", where) != _START:
+        raise codec.refusal("action", values["action"], f"{_START} or {_STOP}", where)
     return values
 
 
 def _check_dither(command: DitherRequest, where: str) -> None:
     sine = command.kind is DitherKind.SINE
-    applicable(command, where, frequency_hz=sine, seed=not sine)
+    codec.applicable(command, where, frequency_hz=sine, seed=not sine)
     _check_modes(command, where)
 
 
 def _check_measurement(command: MeasureRequest, where: str) -> None:
     sine = command.pattern is Pattern.SINE
-    applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
+    codec.applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
     _check_modes(command, where)
 
 
@@ -289,11 +264,11 @@ def _check_modes(command: Strokes, where: str) -> None:
     """Refuse missing or repeated modes, and lists that have not one value for each."""
     modes = command.modes
     if not modes or len(set(modes)) != len(modes):
-        raise refusal("modes", modes, "at least one mode, none twice", where)
+        raise codec.refusal("modes", modes, "at least one mode, none twice", where)
     for key in ("amplitude_m", "frequency_hz"):
         values = getattr(command, key)
         if values is not None and len(values) != len(modes):
-            raise refusal(key, values, f"one for each of {len(modes)} modes", where)
+            raise codec.refusal(key, values, f"one for each of {len(modes)} modes", where)
 
 
 def _check_ramp(command: RampRequest, where: str) -> None:
@@ -301,31 +276,27 @@ def _check_ramp(command: RampRequest, where: str) -> None:
     apart = all(before[1] < after[0] for before, after in pairwise(groups))
     if not groups or not apart or any(first > last for first, last in groups):
         expected = "one or more [first, last], first <= last, none overlapping another"
-        raise refusal("groups", groups, expected, where)
+        raise codec.refusal("groups", groups, expected, where)
     if not command.gains:
-        raise refusal("gains", command.gains, "one or more gains to try", where)
+        raise codec.refusal("gains", command.gains, "one or more gains to try", where)
 
 
-travels(
-    Form(
-        DitherRequest,
-        "a dither command",
-        first=("id", "kind"),
-        keys=lambda keys: {**keys, "action": _START},
-        fields=_starts,
-        check=_check_dither,
-    )
+codec.travels(
+    DitherRequest,
+    "a dither command",
+    first=("id", "kind"),
+    keys=lambda keys: {**keys, "action": _START},
+    fields=_starts,
+    check=_check_dither,
 )
-travels(Form(DitherStop, "a dither command", keys=lambda keys: {**keys, "action": _STOP}))
-travels(Form(LoopRequest, "a loop command"))
-travels(
-    Form(
-        MeasureRequest,
-        "a measure command",
-        first=("id", "pattern", "modes", "amplitude_m", "n_average"),
-        check=_check_measurement,
-    )
+codec.travels(DitherStop, "a dither command", keys=lambda keys: {**keys, "action": _STOP})
+codec.travels(LoopRequest, "a loop command")
+codec.travels(
+    MeasureRequest,
+    "a measure command",
+    first=("id", "pattern", "modes", "amplitude_m", "n_average"),
+    check=_check_measurement,
 )
-travels(Form(RampRequest, "a ramp command", check=_check_ramp))
-travels(Form(OffloadRequest, "an offload command"))
-travels(Form(Reply, "a reply", fields=reason_or_none))
+codec.travels(RampRequest, "a ramp command", check=_check_ramp)
+codec.travels(OffloadRequest, "an offload command")
+codec.travels(Reply, "a reply", fields=codec.reason_or_none)

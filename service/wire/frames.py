@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import WireError
-from service.wire.codec import Form, Id, Opaque, decode, encode, integer, travels, unpack
+from service.wire.codec import Id, Opaque, decode, encode, integer, travels, unpack
 
 BATCH_LIMIT: Final = 4_000_000
 """Bytes: a longer payload is refused unread."""
@@ -146,11 +146,9 @@ def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
 
 
 travels(
-    Form(
-        FrameHeader,
-        "the attachment of a frame batch",
-        opened=lambda data, where: unpack(data, where, ATTACHMENT_LIMIT),
-    )
+    FrameHeader,
+    "the attachment of a frame batch",
+    opened=lambda data, where: unpack(data, where, ATTACHMENT_LIMIT),
 )
 
 

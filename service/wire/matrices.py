@@ -13,24 +13,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from service.errors import WireError
-from service.wire.codec import (
-    SHA256_EXPECTED,
-    Count,
-    Form,
-    Id,
-    Map,
-    Opaque,
-    Positive,
-    Text,
-    applicable,
-    get,
-    integer,
-    read,
-    read_four,
-    refusal,
-    travels,
-)
-from service.wire.commands import Pattern
+from service.wire import codec, commands
 
 CHUNK_LIMIT: Final = 4_000_000
 """Bytes of the largest part."""
@@ -43,7 +26,7 @@ DTYPE: Final = "<f4"
 
 AXIS_LIMIT: Final = 1_000_000
 
-_Axis = Annotated[int, integer(0, AXIS_LIMIT)]
+_Axis = Annotated[int, codec.integer(0, AXIS_LIMIT)]
 _AXES: Final = f"two axes, at most {MATRIX_LIMIT} bytes"
 
 
@@ -54,13 +37,13 @@ class MatrixLayout:
     shape: Annotated[tuple[_Axis, _Axis], Meta(description=_AXES)]
     """Rows and columns, C order, little-endian float32."""
 
-    n_chunks: Count
+    n_chunks: codec.Count
     """Parts it travels in; 0: there is no matrix (a measurement that failed)."""
 
-    chunk_bytes: Annotated[int, integer(1, CHUNK_LIMIT)]
+    chunk_bytes: Annotated[int, codec.integer(1, CHUNK_LIMIT)]
     """Bytes of each part but the last, which may be shorter."""
 
-    sha256: Annotated[str, Meta(pattern=r"\A([0-9a-f]{64})?\Z", description=SHA256_EXPECTED)]
+    sha256: Annotated[str, Meta(pattern=r"\A([0-9a-f]{64})?\Z", description=codec.SHA256_EXPECTED)]
     """Of all its bytes, 64 lower-case hex digits; empty: there is no matrix."""
 
     @property
@@ -77,7 +60,7 @@ class MatrixLayout:
 class Manifest:
     """A reconstructor on its way from the service to the RTC, or the one the RTC uses."""
 
-    id: Id
+    id: codec.Id
     """Never reused."""
 
     layout: MatrixLayout
@@ -89,22 +72,22 @@ class Manifest:
     sigma: Mapping[str, float] | None
     """1 σ of ``alpha``, same names and units."""
 
-    im_id: Text | None
+    im_id: codec.Text | None
     """Informative: the interaction matrix it inverts."""
 
-    parent: Text | None
+    parent: codec.Text | None
     """Informative: the reconstructor it follows."""
 
-    basis_id: Opaque
+    basis_id: codec.Opaque
     """Of the modal basis it commands."""
 
-    config_id: Opaque
+    config_id: codec.Opaque
     """Of the slopes it multiplies."""
 
-    system: Id
+    system: codec.Id
     """The ``{system}`` of the keys."""
 
-    created_ns: Count
+    created_ns: codec.Count
     """When it was computed, nanoseconds since the Unix epoch, UTC."""
 
 
@@ -112,107 +95,102 @@ class Manifest:
 class MeasuredManifest:
     """An interaction matrix the RTC has measured: slope per metre OPD."""
 
-    id: Id
+    id: codec.Id
     """The command's."""
 
     layout: MatrixLayout
     """Shape ``(n_slopes, n_modes_measured)``; no chunks when the measurement failed."""
 
-    reason: Text | None
+    reason: codec.Text | None
     """Why there is no matrix; None when there is one."""
 
     modes: tuple[_Axis, ...]
     """0-based basis indices, one per column."""
 
-    amplitude_m: tuple[Positive, ...]
+    amplitude_m: tuple[codec.Positive, ...]
     """RMS of each mode's stroke, metres OPD."""
 
-    n_average: Annotated[int, integer(1)]
+    n_average: Annotated[int, codec.integer(1)]
     """Repetitions averaged."""
 
-    pattern: Pattern
+    pattern: commands.Pattern
     """How it was measured."""
 
     double_pass: bool
     """Whether the light saw the mirror twice."""
 
-    session: Opaque
+    session: codec.Opaque
     """The RTC's session."""
 
-    basis_id: Opaque
+    basis_id: codec.Opaque
     """As in the frames."""
 
-    config_id: Opaque
+    config_id: codec.Opaque
     """As in the frames."""
 
-    system: Id
+    system: codec.Id
     """The ``{system}`` of the keys."""
 
-    created_ns: Count
+    created_ns: codec.Count
     """When it was measured, nanoseconds since the Unix epoch, UTC."""
 
 
-def _with_keys_of_layout(keys: Map) -> Map:
+def _with_keys_of_layout(keys: codec.Map) -> codec.Map:
     layout = asdict(keys.pop("layout"))
     return {**keys, "dtype": DTYPE, **layout}
 
 
-def _manifest_fields(values: Map, where: str) -> Map:
+def _manifest_fields(values: codec.Map, where: str) -> codec.Map:
     values = _with_layout(values, where)
-    alpha, sigma = (read_four(values, key, where) for key in ("alpha", "sigma"))
+    alpha, sigma = (codec.read_four(values, key, where) for key in ("alpha", "sigma"))
     if alpha is not None and alpha["magnification"] <= 0.0:
         inside = f"'alpha' of {where}"
-        raise refusal("magnification", alpha["magnification"], "a finite number > 0", inside)
+        raise codec.refusal("magnification", alpha["magnification"], "a finite number > 0", inside)
     return {**values, "alpha": alpha, "sigma": sigma}
 
 
-def _measured_fields(values: Map, where: str) -> Map:
+def _measured_fields(values: codec.Map, where: str) -> codec.Map:
     values = _with_layout(values, where, may_fail=True)
     return values | {"reason": None} if values["layout"]["n_chunks"] else values
 
 
 def _check_measured(manifest: MeasuredManifest, where: str) -> None:
     layout, n_modes = manifest.layout, len(manifest.modes)
-    applicable(manifest, where, reason=not layout.n_chunks)
+    codec.applicable(manifest, where, reason=not layout.n_chunks)
     if len(manifest.amplitude_m) != n_modes or (layout.n_chunks and n_modes != layout.shape[1]):
         expected = f"one for each of {layout.shape[1]} measured modes"
-        raise refusal("amplitude_m", manifest.amplitude_m, expected, where)
+        raise codec.refusal("amplitude_m", manifest.amplitude_m, expected, where)
 
 
-def _with_layout(values: Map, where: str, *, may_fail: bool = False) -> Map:
+def _with_layout(values: codec.Map, where: str, *, may_fail: bool = False) -> codec.Map:
     """Return the map of a manifest with its layout, whose keys are among its own, below one."""
-    if get(values, "dtype", where) != DTYPE:
-        raise refusal("dtype", values["dtype"], repr(DTYPE), where)
+    if codec.get(values, "dtype", where) != DTYPE:
+        raise codec.refusal("dtype", values["dtype"], repr(DTYPE), where)
     failed = may_fail and values.get("n_chunks") == 0
     if failed:
         values["sha256"] = ""
-    layout = read(values, MatrixLayout, where)
+    layout = codec.read(values, MatrixLayout, where)
     if layout.n_bytes > MATRIX_LIMIT:
-        raise refusal("shape", str(layout.shape), _AXES, where)
+        raise codec.refusal("shape", str(layout.shape), _AXES, where)
     expected = math.ceil(layout.n_bytes / layout.chunk_bytes)
     if layout.n_chunks != expected and not failed:
-        raise refusal("n_chunks", layout.n_chunks, f"{expected} for shape {layout.shape}", where)
+        raise codec.refusal(
+            "n_chunks", layout.n_chunks, f"{expected} for shape {layout.shape}", where
+        )
     if not layout.sha256 and not failed:
-        raise refusal("sha256", layout.sha256, SHA256_EXPECTED, where)
+        raise codec.refusal("sha256", layout.sha256, codec.SHA256_EXPECTED, where)
     return {**values, "layout": asdict(layout)}
 
 
-travels(
-    Form(
-        Manifest,
-        "the manifest of a reconstructor",
-        keys=_with_keys_of_layout,
-        fields=_manifest_fields,
-    )
+codec.travels(
+    Manifest, "the manifest of a reconstructor", keys=_with_keys_of_layout, fields=_manifest_fields
 )
-travels(
-    Form(
-        MeasuredManifest,
-        "the manifest of a measured matrix",
-        keys=_with_keys_of_layout,
-        fields=_measured_fields,
-        check=_check_measured,
-    )
+codec.travels(
+    MeasuredManifest,
+    "the manifest of a measured matrix",
+    keys=_with_keys_of_layout,
+    fields=_measured_fields,
+    check=_check_measured,
 )
 
 

@@ -13,32 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import WireError
-from service.wire.codec import (
-    MESSAGE_LIMIT,
-    Count,
-    Finite,
-    Form,
-    Id,
-    Map,
-    Opaque,
-    Sha256,
-    Text,
-    above,
-    as_map,
-    get,
-    integer,
-    number,
-    of_map,
-    read_four,
-    reason_or_none,
-    refusal,
-    to_map,
-    travels,
-    unpack,
-)
-from service.wire.commands import DitherRequest, Loop
+from service.wire import codec, commands
 
-STATUS_LIMIT: Final = MESSAGE_LIMIT + 16 * 512**2
+STATUS_LIMIT: Final = codec.MESSAGE_LIMIT + 16 * 512**2
 """Bytes: a longer status is refused unread; its images come on top of what a message may have."""
 
 WHERE: Final = "a status"
@@ -61,10 +38,10 @@ ESSENTIAL: Final = (
 class DitherStatus:
     """The dither the RTC is playing."""
 
-    request: DitherRequest
+    request: commands.DitherRequest
     """What was asked for."""
 
-    start_seq: Count
+    start_seq: codec.Count
     """First frame whose exposure contains it."""
 
 
@@ -72,10 +49,10 @@ class DitherStatus:
 class Pointing:
     """A direction of the telescope."""
 
-    elevation_deg: Annotated[float, number(-90.0, 90.0)]
+    elevation_deg: Annotated[float, codec.number(-90.0, 90.0)]
     """Above the horizon."""
 
-    azimuth_deg: Annotated[float, number(-720.0, 720.0)]
+    azimuth_deg: Annotated[float, codec.number(-720.0, 720.0)]
     """From north over east; only differences count."""
 
 
@@ -83,13 +60,13 @@ class Pointing:
 class ControlLaw:
     """The integrator of the loop: ``c[k+d] = leak * c[k+d-1] - gain * R s[k]``."""
 
-    delay_frames: Annotated[float, number(0.0, 100.0)]
+    delay_frames: Annotated[float, codec.number(0.0, 100.0)]
     """End to end, from exposure to the command that answers it."""
 
-    gains: tuple[Annotated[float, number(0.0)], ...]
+    gains: tuple[Annotated[float, codec.number(0.0)], ...]
     """One per mode of the basis, 0 where uncontrolled."""
 
-    leak: Annotated[float, number(0.0, 1.0)]
+    leak: Annotated[float, codec.number(0.0, 1.0)]
     """Per frame; 1 forgets nothing."""
 
 
@@ -97,49 +74,49 @@ class ControlLaw:
 class Status(ControlLaw):
     """The RTC's own account of its loop, a few times a second."""
 
-    session: Opaque
+    session: codec.Opaque
     """As in the frames."""
 
-    seq: Count | None
+    seq: codec.Count | None
     """The last frame processed; None: there has been none yet."""
 
-    t_ns: Count
+    t_ns: codec.Count
     """Nanoseconds since the Unix epoch, UTC."""
 
-    loop: Loop
+    loop: commands.Loop
     """Closed, open, or closed with the gain of some controlled modes at 0."""
 
-    frame_rate_hz: Annotated[float, above(0.0, 1e6)]
+    frame_rate_hz: Annotated[float, codec.above(0.0, 1e6)]
     """Frames a second, nominal or measured."""
 
-    n_slopes: Annotated[int, integer(1)]
+    n_slopes: Annotated[int, codec.integer(1)]
     """Slopes of a frame."""
 
-    n_modes: Annotated[int, integer(1)]
+    n_modes: Annotated[int, codec.integer(1)]
     """Modes of the whole basis, controlled or not."""
 
-    n_controlled: Count
+    n_controlled: codec.Count
     """Modes that the reconstructor in use commands, the first ones of the basis."""
 
-    cm_id: Id | None
+    cm_id: codec.Id | None
     """The reconstructor in use; None when the RTC does not know."""
 
-    basis_id: Opaque
+    basis_id: codec.Opaque
     """Of the modal basis, as in the frames."""
 
-    config_id: Opaque
+    config_id: codec.Opaque
     """Of the sensor, as in the frames."""
 
     dither: DitherStatus | None
     """What plays, as it was asked for; None: nothing does."""
 
-    max_dither_m: Annotated[float, number(0.0)]
+    max_dither_m: Annotated[float, codec.number(0.0)]
     """Most the RTC accepts for one mode, metres RMS."""
 
-    max_dither_modes: Count
+    max_dither_modes: codec.Count
     """Most modes the RTC dithers at once."""
 
-    magnitude: Finite | None
+    magnitude: codec.Finite | None
     """Of the guide star."""
 
     flux: bytes | None = field(default=None, repr=False)
@@ -148,7 +125,7 @@ class Status(ControlLaw):
     pointing: Pointing | None = None
     """An extension: an RTC that does not know it may leave the key out."""
 
-    trouble: Text | None = None
+    trouble: codec.Text | None = None
     """An extension: what is wrong on the RTC's side, for people; None or no such key: nothing."""
 
     @property
@@ -162,7 +139,7 @@ class Status(ControlLaw):
 
         Some gains of 0 ("partial") make it a loop of the other modes, no less closed.
         """
-        if self.loop == Loop.OPEN:
+        if self.loop == commands.Loop.OPEN:
             return ()
         return tuple(compress(range(self.n_controlled), self.gains))
 
@@ -187,22 +164,22 @@ class AckState(StrEnum):
 class Acknowledgement:
     """The RTC's word on one reconstructor."""
 
-    session: Opaque
+    session: codec.Opaque
     """The RTC's, as in the frames: an acknowledgement of another session is ignored."""
 
-    id: Id | None
+    id: codec.Id | None
     """None: the commit that is rejected could not be read."""
 
-    sha256: Sha256 | None
+    sha256: codec.Sha256 | None
     """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
 
     state: AckState
     """How far it has come."""
 
-    reason: Text
+    reason: codec.Text
     """Why it was rejected; empty otherwise."""
 
-    frame_seq: Count | None
+    frame_seq: codec.Count | None
     """First frame whose slopes the new matrix multiplies; None unless applied."""
 
 
@@ -210,13 +187,13 @@ class Acknowledgement:
 class StateMessage:
     """The service's state for all subscribers; an RTC ignores it."""
 
-    system: Id
+    system: codec.Id
     """The ``{system}`` of the keys."""
 
-    t_ns: Count
+    t_ns: codec.Count
     """When it was said, nanoseconds since the Unix epoch, UTC."""
 
-    mode: Text
+    mode: codec.Text
     """How much the service may do by itself: auto, propose or hold."""
 
     alpha: Mapping[str, float] | None
@@ -225,17 +202,17 @@ class StateMessage:
     sigma: Mapping[str, float] | None
     """1 σ of ``alpha``, same names and units."""
 
-    in_use: Id | None
+    in_use: codec.Id | None
     """The reconstructor the RTC multiplies with; None: unknown."""
 
-    validity: Text | None = None
+    validity: codec.Text | None = None
     """Whether ``alpha`` may be relied on: fresh, ageing, stale or invalid; None: nothing is known,
     or a service of before this key said it."""
 
-    waiting_for: tuple[Text, ...] = ()
+    waiting_for: tuple[codec.Text, ...] = ()
     """Whom the service waits for and what they should do."""
 
-    operation: Text | None = None
+    operation: codec.Text | None = None
     """What the service is in and does, like "Operational, Tracking"; None: a service of before this
     key said it."""
 
@@ -244,19 +221,19 @@ class StateMessage:
 class AlarmMessage:
     """One alarm that began or ended, for all subscribers."""
 
-    system: Id
+    system: codec.Id
     """The ``{system}`` of the keys."""
 
-    t_ns: Count
+    t_ns: codec.Count
     """When it came or went, nanoseconds since the Unix epoch, UTC."""
 
-    name: Opaque
+    name: codec.Opaque
     """Machine-readable."""
 
     active: bool
     """False: it is over."""
 
-    text: Text
+    text: codec.Text
     """What was found, and what to do."""
 
 
@@ -272,88 +249,75 @@ def essentials(data: bytes) -> tuple[object, ...]:
     return tuple(values.get(key) for key in ESSENTIAL)
 
 
-def _opened(data: bytes, where: str) -> Map:
+def _opened(data: bytes, where: str) -> codec.Map:
     """Return the map of a status that is no longer than its limit, its images left aside."""
-    values = unpack(data, where, STATUS_LIMIT)
+    values = codec.unpack(data, where, STATUS_LIMIT)
     flux = values.get("flux")
     n_bytes = len(data) - (len(flux) if isinstance(flux, bytes) else 0)
-    if n_bytes > MESSAGE_LIMIT:
+    if n_bytes > codec.MESSAGE_LIMIT:
         raise WireError(
             f"range: a status has {n_bytes} bytes besides its flux, expected at most "
-            f"{MESSAGE_LIMIT}"
+            f"{codec.MESSAGE_LIMIT}"
         )
     return values
 
 
-def _status_keys(keys: Map) -> Map:
+def _status_keys(keys: codec.Map) -> codec.Map:
     playing = keys["dither"]
     if keys["trouble"] is None:
         del keys["trouble"]
     if playing is None:
         return keys
-    return {**keys, "dither": {**to_map(playing.request), "start_seq": playing.start_seq}}
+    return {**keys, "dither": {**codec.to_map(playing.request), "start_seq": playing.start_seq}}
 
 
-def _status_fields(values: Map, where: str) -> Map:
-    playing, inside = get(values, "dither", where), f"'dither' of {where}"
+def _status_fields(values: codec.Map, where: str) -> codec.Map:
+    playing, inside = codec.get(values, "dither", where), f"'dither' of {where}"
     if playing is None:
         return values
-    request = of_map(DitherRequest, as_map(playing, inside), inside)
-    start_seq = get(playing, "start_seq", inside)
+    request = codec.of_map(commands.DitherRequest, codec.as_map(playing, inside), inside)
+    start_seq = codec.get(playing, "start_seq", inside)
     return {**values, "dither": {"request": asdict(request), "start_seq": start_seq}}
 
 
 def _check_status(status: Status, where: str) -> None:
     if len(status.gains) != status.n_modes:
-        raise refusal("gains", status.gains, f"one for each of {status.n_modes} modes", where)
+        raise codec.refusal("gains", status.gains, f"one for each of {status.n_modes} modes", where)
     if status.n_controlled > status.n_modes:
         expected = f"an integer from 0 to {status.n_modes}"
-        raise refusal("n_controlled", status.n_controlled, expected, where)
+        raise codec.refusal("n_controlled", status.n_controlled, expected, where)
     flux = status.flux
     if flux is not None and 16 * math.isqrt(len(flux) // 16) ** 2 != len(flux):
-        raise refusal("flux", flux, "bytes of four square float32 images", where)
+        raise codec.refusal("flux", flux, "bytes of four square float32 images", where)
 
 
-def _check_acknowledgement(acknowledgement: Acknowledgement, where: str) -> None:
-    if (acknowledgement.frame_seq is not None) != (acknowledgement.state is AckState.APPLIED):
-        raise refusal(
-            "frame_seq", acknowledgement.frame_seq, "a number if and only if applied", where
-        )
-    if acknowledgement.state is not AckState.REJECTED and (
-        acknowledgement.id is None or acknowledgement.sha256 is None
-    ):
-        raise refusal(
-            "id, sha256",
-            (acknowledgement.id, acknowledgement.sha256),
-            "both, unless rejected",
-            where,
-        )
+def _check_acknowledgement(ack: Acknowledgement, where: str) -> None:
+    if (ack.frame_seq is not None) != (ack.state is AckState.APPLIED):
+        raise codec.refusal("frame_seq", ack.frame_seq, "a number if and only if applied", where)
+    if ack.state is not AckState.REJECTED and (ack.id is None or ack.sha256 is None):
+        raise codec.refusal("id, sha256", (ack.id, ack.sha256), "both, unless rejected", where)
 
 
-def _state_fields(values: Map, where: str) -> Map:
-    four = {key: read_four(values, key, where) for key in ("alpha", "sigma")}
+def _state_fields(values: codec.Map, where: str) -> codec.Map:
+    four = {key: codec.read_four(values, key, where) for key in ("alpha", "sigma")}
     absent = {"waiting_for": values.get("waiting_for") or (), "operation": values.get("operation")}
     return {**values, **four, **absent}
 
 
-travels(
-    Form(
-        Status,
-        WHERE,
-        first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
-        extensions=("pointing", "trouble"),
-        opened=_opened,
-        keys=_status_keys,
-        fields=_status_fields,
-        check=_check_status,
-    )
+codec.travels(
+    Status,
+    WHERE,
+    first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
+    extensions=("pointing", "trouble"),
+    opened=_opened,
+    keys=_status_keys,
+    fields=_status_fields,
+    check=_check_status,
 )
-travels(
-    Form(Acknowledgement, "an acknowledgement", fields=reason_or_none, check=_check_acknowledgement)
+codec.travels(
+    Acknowledgement, "an acknowledgement", fields=codec.reason_or_none, check=_check_acknowledgement
 )
-travels(
-    Form(
-        StateMessage, "a state message", extensions=("validity",), fields=_state_fields, held=False
-    )
+codec.travels(
+    StateMessage, "a state message", extensions=("validity",), fields=_state_fields, held=False
 )
-travels(Form(AlarmMessage, "an alarm message", held=False))
+codec.travels(AlarmMessage, "an alarm message", held=False)

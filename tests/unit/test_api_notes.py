@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.archive.notes import Annotation
+from service.archive.nights import Annotation
 from service.errors import StorageError
 from tests.unit.test_api import MATRIX, SECOND, assert_problem, service
 
@@ -35,7 +35,7 @@ async def test_a_note_without_a_time_is_of_now(client):
 async def test_notes_of_a_time_are_its_newest_oldest_first(client, service):
     for k in range(5):
         note = Annotation(t_ns_utc=k * SECOND, written_ns_utc=k, who="Ada", note=f"note {k}")
-        service.archive.annotations.add(note)
+        service.archive.nights.add_note(note)
     asked = {"since_ns": SECOND, "until_ns": 4 * SECOND, "limit": 3}
     found = (await client.get("/v1/annotations", params=asked)).json()["annotations"]
     assert [one["note"] for one in found] == ["note 2", "note 3", "note 4"]
@@ -50,7 +50,7 @@ async def test_a_note_the_disk_refuses_is_told(client, service, monkeypatch):
     def refuses(_):
         raise StorageError("disk full")
 
-    monkeypatch.setattr(service.archive.annotations, "add", refuses)
+    monkeypatch.setattr(service.archive.nights, "add_note", refuses)
     refused = await client.post("/v1/annotations", json=NOTED)
     assert_problem(refused, 507, "archive-failed", "disk full")
     assert not service.audited

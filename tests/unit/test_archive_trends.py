@@ -7,14 +7,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.archive.trends import TREND_S, TrendSample
+from service.archive.nights import TREND_S, TrendSample
 from service.control.expected_gain import ExpectedGain
 from service.control.gains import ModeGain
 from service.errors import ArchiveError
 from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
-from service.runtime import trends as of_moments
-from service.runtime.trends import TrendSampler, residual_of, sample_of
+from service.runtime import telemetry_recorder as of_moments
+from service.runtime.telemetry_recorder import TrendSampler, residual_of, sample_of
 from service.tracking.products import Assessment
 from service.wire import Pointing
 from tests.states import changed
@@ -46,7 +46,7 @@ def at(t_s, **changes):
 def test_a_sample_comes_back_as_it_was(archive):
     nothing = TrendSample(t_ns_utc=2 * SECOND)
     archive.record((), (), (), (FULL, nothing))
-    full, bare = archive.trends.between(0, 2 * SECOND, 10)
+    full, bare = archive.nights.samples(0, 2 * SECOND, 10)
     assert isinstance(full.n_controlled, int)
     assert bare == nothing or bare.alpha is bare.sigma is bare.residual_m is None
     for field in fields(TrendSample):
@@ -59,7 +59,7 @@ def test_a_sample_comes_back_as_it_was(archive):
 def test_of_many_the_worst_and_the_ends_remain(archive):
     night = [at(15 * k, residual_m=9e-7 if k == 777 else 5e-8) for k in range(3000)]
     archive.record((), (), (), night)
-    found = archive.trends.between(0, 10**18, 200)
+    found = archive.nights.samples(0, 10**18, 200)
     assert 100 <= len(found) <= 200
     assert found[-1].t_ns_utc == night[-1].t_ns_utc
     assert max(one.residual_m for one in found) == 9e-7

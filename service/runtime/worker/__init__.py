@@ -4,8 +4,20 @@ A compute thread beside the ingest raises its latency thirty-fold; a nice'd proc
 alone.
 """
 
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Concatenate, Generic, ParamSpec, TypeVar
+
+from service.model.instrument import Instrument
+from service.runtime.processes import Worker
 from service.runtime.worker.optics_worker import OpticsWorker
-from service.runtime.worker.process import Done, run_job, start_worker
 from service.runtime.worker.records import Compute, Conditions, Made, Sampling
 
 __all__ = [
@@ -18,3 +30,53 @@ __all__ = [
     "run_job",
     "start_worker",
 ]
+
+_open_worker: Callable[[], OpticsWorker] | None = None
+"""Of the worker process: it outlives a job."""
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Done(Generic[R]):
+    """What came of a job, and what it cost."""
+
+    result: R
+    cpu_s: float
+    """Processor time of the whole worker process, all its threads, seconds."""
+
+
+def start_worker(instrument: Instrument, compute: Compute, early: Worker | None = None) -> Worker:
+    """Return a nice'd worker process; nothing runs before the first job but what began early."""
+    return (early or Worker()).begun(functools.partial(_enter, instrument, compute))
+
+
+def run_job(
+    job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
+) -> Done[R]:
+    """Run a method of the optics worker in its process."""
+    if _open_worker is None:
+        raise RuntimeError("not in a worker process")
+    before_s, optics = time.process_time(), _open_worker()
+    try:
+        result = job(optics, *args, **kwargs)
+    finally:
+        optics.tidy()
+        _return_memory()
+    return Done(result=result, cpu_s=time.process_time() - before_s)
+
+
+def _return_memory() -> None:
+    """Return what is free to the system: a linearisation leaves hundreds of megabytes behind."""
+    with contextlib.suppress(OSError, AttributeError):  # only the GNU C library has it
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _enter(instrument: Instrument, compute: Compute) -> None:
+    """Prepare the worker process."""
+    global _open_worker
+    os.nice(compute.nice)
+    _open_worker = functools.cache(lambda: OpticsWorker(instrument, compute))
+    with contextlib.suppress(Exception):  # the first job meets it again, fails and says why
+        _open_worker()

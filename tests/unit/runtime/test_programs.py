@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from service.errors import WorkerError
-from service.runtime.programs import run_program
+from service.runtime.uploads import run_program
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -56,7 +56,7 @@ class Refits:
 
     def begin(self, effects: Iterable[Effect], now_ns: int) -> None:
         """Remember a job from the moment its computation begins; its id is the order's."""
-        (made,) = (effect for effect in effects if isinstance(effect, ev.MakeMatrix))
+        made = next(effect for effect in effects if isinstance(effect, ev.MakeMatrix))
         self._jobs[made.cause] = RefitJob(
             id=made.cause, state=RefitState.RUNNING, n_modes=made.n_modes, asked_ns_utc=now_ns
         )

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +29,7 @@ from service.errors import (
 from service.estimation.frames import FrameBlock
 from service.files.recording import RecordingWriter
 from service.tracking.commands import Instruction
+from service.tracking.events import new_id
 from service.tracking.state import TrackerState
 
 LONGEST_S = 3600.0
@@ -122,9 +122,8 @@ class TelemetryRecorder:
             if full is not None:
                 raise CommandError(f"nothing is recorded: {full}")
             now_ns = time.time_ns()
-            now = datetime.fromtimestamp(now_ns / 1e9, UTC)
             record = RecordingRecord(
-                id=f"tm-{now:%Y%m%dT%H%M%S.%f}",
+                id=new_id("tm", now_ns),
                 state=RUNNING,
                 created_ns_utc=now_ns,
                 duration_s=duration_s,

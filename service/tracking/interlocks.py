@@ -221,10 +221,11 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
     state = moment.state
     record = _meant(state, matrix_id)
     if record is None or record.state is not MatrixState.PROPOSED:
-        return _not_proposed(record)
+        return f"{_not_proposed(record)}{'' if record else ': refit first'}"
     registration = state.alpha.registration
     if registration is not None and not registration.usable:
-        return f"{record.id} cannot be judged: α is invalid ({registration.validity.reason})"
+        why = registration.validity.reason
+        return f"{record.id} cannot be judged: α is invalid ({why}): wait for a window"
     if left_behind(state, record, moment.policy):
         return f"{record.id} was made for another α than the present one: refit"
     reason = why_refused(state, record)

@@ -88,7 +88,7 @@ def test_each_moment_refuses_something_and_each_order_is_refused_and_allowed_som
 @pytest.mark.parametrize(
     ("moment", "order", "words"),
     [
-        (in_use, "approve", "no reconstructor is proposed"),
+        (in_use, "approve", "no reconstructor is proposed: refit first"),
         (proposed, "give_up", "nothing is being measured"),
         (proposed, "resume", "nothing is stopped"),
         (

@@ -37,7 +37,7 @@ from service.tracking.policy import Policy
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import note_declined
-from service.tracking.updates import decide, fetch_in_use
+from service.tracking.updates import decide_updates, fetch_in_use
 from service.wire import (
     Acknowledgement,
     DitherRequest,
@@ -87,18 +87,18 @@ def step(
         part(context, event)
         derive_alarms(context)
     ordered = isinstance(event, Command)
-    alarm_records.follow(context, timely=isinstance(event, ev.Tick), ordered=ordered)
+    alarm_records.update_records(context, timely=isinstance(event, ev.Tick), ordered=ordered)
     return context.state, tuple(context.effects)
 
 
 def _react(context: StepContext, event: Event) -> None:
     """Take the event in."""
-    measurement.watch(context, event)
+    measurement.give_up_lost(context, event)
     reaction = REACTIONS.get(type(event))
     if reaction is not None:
         reaction(context, event)
-    refusals.follow(context)
-    probation.follow(context, event)
+    refusals.reset_run(context)
+    probation.advance(context, event)
     note_declined(context, rejected=isinstance(event, cmd.Reject))
 
 
@@ -110,19 +110,19 @@ def _go_on(context: StepContext, event: Event) -> None:
     if context.operator.stopped_because:
         resume.keep_stopped(context)
         return
-    acquisition.acquire(context, event)
+    acquisition.advance(context, event)
     if context.acquisition.under_way:
         return
-    noisy_measurement.follow(context, event)
+    noisy_measurement.advance(context, event)
     if not noisy_measurement.awaits_its_dither(context.state):
-        decide(context)
-        offload.demand(context)
+        decide_updates(context)
+        offload.request_offload(context)
 
 
 def _on_tick(context: StepContext, _: ev.Tick) -> None:
     """Let what depends on the time alone age: the RTC's silence, α, alarms."""
     rtc.on_tick(context)
-    validity.age(context)
+    validity.age_registration(context)
     operator.close_again(context)
 
 
@@ -146,9 +146,9 @@ def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
     if context.state.measuring is not None:
         window_processing.reject_window(context, measurement.MEASURING)
         return
-    mode_proof.learn(context, event.estimate)
+    mode_proof.learn_modes(context, event.estimate)
     window_processing.on_window(context, event)
-    dither.learn(context, event.estimate)
+    dither.learn_precision(context, event.estimate)
 
 
 def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
@@ -156,7 +156,7 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
     if context.acquisition.under_way:
         reconstructors.propose(context, made.record)
     elif probation.is_way_back(context.state, made):
-        probation.go_back(context, made)
+        probation.send_way_back(context, made)
     else:
         reconstructors.on_matrix(context, made)
 
@@ -165,7 +165,9 @@ def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
     """Stop a dither that is stronger in the light than was asked for."""
     loud = dither.why_too_strong(context, event)
     if loud is not None:
-        noisy_measurement.cut_off(context, f"its dither was too strong: {event.text}")
+        noisy_measurement.fail_noisy_measurement(
+            context, f"its dither was too strong: {event.text}"
+        )
         dither.stop_too_strong(context, event.id, loud)
 
 
@@ -195,11 +197,11 @@ def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
     """Note that something could not be done, where it was asked for."""
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
-            measurement.fail(context, context.state.measurement(name), failed.text)
+            measurement.fail_measurement(context, context.state.measurement(name), failed.text)
         case ev.Ask(request=OffloadRequest(id=name)):
             offload.on_failure(context, name, failed.text)
         case ev.FinishNoisy(record=noisy):
-            measurement.fail(context, noisy, failed.text)
+            measurement.fail_measurement(context, noisy, failed.text)
         case ev.Ask(request=LoopRequest(id=name) | RampRequest(id=name)):
             operator.on_loop_answer(context, name, CommandState.FAILED, failed.text)
         case effect:
@@ -220,7 +222,7 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.PassiveUnavailable: window_processing.on_passive_unavailable,
     ev.MatrixMade: _on_made,
     ev.MatrixFetched: reconstructors.on_fetched,
-    ev.ModesRecognised: mode_proof.recognise,
+    ev.ModesRecognised: mode_proof.note_recognised,
     ev.MarginJudged: reconstructors.on_margin,
     ev.ProposalJudged: reconstructors.on_proposal_judged,
     Acknowledgement: reconstructors.on_acknowledgement,
@@ -238,8 +240,8 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     cmd.SetValue: alarm_rules.set_value,
     cmd.SetLoop: operator.set_loop,
     cmd.Ramp: operator.ramp,
-    cmd.StopEverything: resume.stop,
-    cmd.Resume: resume.release,
+    cmd.StopEverything: resume.stop_everything,
+    cmd.Resume: resume.resume_everything,
     cmd.Acquire: acquisition.acquire_on_command,
     cmd.AbortAcquisition: acquisition.abort_on_command,
     cmd.StartDither: operator.start_dither,

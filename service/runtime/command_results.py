@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from service.errors import CommandError, LinkError
 from service.tracking import commands as cmd
-from service.tracking.alarm_records import muted
+from service.tracking.alarm_records import muted_records
 from service.tracking.alarm_rules import as_text
 from service.tracking.alarms import AlarmRecord
 from service.tracking.commands import Command
@@ -238,5 +238,5 @@ def _alarm(now: TrackerState, name: str) -> str:
         said.append("over and done with")
     if record.muted is not None:
         left_s = ((record.muted.until_ns_utc or 0) - record.muted.t_ns_utc) / 1e9
-        said.append(f"muted for {left_s:.0f} s, with {len(muted(now))} muted in all")
+        said.append(f"muted for {left_s:.0f} s, with {len(muted_records(now))} muted in all")
     return f"{name} is {', '.join(said)}"

@@ -32,7 +32,7 @@ from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.events import Effect, Event
-from service.tracking.operations.running import OperationKind, under_way
+from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.state import TrackerState
 from service.wire import Status
@@ -183,7 +183,7 @@ class Engine:
         if state.alpha.registration is None or state.alarms.active or state.on_probation:
             return 0.0
         dithers = (OperationKind.OWN_DITHER, OperationKind.OTHER_DITHER)
-        steady = all(running.kind in dithers for running in under_way(state, now_ns))
+        steady = all(running.kind in dithers for running in running_operations(state, now_ns))
         return STEADY_GATHER_S if steady else 0.0
 
     def take_sums(self) -> list[PassiveSums | str | None]:

@@ -21,7 +21,7 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import Mode, TrackerState
-from service.tracking.update_policy import PROPOSAL_STANDS_S, outdated
+from service.tracking.update_policy import PROPOSAL_STANDS_S, is_outdated
 from service.wire import TEXT_LIMIT, StateMessage
 
 SILENT_S: Final = 3.0
@@ -330,7 +330,7 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
 
 def _replaced(state: TrackerState, record: ReconstructorRecord) -> str:
     """Return that a proposal will be replaced, and when; empty: it fits α."""
-    if state.operator.mode is Mode.HOLD or not outdated(state, record):
+    if state.operator.mode is Mode.HOLD or not is_outdated(state, record):
         return ""
     until_s = record.created_ns_utc / SECOND_NS + PROPOSAL_STANDS_S
     then = datetime.fromtimestamp(until_s, UTC)

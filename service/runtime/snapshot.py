@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from service.control.gains import ModeGain
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS, Misregistration
-from service.tracking.alarm_records import muted, record_of, stale, worst
+from service.tracking.alarm_records import muted_records, record_of, stale_records, worst_severity
 from service.tracking.alarms import ALARMS, AlarmDefinition, AlarmRecord, Prerequisite, Severity
 from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
@@ -117,17 +117,17 @@ class Snapshot:
     @property
     def stale_alarms(self) -> tuple[AlarmStatus, ...]:
         """Those that have gone and nobody has acknowledged."""
-        return tuple(AlarmStatus(record=record) for record in stale(self.tracker))
+        return tuple(AlarmStatus(record=record) for record in stale_records(self.tracker))
 
     @property
     def muted_alarms(self) -> tuple[AlarmRecord, ...]:
         """Those that are muted, whether they last or not."""
-        return muted(self.tracker)
+        return muted_records(self.tracker)
 
     @property
     def worst_severity(self) -> Severity | None:
         """Of all that last, or went unseen; null: there is nothing."""
-        return worst(self.tracker)
+        return worst_severity(self.tracker)
 
     @property
     def alpha(self) -> Alpha | None:

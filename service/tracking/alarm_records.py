@@ -28,7 +28,7 @@ RAISED_AGAIN_S = 60.0
 """After a restart of the service, for an alarm that lasts to be raised again."""
 
 
-def follow(context: StepContext, *, timely: bool, ordered: bool) -> None:
+def update_records(context: StepContext, *, timely: bool, ordered: bool) -> None:
     """Keep the notes in step with the alarms, and with the time.
 
     ``timely``: the time has gone on. ``ordered``: an operator has given a command, and what it ends
@@ -39,11 +39,13 @@ def follow(context: StepContext, *, timely: bool, ordered: bool) -> None:
     notes = {record.name: record for record in context.alarms.records}
     raised = {alarm.name: alarm for alarm in context.alarms.active}
     for alarm in raised.values():
-        notes[alarm.name] = _raised(notes.get(alarm.name, AlarmRecord(name=alarm.name)), alarm)
+        notes[alarm.name] = _with_alarm(notes.get(alarm.name, AlarmRecord(name=alarm.name)), alarm)
     for name, record in notes.items():
         if name not in raised:
-            notes[name] = _not_raised(context, record, ordered=ordered)
-    _keep(context, {name: _unmuted(record, context.now_ns) for name, record in notes.items()})
+            notes[name] = _without_alarm(context, record, ordered=ordered)
+    _store(
+        context, {name: _without_old_mute(record, context.now_ns) for name, record in notes.items()}
+    )
 
 
 def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
@@ -52,22 +54,22 @@ def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
         (record for record in state.alarms.records if record.name == alarm.name),
         AlarmRecord(name=alarm.name),
     )
-    return replace(_raised(known, alarm), text=alarm.text)
+    return replace(_with_alarm(known, alarm), text=alarm.text)
 
 
-def stale(state: TrackerState) -> tuple[AlarmRecord, ...]:
+def stale_records(state: TrackerState) -> tuple[AlarmRecord, ...]:
     """Return the alarms that have gone and nobody has seen."""
     return tuple(
         record for record in state.alarms.records if record.alarm_state is AlarmState.STALE
     )
 
 
-def muted(state: TrackerState) -> tuple[AlarmRecord, ...]:
+def muted_records(state: TrackerState) -> tuple[AlarmRecord, ...]:
     """Return the alarms that are muted, whether they last or not."""
     return tuple(record for record in state.alarms.records if record.muted is not None)
 
 
-def worst(state: TrackerState) -> Severity | None:
+def worst_severity(state: TrackerState) -> Severity | None:
     """Return the most severe of what lasts, or went unseen; None: there is nothing."""
     found: Severity | None = None
     for record in state.alarms.records:
@@ -93,8 +95,8 @@ def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
             f"{record.name} has been {worst_yet}, and {seen} was seen of it: look again"
         )
     known = replace(record, acknowledged=_operator_note(context, command))
-    notes[record.name] = known if record.over_ns_utc is None else _done_with(record)
-    _keep(context, notes)
+    notes[record.name] = known if record.over_ns_utc is None else _blank(record)
+    _store(context, notes)
     context.log("alarm.acknowledged", f"{record.name} {command.signed}")
 
 
@@ -111,7 +113,7 @@ def mute(context: StepContext, command: cmd.MuteAlarm) -> None:
     notes[record.name] = replace(
         record, muted=replace(_operator_note(context, command), until_ns_utc=until_ns)
     )
-    _keep(context, notes)
+    _store(context, notes)
     context.log("alarm.muted", f"{record.name} for {command.for_s:.0f} s {command.signed}")
 
 
@@ -125,11 +127,11 @@ def unmute(context: StepContext, command: cmd.UnmuteAlarm) -> None:
     """
     notes, record = _with_record(context, command.name)
     notes[record.name] = replace(record, muted=None)
-    _keep(context, notes)
+    _store(context, notes)
     context.log("alarm.unmuted", f"{record.name} {command.signed}")
 
 
-def take_over(context: StepContext, orders: Orders) -> None:
+def restore_records(context: StepContext, orders: Orders) -> None:
     """Know what was known before a restart; what lasted then has yet to be raised again."""
     over_ns = context.now_ns
     context.alarms = replace(
@@ -141,7 +143,7 @@ def take_over(context: StepContext, orders: Orders) -> None:
     )
 
 
-def _raised(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
+def _with_alarm(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
     severity = alarm.definition.severity
     worse = severity.above(record.worst)
     if record.worst is not None and record.over_ns_utc is None and not worse:
@@ -156,28 +158,28 @@ def _raised(record: AlarmRecord, alarm: Alarm) -> AlarmRecord:
     )
 
 
-def _not_raised(context: StepContext, record: AlarmRecord, *, ordered: bool) -> AlarmRecord:
+def _without_alarm(context: StepContext, record: AlarmRecord, *, ordered: bool) -> AlarmRecord:
     """Return the note of an alarm that does not last."""
     if record.worst is None:
         return record
     if record.over_ns_utc is None:
         if ordered or record.acknowledged is not None:
-            return _done_with(record)
+            return _blank(record)
         last = next(
             (a.text for a in context.before.alarms.active if a.name == record.name), record.text
         )
         return replace(record, over_ns_utc=context.now_ns, text=last)
     waited_ns = context.now_ns - record.over_ns_utc
     if record.acknowledged is not None and waited_ns > RAISED_AGAIN_S * SECOND_NS:
-        return _done_with(record)
+        return _blank(record)
     return record
 
 
-def _done_with(record: AlarmRecord) -> AlarmRecord:
+def _blank(record: AlarmRecord) -> AlarmRecord:
     return AlarmRecord(name=record.name, muted=record.muted)
 
 
-def _unmuted(record: AlarmRecord, now_ns: int) -> AlarmRecord:
+def _without_old_mute(record: AlarmRecord, now_ns: int) -> AlarmRecord:
     """Return a note without a mute that has had its time."""
     until_ns = None if record.muted is None else record.muted.until_ns_utc
     return record if until_ns is None or now_ns < until_ns else replace(record, muted=None)
@@ -192,7 +194,7 @@ def _with_record(context: StepContext, name: str) -> tuple[dict[str, AlarmRecord
     return notes, notes.get(name, AlarmRecord(name=name))
 
 
-def _keep(context: StepContext, notes: dict[str, AlarmRecord]) -> None:
+def _store(context: StepContext, notes: dict[str, AlarmRecord]) -> None:
     """Keep what says something, where it is not what is kept already."""
     kept = tuple(record for record in notes.values() if record != AlarmRecord(name=record.name))
     if kept != context.alarms.records:

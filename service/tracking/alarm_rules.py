@@ -47,16 +47,16 @@ def derive_alarms(context: StepContext) -> None:
     for name, rule in RULES.items():
         text = rule(context)
         if text is not None or name in raised:
-            _set(context, name, text, _definition(context, name))
+            _update(context, name, text, _definition(context, name))
     for alarm in context.alarms.active:
         lasts = LASTING.get(alarm.name)
         if lasts is not None and not lasts(context):
             void_intervals.end_alarm(context, alarm.name)
     for own in context.policy.rules:
-        _set(context, f"{RULE_PREFIX}{own.name}", _rule_text(context, own), _own_definition(own))
+        _update(context, f"{RULE_PREFIX}{own.name}", _rule_text(context, own), _own_definition(own))
 
 
-def _set(
+def _update(
     context: StepContext, name: str, text: str | None, definition: AlarmDefinition | None
 ) -> None:
     """Raise an alarm with this text, or end it; one that goes on as it is is let be."""
@@ -137,7 +137,7 @@ def _not_stopped(context: StepContext) -> str | None:
         return None
     if context.now_ns - memory.stopped_ns_utc < GONE_WITHIN_S * SECOND_NS:
         return None
-    why = dither_plan.too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
+    why = dither_plan.why_too_strong(context, rtc) or dither_plan.why_unwanted(context, rtc)
     return why and (
         f"{why}, and the RTC goes on playing {memory.unwanted_id}: it is asked every "
         f"{dither.TELL_EVERY_S:.0f} s to stop it; stop it at the RTC"
@@ -261,7 +261,7 @@ FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
 
 def _rule_text(context: StepContext, rule: Rule) -> str | None:
     """Return what an operators' rule says that holds now, else None."""
-    found = _value(context, rule)
+    found = _value_of(context, rule)
     holds = rule.holds_unknown if found is None else _COMPARE[rule.how](found, rule.than)
     shown = "not known" if found is None else as_text(found)
     return f"{rule.text} ({rule.about} is {shown})" if holds else None
@@ -327,7 +327,7 @@ def as_text(value: cmd.Value) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
-def _value(context: StepContext, rule: Rule) -> cmd.Value | None:
+def _value_of(context: StepContext, rule: Rule) -> cmd.Value | None:
     if rule.about in FIELDS:
         return FIELDS[rule.about](context.state)
     reported = (each for each in context.alarms.observatory_values if each.name == rule.about)

@@ -25,10 +25,10 @@ from service.tracking.dither_request import (
     DitherPhase,
     DitherPolicyState,
     Precision,
+    is_own_sine,
+    is_proving,
     on_vibrations,
-    own_sine,
     plan_dither,
-    proves,
     total_m,
     why_unusable,
 )
@@ -68,18 +68,18 @@ _ON_ITS_WAY_S = 2.0
 
 def choose_dither(context: StepContext, rtc: Status) -> None:
     """Dither as much and as often as the policy asks while the loop is closed, its matrix known."""
-    _account(context, rtc)
+    _update_cost(context, rtc)
     stop_unwanted(context, rtc)
     dither = context.dither
-    if dither is not None and not own_sine(dither.request):
-        _show(context, DitherPhase.OPERATOR, f"{dither.id} runs")
+    if dither is not None and not is_own_sine(dither.request):
+        _set_phase(context, DitherPhase.OPERATOR, f"{dither.id} runs")
         return
-    forbidden = dither_plan.why_none(context, rtc)
+    forbidden = dither_plan.why_no_dither(context, rtc)
     if forbidden is not None:
-        _show(context, DitherPhase.OFF, forbidden)
+        _set_phase(context, DitherPhase.OFF, forbidden)
         return
-    mode_proof.give_up(context, rtc)
-    wanted, plan = dither_plan.wanted(context, rtc)
+    mode_proof.give_up_unseen(context, rtc)
+    wanted, plan = dither_plan.choose_next(context, rtc)
     _set_policy(
         context,
         replace(
@@ -89,59 +89,59 @@ def choose_dither(context: StepContext, rtc: Status) -> None:
             avoided_hz=wanted.parameters.avoid_hz,
         ),
     )
-    _show(context, wanted.phase, wanted.reason)
+    _set_phase(context, wanted.phase, wanted.reason)
     if dither is not None:
         _end_when_done(context, rtc, dither, wanted)
     elif not _adopt(context, rtc):
         _begin(context, rtc, wanted)
 
 
-def ask_for(context: StepContext, dither: Dither) -> None:
+def request_dither(context: StepContext, dither: Dither) -> None:
     """Ask for a dither and follow it."""
     _set_dither(context, replace(dither, cause=context.cause))
     context.ask(ev.Ask(request=dither.request))
 
 
-def ask_to_stop(context: StepContext) -> None:
+def request_stop(context: StepContext) -> None:
     """Ask the RTC to play no dither; two reasons at once are one request."""
     stop = ev.Ask(request=DitherStop(id=f"stop-{context.now_ns}"))
     if stop not in context.effects:
         context.ask(stop)
 
 
-def drop(context: StepContext) -> None:
+def forget_dither(context: StepContext) -> None:
     """Follow no dither any more."""
     _set_dither(context, None)
 
 
-def make_way(context: StepContext) -> None:
+def stop_running_dither(context: StepContext) -> None:
     """Stop the dither that runs, if one does; follow and adopt it no more."""
     dither, rtc = context.dither, context.rtc
     running = dither.id if dither is not None else rtc and rtc.dither_id
     if running:
         _note_stop(context, running)
         _set_dither(context, None)
-        ask_to_stop(context)
+        request_stop(context)
 
 
-def allow(context: StepContext, *, allowed: bool = True) -> None:
+def allow_dither(context: StepContext, *, allowed: bool = True) -> None:
     """Let the service dither by itself, or not any more."""
     context.dithers = replace(context.dithers, stopped=not allowed)
 
 
 def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
     """Stop the dither, and start none until told to."""
-    drop(context)
-    allow(context, allowed=False)
-    found_again(context)
-    tell_to_stop(context)
+    forget_dither(context)
+    allow_dither(context, allowed=False)
+    note_found(context)
+    stop_unfollowed(context)
     context.log("dither.stopped", "by the operator")
 
 
-def tell_to_stop(context: StepContext) -> None:
+def stop_unfollowed(context: StepContext) -> None:
     """Ask the RTC to end a dither that nobody wants, which is not followed."""
     _set_policy(context, replace(context.dither_policy, stop_asked_ns_utc=context.now_ns))
-    ask_to_stop(context)
+    request_stop(context)
 
 
 def on_answer(context: StepContext, request: DitherRequest, reply: Reply) -> None:
@@ -174,7 +174,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
     if dither is None or dither.start_seq is None:
         return
     if rtc.dither is not None and rtc.dither_id == dither.id:
-        _correct(context, dither, rtc.dither)
+        _take_over_played(context, dither, rtc.dither)
         return
     elapsed_s = (context.now_ns - dither.asked_ns_utc) / SECOND_NS
     if rtc.seq is None:
@@ -195,7 +195,7 @@ def follow_status(context: StepContext, rtc: Status) -> None:
     if context.dithers.losses:
         context.put_off(dither_s=_patience_s(context.state))
     text = f"the RTC's status shows no {dither.id} although it was accepted: it is asked for again"
-    _lose(context, dither, text)
+    _note_lost(context, dither, text)
 
 
 def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
@@ -211,16 +211,16 @@ def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
     if event.silent_s < _patience_s(context.state):
         context.raise_alarm(alarms.DITHER_LOST, text)
     else:
-        _lose(context, dither, text)
+        _note_lost(context, dither, text)
 
 
-def found_again(context: StepContext) -> None:
+def note_found(context: StepContext) -> None:
     """Miss it no more: a window held the dither, or none is wanted any more."""
     context.dithers = replace(context.dithers, lost=None, losses=0)
     context.clear_alarm(alarms.DITHER_LOST)
 
 
-def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
+def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
     """Take over from an accepted window what it says of the precision of windows."""
     rtc, known = context.rtc, context.dither_policy.precision
     accepted = context.windows.accepted > context.before.windows.accepted
@@ -259,10 +259,10 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
 
 def stop_too_strong(context: StepContext, dither_id: str, loud: str) -> None:
     """Stop a dither that the frames show to be too strong."""
-    _meet_unwanted(context, dither_id)
+    _note_unwanted(context, dither_id)
     _set_policy(context, replace(context.dither_policy, loud_id=dither_id, loud_text=loud))
-    _blame(context, dither_id, loud)
-    tell_to_stop(context)
+    _raise_over_budget(context, dither_id, loud)
+    stop_unfollowed(context)
 
 
 def stop_unanswered(context: StepContext, text: str) -> None:
@@ -271,22 +271,22 @@ def stop_unanswered(context: StepContext, text: str) -> None:
         ended = f"{context.dither.id} was ended, and another is tried after {CALM_S:.0f} s"
         context.raise_alarm(alarms.MIRROR_SILENT, f"the mirror does not answer: {text}; {ended}")
         context.put_off(dither_s=CALM_S)
-        make_way(context)
+        stop_running_dither(context)
 
 
 def stop_unwanted(context: StepContext, rtc: Status) -> None:
     """Ask the RTC, again and again, to stop what it should not play."""
-    running, loud = rtc.dither_id, dither_plan.too_strong(context, rtc)
+    running, loud = rtc.dither_id, dither_plan.why_too_strong(context, rtc)
     why = loud or dither_plan.why_unwanted(context, rtc)
     if running is None or why is None:
         forget_unwanted(context)
         return
     if context.dither_policy.unwanted_id != running:
-        _meet_unwanted(context, running)
+        _note_unwanted(context, running)
         if loud is not None:
-            _blame(context, running, loud)
+            _raise_over_budget(context, running, loud)
     if context.now_ns - context.dither_policy.stop_asked_ns_utc >= TELL_EVERY_S * SECOND_NS:
-        tell_to_stop(context)
+        stop_unfollowed(context)
 
 
 def forget_unwanted(context: StepContext) -> None:
@@ -307,15 +307,15 @@ def _begin(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
     """Ask for a dither if it is time, and nothing left behind is in its way."""
     loud_ns = context.dither_policy.loud_ns_utc
     if loud_ns and context.now_ns < loud_ns + round(CALM_S * SECOND_NS):
-        _show(context, DitherPhase.OFF, "the RTC has played the last one too strong")
+        _set_phase(context, DitherPhase.OFF, "the RTC has played the last one too strong")
         return
     if context.now_ns < context.dithers.no_dither_before_ns_utc:
         return
     if rtc.dither_id is not None and rtc.dither_id.startswith((OWN_DITHER, NOISY_DITHER)):
         # left behind by this service: its window of another length, or to stop
         context.put_off(dither_s=2.0)
-        make_way(context)
-    elif context.now_ns >= wanted.next_ns_utc and not dither_plan.awaits_a_result(context, wanted):
+        stop_running_dither(context)
+    elif context.now_ns >= wanted.next_ns_utc and not dither_plan.awaits_result(context, wanted):
         _ask(context, rtc, wanted)
 
 
@@ -335,7 +335,7 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
         text = f"lines at {shaken} Hz are on vibrations: there is no room, or the settings fix them"
         context.warn("dither.on-vibrations", text)
     if wanted.phase is DitherPhase.PROVE:
-        mode_proof.begin(context, wanted.parameters.modes)
+        mode_proof.note_shown(context, wanted.parameters.modes)
     _set_policy(
         context,
         replace(
@@ -346,7 +346,7 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
             next_ns_utc=None,
         ),
     )
-    ask_for(context, dither)
+    request_dither(context, dither)
 
 
 def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: WantedDither) -> None:
@@ -364,7 +364,7 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
         and 2.0 * total_m(dither.request) < wanted.parameters.total_m
     )
     moved = dither_plan.why_moved(dither, rtc, context.policy, wanted.parameters.shunned)
-    if wanted.phase is DitherPhase.PROVE and not proves(dither.request):
+    if wanted.phase is DitherPhase.PROVE and not is_proving(dither.request):
         moved = wanted.reason
     if done or weak or moved:
         # the next one must not overtake the command to stop
@@ -372,7 +372,7 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
         weakness = "" if done or moved else " is too weak"
         text = f"{dither.id}{weakness}: {moved or wanted.reason}"
         context.log("dither.stopped", text, Level.INFO if moved or weakness else Level.DEBUG)
-        make_way(context)
+        stop_running_dither(context)
 
 
 def _adopt(context: StepContext, rtc: Status) -> bool:
@@ -380,7 +380,7 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
     if rtc.dither is None or rtc.dither_id == context.dithers.lost:
         return False
     running, begun_seq, dithering = rtc.dither.request, rtc.dither.start_seq, context.dither_policy
-    over = own_sine(running) and total_m(running) > dither_plan.ROUNDING * dithering.budget_m
+    over = is_own_sine(running) and total_m(running) > dither_plan.ROUNDING * dithering.budget_m
     asked_to_stop = running.id == dithering.stopped_id
     # a recorded night stops nothing: what it goes on playing is read all the same
     heard_ns = dithering.stopped_ns_utc + round(STOPPED_WITHIN_S * SECOND_NS)
@@ -402,7 +402,7 @@ def _level(request: DitherRequest) -> Level:
     return Level.DEBUG if request.id.startswith(OWN_DITHER) else Level.INFO
 
 
-def _account(context: StepContext, rtc: Status) -> None:
+def _update_cost(context: StepContext, rtc: Status) -> None:
     """Keep count of what the dither costs, and of who has looked at α last."""
     dithering, registration, dither = context.dither_policy, context.registration, context.dither
     followed = dither is not None and dither.start_seq is not None
@@ -427,7 +427,7 @@ def _account(context: StepContext, rtc: Status) -> None:
     )
 
 
-def _show(context: StepContext, phase: DitherPhase, reason: str) -> None:
+def _set_phase(context: StepContext, phase: DitherPhase, reason: str) -> None:
     none_follows = phase in {DitherPhase.OFF, DitherPhase.OPERATOR}
     next_ns = None if none_follows else context.dither_policy.next_ns_utc
     _set_policy(
@@ -435,7 +435,7 @@ def _show(context: StepContext, phase: DitherPhase, reason: str) -> None:
     )
 
 
-def _correct(context: StepContext, asked: Dither, shown: DitherStatus) -> None:
+def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) -> None:
     """Take the RTC's word on what it plays, where that is not what was asked for.
 
     It is true, and not for that tolerated: one too strong is stopped.
@@ -455,7 +455,7 @@ def _correct(context: StepContext, asked: Dither, shown: DitherStatus) -> None:
     context.warn("dither.other", text)
 
 
-def _lose(context: StepContext, dither: Dither, text: str) -> None:
+def _note_lost(context: StepContext, dither: Dither, text: str) -> None:
     context.raise_alarm(alarms.DITHER_LOST, text)
     context.warn("dither.lost", text)
     _set_dither(context, None)
@@ -480,7 +480,7 @@ def _note_stop(context: StepContext, dither_id: str) -> None:
         )
 
 
-def _meet_unwanted(context: StepContext, running: str) -> None:
+def _note_unwanted(context: StepContext, running: str) -> None:
     """Note that a dither must go, and follow it no more."""
     _note_stop(context, running)
     if context.dither is not None and context.dither.id == running:
@@ -488,7 +488,7 @@ def _meet_unwanted(context: StepContext, running: str) -> None:
     _set_policy(context, replace(context.dither_policy, unwanted_id=running))
 
 
-def _blame(context: StepContext, running: str, loud: str) -> None:
+def _raise_over_budget(context: StepContext, running: str, loud: str) -> None:
     text = (
         f"{loud}: it was told to stop {running}, and another is tried after {CALM_S:.0f} s; look "
         "at the RTC's dither, or stop the dither to do without"

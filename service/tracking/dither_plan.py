@@ -32,9 +32,9 @@ from service.tracking.dither_request import (
     DitherParameters,
     DitherPhase,
     DitherPlan,
+    is_own_sine,
+    is_proving,
     n_lines,
-    own_sine,
-    proves,
     total_m,
 )
 from service.tracking.policy import SECOND_NS, Policy
@@ -99,14 +99,14 @@ class WantedDither:
     """When; now or earlier: at once."""
 
 
-def wanted(context: StepContext, rtc: Status) -> tuple[WantedDither, DitherPlan]:
+def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, DitherPlan]:
     """Return the dither that is wanted in this state, and the plan behind it."""
     state, policy, kappa = context.state, context.policy, precision(context.state, rtc)
     requirement = _requirement(context, rtc, kappa)
     window_s = requirement.window_s
     sittings = tuple(n * window_s for n in SITTING_LADDER)
     sparse = replace(requirement, window_s=dither.burst_s(kappa, requirement, sittings))
-    phase, reason, next_ns = _paced(context, sparse)
+    phase, reason, next_ns = _next_window(context, sparse)
     requirement = sparse if phase is DitherPhase.SPARSE else requirement
     found = schedule(kappa, requirement)
     plan = _plan(state, found, requirement, window_s, phase)
@@ -139,7 +139,7 @@ def _to_show(
     )
 
 
-def by_hand(context: StepContext, rtc: Status) -> DitherParameters:
+def operator_parameters(context: StepContext, rtc: Status) -> DitherParameters:
     """Return what an operator's dither is like where the operator does not say."""
     policy, plan = context.policy, context.dither_policy.plan
     window_s = policy.window_s if plan is None else plan.window_s
@@ -168,7 +168,7 @@ def _plan(
     phase: DitherPhase,
 ) -> DitherPlan:
     """Return the schedule as it is carried out."""
-    total_m, interval_s = _steady(state, found, requirement), found.interval_s
+    total_m, interval_s = _steady_amplitude(state, found, requirement), found.interval_s
     if phase is DitherPhase.ACQUIRE:
         total_m = requirement.budget_m
     if phase is not DitherPhase.SPARSE:
@@ -212,7 +212,7 @@ def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[in
     It was asked for when fewer modes were controlled, or before one of its modes was seen to
     answer otherwise than the model says.
     """
-    if proves(dither.request):
+    if is_proving(dither.request):
         return ""
     odd = shunned.intersection(dither.request.modes)
     if odd and not odd.intersection(chosen_modes(rtc, policy, shunned)):
@@ -263,7 +263,9 @@ def _walk_rate(context: StepContext) -> NDArray[np.float64]:
     return np.maximum(base, registration.grown / age_s) if age_s >= 1.0 else base
 
 
-def _paced(context: StepContext, requirement: DitherRequirement) -> tuple[DitherPhase, str, int]:
+def _next_window(
+    context: StepContext, requirement: DitherRequirement
+) -> tuple[DitherPhase, str, int]:
     """Return how to dither, why, and when the next window is due."""
     state, registration, policy, now_ns = (
         context.state,
@@ -318,7 +320,9 @@ def _pace_without_passive(
     )
 
 
-def _steady(state: TrackerState, found: Schedule, requirement: DitherRequirement) -> float:
+def _steady_amplitude(
+    state: TrackerState, found: Schedule, requirement: DitherRequirement
+) -> float:
     """Return the amplitude, left as it is while the best one is near."""
     before = state.dithers.policy.plan
     settled = state.dithers.policy.phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE}
@@ -328,7 +332,7 @@ def _steady(state: TrackerState, found: Schedule, requirement: DitherRequirement
     return before.total_m if 1.0 / CHANGE <= ratio <= CHANGE else found.total_m
 
 
-def why_none(context: StepContext, rtc: Status) -> str | None:
+def why_no_dither(context: StepContext, rtc: Status) -> str | None:
     """Return why the service asks for no dither of its own, or None."""
     state = context.state
     still = state.dithers.policy.unwanted_id
@@ -351,7 +355,7 @@ def why_none(context: StepContext, rtc: Status) -> str | None:
     return None if alarm is None else f"nothing would be measured under {alarm.name}"
 
 
-def awaits_a_result(context: StepContext, wanted_dither: WantedDither) -> bool:
+def awaits_result(context: StepContext, wanted_dither: WantedDither) -> bool:
     """Return whether the window of the dither that ended last may still be on its way."""
     dithering = context.dither_policy
     if wanted_dither.phase is DitherPhase.PROVE:
@@ -362,7 +366,7 @@ def awaits_a_result(context: StepContext, wanted_dither: WantedDither) -> bool:
     return not late and context.windows.accepted < dithering.results_due
 
 
-def too_strong(context: StepContext, rtc: Status) -> str | None:
+def why_too_strong(context: StepContext, rtc: Status) -> str | None:
     """Return why a dither that is played costs more than it may, or None.
 
     An operator's own may cost more than the budget, but not more than was asked for.
@@ -371,7 +375,7 @@ def too_strong(context: StepContext, rtc: Status) -> str | None:
         return None
     running, dithering = rtc.dither.request, context.dither_policy
     found_m, most_m = total_m(running), budget_m(rtc, context.policy)
-    over = own_sine(running) and found_m > ROUNDING * most_m
+    over = is_own_sine(running) and found_m > ROUNDING * most_m
     if not over and running.id != dithering.loud_id:
         return None
     if running.id == dithering.loud_id and dithering.loud_text:

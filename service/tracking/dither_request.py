@@ -154,12 +154,12 @@ def plan_dither(
     return Dither(request=request, asked_ns_utc=now_ns, window_s=choice.window_s)
 
 
-def own_sine(request: DitherRequest) -> bool:
+def is_own_sine(request: DitherRequest) -> bool:
     """Return whether a dither is one that the service has chosen by itself."""
     return request.id.startswith(OWN_DITHER) and request.kind is DitherKind.SINE
 
 
-def proves(request: DitherRequest) -> bool:
+def is_proving(request: DitherRequest) -> bool:
     """Return whether a dither is there to see how its modes answer."""
     return request.id.startswith(PROVING_DITHER)
 

@@ -63,7 +63,7 @@ MISFIT_WINDOWS = 10
 """So many tell the model error together: the misfit of a faint star's window is mostly chance."""
 
 
-def followed_gains(
+def update_gains(
     before: tuple[ModeGain, ...],
     modes: tuple[int, ...],
     gains: Array,
@@ -78,12 +78,12 @@ def followed_gains(
     table = {gain.mode: gain for gain in before}
     own = np.zeros(len(gains)) if sigma is None else sigma
     for mode, gain, noise in zip(modes, gains, own, strict=True):
-        table[mode] = _followed(table.get(mode), mode, float(gain), float(noise), t_ns)
+        table[mode] = _update_gain(table.get(mode), mode, float(gain), float(noise), t_ns)
     newest = sorted(table.values(), key=lambda gain: gain.t_ns_utc)[-MODES_KEPT:]
     return tuple(sorted(newest, key=lambda gain: gain.mode))
 
 
-def _followed(
+def _update_gain(
     gain: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int
 ) -> ModeGain:
     """Return one gain as a scalar random walk; its windows' scatter is learnt as it goes.
@@ -153,7 +153,7 @@ class FilterUpdate:
     """Whether it is of a new place, to which what was known before says nothing."""
 
 
-def brought_forward(context: StepContext, registration: Registration, t_ns_utc: int) -> Joint:
+def predict(context: StepContext, registration: Registration, t_ns_utc: int) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - registration.t_ns_utc
     if elapsed_ns < -void_intervals.CLOCK_SET_BACK_S * SECOND_NS:
@@ -206,14 +206,14 @@ def biases_of(joint: Joint, before: tuple[PassiveBias, ...]) -> tuple[PassiveBia
     return tuple(found)
 
 
-def remember(context: StepContext, entry: HistoryEntry) -> None:
+def add_history(context: StepContext, entry: HistoryEntry) -> None:
     """Keep one more line of history."""
     entry = replace(entry, in_use=context.matrices.in_use)
     history = (*context.alpha.history, entry)[-HISTORY_LENGTH:]
     context.alpha = replace(context.alpha, history=history)
 
 
-def counted(context: StepContext, registration: Registration, prior: Joint) -> int:
+def n_agreeing(context: StepContext, registration: Registration, prior: Joint) -> int:
     """Return how many windows agree after this one: it stands alone where α had gone stale."""
     policy = context.policy
     sigma = np.sqrt(np.diag(prior.alpha_covariance) + registration.floor**2)
@@ -256,9 +256,9 @@ def accept(
     context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
     if not doubted:
         void_intervals.make_valid(context, Purpose.SETTLE)
-        validity.have_window(context)
-    remember(context, entry_of(measured, registration, update.innovation))
-    validity.age(context)
+        validity.end_window_request(context)
+    add_history(context, history_entry(measured, registration, update.innovation))
+    validity.age_registration(context)
 
 
 def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpan) -> bool:
@@ -299,7 +299,7 @@ def _previous_estimate(
     )
 
 
-def entry_of(
+def history_entry(
     measured: WindowEstimate, registration: Registration, innovation: float, *, entered: bool = True
 ) -> HistoryEntry:
     """Return the line of the history that a window leaves."""

@@ -19,13 +19,13 @@ from service.tracking.commands import Command
 from service.tracking.events import kebab
 from service.tracking.loop import NO_RTC
 from service.tracking.operations.acquisition_stages import why_not_now
-from service.tracking.operations.running import OperationKind, RunningOperation, under_way
+from service.tracking.operations.running import OperationKind, RunningOperation, running_operations
 from service.tracking.policy import Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import known_record
+from service.tracking.reconstructors import require_record
 from service.tracking.sending import beyond_judging, why_refused
 from service.tracking.state import Mode, TrackerState
-from service.tracking.update_policy import left_behind
+from service.tracking.update_policy import is_left_behind
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,13 +109,13 @@ def permitted(state: TrackerState, order: Order, policy: Policy, now_ns: int) ->
     UnknownIdError
         If a command names what does not exist.
     """
-    return _decided(_moment(state, policy, now_ns), order)
+    return _decide(_moment(state, policy, now_ns), order)
 
 
 def permissions(state: TrackerState, policy: Policy, now_ns: int) -> Mapping[str, Permission]:
     """Return the same of every order, by its name."""
     moment = _moment(state, policy, now_ns)
-    return {name: _decided(moment, order) for name, order in ORDERS.items()}
+    return {name: _decide(moment, order) for name, order in ORDERS.items()}
 
 
 def require(state: TrackerState, command: Command, policy: Policy, now_ns: int) -> None:
@@ -134,11 +134,11 @@ def require(state: TrackerState, command: Command, policy: Policy, now_ns: int) 
 
 
 def _moment(state: TrackerState, policy: Policy, now_ns: int) -> Moment:
-    running = under_way(state, now_ns)
+    running = running_operations(state, now_ns)
     return Moment(state=state, policy=policy, now_ns=now_ns, running=running)
 
 
-def _decided(moment: Moment, order: Order) -> Permission:
+def _decide(moment: Moment, order: Order) -> Permission:
     kind = order if isinstance(order, type) else type(order)
     opens = isinstance(order, cmd.SetLoop) and order.loop == "open"
     for running in moment.running:
@@ -219,14 +219,14 @@ def _refit(moment: Moment, _: str) -> str | None:
 
 def _approve(moment: Moment, matrix_id: str) -> str | None:
     state = moment.state
-    record = _meant(state, matrix_id)
+    record = _named_or_proposed(state, matrix_id)
     if record is None or record.state is not MatrixState.PROPOSED:
         return f"{_not_proposed(record)}{'' if record else ': refit first'}"
     registration = state.alpha.registration
     if registration is not None and not registration.usable:
         why = registration.validity.reason
         return f"{record.id} cannot be judged: α is invalid ({why}): wait for a window"
-    if left_behind(state, record, moment.policy):
+    if is_left_behind(state, record, moment.policy):
         return f"{record.id} was made for another α than the present one: refit"
     reason = why_refused(state, record)
     if reason is not None:
@@ -237,15 +237,15 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
 
 
 def _reject(moment: Moment, matrix_id: str) -> str | None:
-    record = _meant(moment.state, matrix_id)
+    record = _named_or_proposed(moment.state, matrix_id)
     proposed = record is not None and record.state is MatrixState.PROPOSED
     return None if proposed else _not_proposed(record)
 
 
-def _meant(state: TrackerState, matrix_id: str) -> ReconstructorRecord | None:
+def _named_or_proposed(state: TrackerState, matrix_id: str) -> ReconstructorRecord | None:
     """Return the reconstructor of this id; of none, the one that is proposed, if one is."""
     if matrix_id:
-        return known_record(state, matrix_id)
+        return require_record(state, matrix_id)
     records = reversed(state.matrices.reconstructors)
     return next((one for one in records if one.state is MatrixState.PROPOSED), None)
 
@@ -259,7 +259,7 @@ def _not_proposed(record: ReconstructorRecord | None) -> str:
 def _publish(moment: Moment, matrix_id: str) -> str | None:
     state = moment.state
     if matrix_id:
-        record = known_record(state, matrix_id)
+        record = require_record(state, matrix_id)
         if not record.was_used and state.alpha.registration is None:
             unknown = "α is not known yet; start a dither, wait for a window"
             return f"{record.id} cannot be judged: {unknown}"

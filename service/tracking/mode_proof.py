@@ -28,7 +28,7 @@ from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import limit_modes, settled
+from service.tracking.update_policy import is_settled, limit_modes
 from service.wire import Status
 
 SIZE_RANGE = (0.4, 2.0)
@@ -99,7 +99,7 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
     odd -= proven_modes(context.state)
     if not odd:
         return None
-    return f"{_named(odd)} not answered as the instrument file says: such a window tells no α"
+    return f"{_as_subject(odd)} not answered as the instrument file says: such a window tells no α"
 
 
 def n_proven_modes(state: TrackerState, n_modes: int) -> int:
@@ -118,9 +118,9 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
         return None
     contrary = [mode for mode in missing if mode in state.matrices.mode_proof.contrary]
     if contrary:
-        return f"{_named(contrary)} not answered as the instrument file says"
+        return f"{_as_subject(contrary)} not answered as the instrument file says"
     return (
-        f"{_named(missing)} not been seen to answer yet: a dither shows them before they are "
+        f"{_as_subject(missing)} not been seen to answer yet: a dither shows them before they are "
         "controlled; let the service dither"
     )
 
@@ -128,7 +128,7 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
 def awaits_proof(context: StepContext, rtc: Status) -> bool:
     """Return whether modes that are wanted are still to be shown by a dither."""
     allowed = context.policy.dither_enabled and not context.dithers.stopped
-    return allowed and not context.policy.dither_modes and bool(_missing(context, rtc))
+    return allowed and not context.policy.dither_modes and bool(_missing_modes(context, rtc))
 
 
 def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[int, ...]:
@@ -143,8 +143,8 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
         return ()
     if not awaits_proof(context, rtc):
         return ()
-    missing = _missing(context, rtc)
-    if not (settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
+    missing = _missing_modes(context, rtc)
+    if not (is_settled(registration) or (unknown_loop(state, rtc) and _plausible(registration))):
         return ()
     at_once = max(MAX_AT_ONCE // FEWER**state.matrices.mode_proof.n_tries, N_LINES)
     most = min(len(lines_clear(context, rtc, window_s)), at_once, rtc.max_dither_modes)
@@ -181,16 +181,16 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
     )
 
 
-def begin(context: StepContext, modes: tuple[int, ...]) -> None:
+def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
     """Note that a dither has been asked for to see these modes."""
     proof = context.matrices.mode_proof
     if (
         context.state.alarm(alarms.WORKER_BEHIND) is None
     ):  # which gives windows up: no fault of theirs
-        proof = _missed(proof)
+        proof = _after_miss(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
     context.matrices = replace(context.matrices, mode_proof=shown)
-    context.log("modes.shown", f"modes {_listed(modes)} are dithered before they are controlled")
+    context.log("modes.shown", f"modes {_as_list(modes)} are dithered before they are controlled")
 
 
 def awaits_result(context: StepContext, window_s: float) -> bool:
@@ -200,7 +200,7 @@ def awaits_result(context: StepContext, window_s: float) -> bool:
     return bool(proof.shown) and waited_s < window_s + TOLD_WITHIN_S
 
 
-def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
+def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
     """Take over which modes of a window answer as they should, whatever it says of α."""
     rtc, proof = context.rtc, context.matrices.mode_proof
     if rtc is None or estimate.session != rtc.session or estimate.gain_sigma is None:
@@ -224,7 +224,7 @@ def learn(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> No
     )
     if proof.shown and proof.shown <= frozenset(estimate.modes):
         told = (good | bad) & (proof.shown - before.proven)
-        proof = replace(proof, n_tries=0) if told else _missed(proof)
+        proof = replace(proof, n_tries=0) if told else _after_miss(proof)
         proof = replace(proof, shown=frozenset())
     if proof == before:
         return
@@ -248,7 +248,7 @@ def _answers(
     return tuple(found[mode] for mode in sorted(found))
 
 
-def recognise(context: StepContext, event: ev.ModesRecognised) -> None:
+def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
     """Take over which modes of the matrix in use the model has recognised."""
     proof = replace(
         context.matrices.mode_proof,
@@ -278,13 +278,13 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
     return None if kept == ModeProof() else kept
 
 
-def restore(context: StepContext, proof: ModeProof, session: str) -> None:
+def restore_proof(context: StepContext, proof: ModeProof, session: str) -> None:
     """Hold what the service before this one has seen of modes, until the RTC says who it is."""
     restored = replace(proof, session=session)
     context.matrices = replace(context.matrices, mode_proof=restored)
 
 
-def take_over(context: StepContext, rtc: Status) -> None:
+def believe_restored(context: StepContext, rtc: Status) -> None:
     """Believe what the service before has seen of this RTC in this session; forget it of others."""
     proof = context.matrices.mode_proof
     if not proof.session:
@@ -346,7 +346,7 @@ def contrary_text(context: StepContext) -> str | None:
 
 def _contrary_in_words(proof: ModeProof, in_the_way: list[int]) -> str:
     return (
-        f"{_named(in_the_way)} not answered the dither as the instrument file says"
+        f"{_as_subject(in_the_way)} not answered the dither as the instrument file says"
         f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
 
@@ -354,7 +354,7 @@ def _contrary_in_words(proof: ModeProof, in_the_way: list[int]) -> str:
 def _contrary_in_the_way(context: StepContext, rtc: Status) -> list[int]:
     if not context.matrices.mode_proof.contrary:
         return []
-    target = _target(context, rtc)
+    target = _target_modes(context, rtc)
     return sorted(mode for mode in shunned_modes(context.state) if mode < target)
 
 
@@ -385,18 +385,18 @@ def uneven_text(context: StepContext) -> str | None:
         one = "answers" if len(proof.uneven) == 1 else "answer"
         noun = "mode" if len(proof.uneven) == 1 else "modes"
         found.append(
-            f"{noun} {_listed(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
+            f"{noun} {_as_list(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
             "strongly or as weakly as the modes beside"
         )
     return "; ".join(found) or None
 
 
-def _missed(proof: ModeProof) -> ModeProof:
+def _after_miss(proof: ModeProof) -> ModeProof:
     """Return the account after a dither that has shown nothing."""
     return replace(proof, n_tries=proof.n_tries + 1) if proof.shown else proof
 
 
-def give_up(context: StepContext, rtc: Status) -> None:
+def give_up_unseen(context: StepContext, rtc: Status) -> None:
     """Leave modes alone for a while that several dithers have not shown."""
     proof = context.matrices.mode_proof
     if proof.n_tries < TRIES:
@@ -405,34 +405,34 @@ def give_up(context: StepContext, rtc: Status) -> None:
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)
     text = (
-        f"{_named(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows are "
-        "refused, or give the dither more budget"
+        f"{_as_subject(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows "
+        "are refused, or give the dither more budget"
     )
     limit_modes(context, n_proven_modes(context.state, rtc.n_modes), text)
 
 
-def _missing(context: StepContext, rtc: Status) -> list[int]:
+def _missing_modes(context: StepContext, rtc: Status) -> list[int]:
     """Return the modes that are wanted now, and that nobody has seen to answer.
 
     Those that one window has accused are shown again whatever is wanted: an accusation is named,
     or it is none.
     """
-    proven, wanted = proven_modes(context.state), _wanted(context, rtc)
+    proven, wanted = proven_modes(context.state), _wanted_modes(context, rtc)
     accused = (
         mode for mode in context.matrices.mode_proof.suspected if wanted <= mode < rtc.n_modes
     )
     return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
 
 
-def _wanted(context: StepContext, rtc: Status) -> int:
+def _wanted_modes(context: StepContext, rtc: Status) -> int:
     """Return up to which mode all should be proven now."""
-    limit, n_modes = context.matrices.mode_limit, _target(context, rtc)
+    limit, n_modes = context.matrices.mode_limit, _target_modes(context, rtc)
     if limit is not None and context.now_ns < limit.until_ns_utc:
         n_modes = min(n_modes, limit.n_modes)
     return n_modes
 
 
-def _target(context: StepContext, rtc: Status) -> int:
+def _target_modes(context: StepContext, rtc: Status) -> int:
     """Return how many modes are controlled, are to be, or await an operator's word."""
     proposed = (
         r.n_modes for r in context.matrices.reconstructors if r.state is MatrixState.PROPOSED
@@ -440,12 +440,12 @@ def _target(context: StepContext, rtc: Status) -> int:
     return max(rtc.n_controlled, min(context.policy.n_modes_target, rtc.n_modes), *proposed, 0)
 
 
-def _named(modes: Collection[int]) -> str:
+def _as_subject(modes: Collection[int]) -> str:
     """Return modes as the subject of a sentence, with its verb."""
-    return f"mode {_listed(modes)} has" if len(modes) == 1 else f"modes {_listed(modes)} have"
+    return f"mode {_as_list(modes)} has" if len(modes) == 1 else f"modes {_as_list(modes)} have"
 
 
-def _listed(modes: Iterable[int]) -> str:
+def _as_list(modes: Iterable[int]) -> str:
     """Return modes in words, lowest first, a run of them by its ends."""
     runs: list[list[int]] = []
     for mode in sorted(modes):

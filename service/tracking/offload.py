@@ -17,12 +17,12 @@ from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, step_text,
 from service.tracking import events as ev
 from service.tracking import validity
 from service.tracking.alarms import Interlock
-from service.tracking.operations.running import ramping
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Offloading, Policy
 from service.tracking.registration import Offload, OffloadState, Purpose, Registration, Validity
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import settled
+from service.tracking.update_policy import is_settled
 from service.tracking.void_intervals import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
@@ -44,7 +44,7 @@ STATUS_S = 1.0
 Array = NDArray[np.float64]
 
 
-def demand(context: StepContext) -> None:
+def request_offload(context: StepContext) -> None:
     """Ask for a move where α is known well enough and too far from the nominal registration."""
     limits, registration, rtc = context.policy.offloading, context.registration, context.rtc
     if (
@@ -54,7 +54,7 @@ def demand(context: StepContext) -> None:
         or not _may_move(context, registration, rtc, limits)
     ):
         return
-    step = wanted(context.state, registration, context.policy.start.vector, limits)
+    step = wanted_step(context.state, registration, context.policy.start.vector, limits)
     if not step.any():
         return
     last = context.alpha.offload
@@ -72,7 +72,7 @@ def demand(context: StepContext) -> None:
     context.log("offload.asked", f"{offload.id}: α is to change by {step_text(step)}")
 
 
-def wanted(
+def wanted_step(
     state: TrackerState, registration: Registration, start: Array, limits: Offloading
 ) -> Array:
     """Return by how much α is to change ``(4,)``, numeric units; 0: by nothing.
@@ -129,7 +129,7 @@ def on_failure(context: StepContext, name: str, text: str) -> None:
     context.warn("offload.failed", f"{offload.id}: {text}; whether it was made must be measured")
 
 
-def go_on(context: StepContext, offload: Offload) -> None:
+def restore_offload(context: StepContext, offload: Offload) -> None:
     """Take over the last demand of the service before; one without a reply may have been made.
 
     A service that asks for no moves forgets it: somebody may bring the device elsewhere meanwhile.
@@ -154,7 +154,7 @@ def _may_move(
     ):
         return False
     sure = (
-        settled(registration)
+        is_settled(registration)
         and not registration.doubt
         and registration.validity.level is Validity.FRESH
     )
@@ -164,7 +164,7 @@ def _may_move(
         r.on_its_way for r in state.matrices.reconstructors
     ):
         return False
-    if state.noisy_measurement is not None or ramping(state, context.now_ns) is not None:
+    if state.noisy_measurement is not None or running_ramp(state, context.now_ns) is not None:
         return False
     return last is None or context.now_ns >= last.asked_ns_utc + _rest_ns(last, context.policy)
 

@@ -11,8 +11,8 @@ from service.tracking import events as ev
 from service.tracking import reconstructors
 from service.tracking.alarms import PROBATION
 from service.tracking.commands import GainGroup, ModeGroup
-from service.tracking.dither import allow, ask_for
-from service.tracking.dither_plan import by_hand
+from service.tracking.dither import allow_dither, request_dither
+from service.tracking.dither_plan import operator_parameters
 from service.tracking.dither_request import (
     ASKED_DITHER,
     RANDOM_TOTAL_M,
@@ -29,7 +29,7 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Level, Mode
 from service.tracking.step_context import StepContext
-from service.tracking.validity import point
+from service.tracking.validity import note_pointing
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 
 
@@ -79,7 +79,7 @@ def refit(context: StepContext, command: cmd.Refit) -> None:
     asked = command.n_modes or rtc.n_controlled
     if not 0 < asked <= rtc.n_modes:
         raise CommandError(f"found {asked} modes; expected 1 to {rtc.n_modes}")
-    reconstructors.make(context, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
+    reconstructors.request_matrix(context, ev.MakeMatrix(n_modes=asked, why="the operator asked"))
 
 
 def start_dither(context: StepContext, command: cmd.StartDither) -> None:
@@ -94,11 +94,11 @@ def start_dither(context: StepContext, command: cmd.StartDither) -> None:
     dither = _planned(context, rtc, command)
     total, over_budget = total_m(dither.request), command.over_budget
     cost = cost_of(total, context.policy, over_budget=over_budget)
-    allow(context)
+    allow_dither(context)
     modes = dither.request.modes
     which = f"modes {modes}" if len(modes) < 10 else f"{len(modes)} modes"
     context.log("dither.asked", f"{dither.request.kind}, {which}, {cost}")
-    ask_for(context, dither)
+    request_dither(context, dither)
 
 
 def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dither:
@@ -124,7 +124,7 @@ def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dit
         rtc,
         policy,
         now_ns,
-        choice=by_hand(context, rtc),
+        choice=operator_parameters(context, rtc),
         modes=command.modes,
         amplitude_m=command.amplitude_m,
         frequency_hz=command.frequency_hz,
@@ -139,13 +139,15 @@ def _planned(context: StepContext, rtc: Status, command: cmd.StartDither) -> Dit
 
 def _republish(context: StepContext, source: str, why: str, *, anyway: bool = False) -> None:
     """Offer an earlier matrix again; hold, or the service would replace it at once."""
-    reconstructors.make(context, ev.RepublishMatrix(source=source, why=why, anyway=anyway))
+    reconstructors.request_matrix(
+        context, ev.RepublishMatrix(source=source, why=why, anyway=anyway)
+    )
     enter_hold(context, why)
 
 
 def set_pointing(context: StepContext, command: cmd.SetPointing) -> None:
     """Note where the telescope looks, as the observatory tells it."""
-    point(context, command.pointing)
+    note_pointing(context, command.pointing)
 
 
 def enter_hold(context: StepContext, why: str) -> None:

@@ -34,7 +34,7 @@ _UNSENT = frozenset({MatrixState.REFUSED, MatrixState.DISCARDED})
 _SPARE = frozenset({MatrixState.REJECTED, MatrixState.FAILED, MatrixState.SUPERSEDED})
 
 
-def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
+def require_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
     """Return the record of this id.
 
     Raises
@@ -48,14 +48,14 @@ def known_record(state: TrackerState, matrix_id: str) -> ReconstructorRecord:
     return record
 
 
-def keep(context: StepContext, record: ReconstructorRecord) -> None:
+def store_reconstructor(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep one more reconstructor; what is needed least gives way."""
     records = [*(r for r in context.matrices.reconstructors if r.id != record.id), record]
     kept = prune(records, context.matrices.in_use)
     context.matrices = replace(context.matrices, reconstructors=kept)
 
 
-def change(context: StepContext, record: ReconstructorRecord) -> None:
+def replace_record(context: StepContext, record: ReconstructorRecord) -> None:
     """Replace the record of the same id."""
     records = tuple(record if r.id == record.id else r for r in context.matrices.reconstructors)
     context.matrices = replace(context.matrices, reconstructors=records)
@@ -63,18 +63,20 @@ def change(context: StepContext, record: ReconstructorRecord) -> None:
 
 def change_state(context: StepContext, matrix_id: str, to: MatrixState, reason: str) -> None:
     """Take one reconstructor further on its way."""
-    change(context, replace(known_record(context.state, matrix_id), state=to, reason=reason))
+    replace_record(
+        context, replace(require_record(context.state, matrix_id), state=to, reason=reason)
+    )
 
 
-def use(context: StepContext, matrix_id: str) -> None:
+def mark_applied(context: StepContext, matrix_id: str) -> None:
     """Mark one reconstructor as applied; whichever was, has been superseded."""
-    record = known_record(context.state, matrix_id)
+    record = require_record(context.state, matrix_id)
     if context.matrices.in_use == matrix_id and record.state is MatrixState.APPLIED:
         return
     for other in context.matrices.reconstructors:
         if other.id != matrix_id and other.state is MatrixState.APPLIED:
             change_state(context, other.id, MatrixState.SUPERSEDED, f"{matrix_id} is in use")
-    change(context, replace(record, state=MatrixState.APPLIED))
+    replace_record(context, replace(record, state=MatrixState.APPLIED))
     forget_verdict(context)
     context.matrices = replace(
         context.matrices, in_use=matrix_id, assessment=None, judged_ns_utc=None
@@ -86,7 +88,7 @@ def forget_verdict(context: StepContext) -> None:
     context.matrices = replace(context.matrices, margin=None)
 
 
-def judge_again(context: StepContext) -> None:
+def forget_when_judged(context: StepContext) -> None:
     """Have the matrix in use judged again, whenever that was done last."""
     context.matrices = replace(context.matrices, judged_ns_utc=None)
 
@@ -109,29 +111,29 @@ def forget_session(context: StepContext) -> None:
     )
 
 
-def fetch(context: StepContext, rtc: Status) -> None:
+def request_applied(context: StepContext, rtc: Status) -> None:
     """Ask the RTC for the matrix it uses."""
     context.matrices = replace(context.matrices, applied_asked_ns_utc=context.now_ns)
     context.ask(ev.FetchMatrix(id=rtc.cm_id))
 
 
-def not_fetched(context: StepContext, why: str) -> None:
+def note_not_fetched(context: StepContext, why: str) -> None:
     """Note why the matrix in use is not to be had."""
     context.matrices = replace(context.matrices, read_back_error=why)
 
 
-def make(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMatrix) -> None:
+def request_matrix(context: StepContext, effect: ev.MakeMatrix | ev.RepublishMatrix) -> None:
     """Have a reconstructor computed, or copied."""
     context.matrices = replace(context.matrices, making_since_ns_utc=context.now_ns)
     context.ask(effect)
 
 
-def made_none(context: StepContext) -> None:
+def note_none_made(context: StepContext) -> None:
     """Note that no reconstructor is being computed."""
     context.matrices = replace(context.matrices, making_since_ns_utc=None)
 
 
-def judge(context: StepContext, matrix_id: str) -> None:
+def request_verdict(context: StepContext, matrix_id: str) -> None:
     """Have the matrix in use judged."""
     context.matrices = replace(context.matrices, judged_ns_utc=context.now_ns)
     context.ask(ev.JudgeMatrix(id=matrix_id))
@@ -169,11 +171,11 @@ def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
 
 def propose(context: StepContext, record: ReconstructorRecord) -> None:
     """Keep a new reconstructor in place of any proposal."""
-    made_none(context)
+    note_none_made(context)
     for older in context.matrices.reconstructors:
         if older.state is MatrixState.PROPOSED:
             change_state(context, older.id, MatrixState.DISCARDED, f"{record.id} replaces it")
-    keep(context, replace(record, cause=context.cause))
+    store_reconstructor(context, replace(record, cause=context.cause))
     verdict = record.gate.reason if record.gate is not None else record.reason
     if record.state is MatrixState.REFUSED:
         context.warn("reconstructor.refused", f"{record.id}: {verdict}")
@@ -199,7 +201,7 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
         gains = record.judged.gains
     text = f"{matrix_id} is judged again before it is sent: {stale}"
     context.log("reconstructor.judged-again", text)
-    change(context, replace(record, cause=context.cause))
+    replace_record(context, replace(record, cause=context.cause))
     context.ask(ev.JudgeProposal(id=matrix_id, gains=gains, wanted=wanted))
 
 
@@ -211,10 +213,10 @@ def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
     verdict = event.verdict
     record = replace(record, gate=verdict, judged=event.judged)
     if not verdict.accepted:
-        change(context, replace(record, state=MatrixState.REFUSED, reason=verdict.reason))
+        replace_record(context, replace(record, state=MatrixState.REFUSED, reason=verdict.reason))
         context.warn("reconstructor.refused", f"{record.id}: {verdict.reason}")
         return
-    change(context, record)
+    replace_record(context, record)
     reason = why_unsendable(context.state, record)
     if reason is None and not event.wanted and not may_follow(context.state):
         alarm = context.blocking_alarm(Interlock.DECIDE)
@@ -262,7 +264,7 @@ def _send(
     context: StepContext, record: ReconstructorRecord, gains: tuple[float, ...] | None
 ) -> None:
     unjudged = _why_unjudged(record)
-    change(
+    replace_record(
         context,
         replace(
             record,
@@ -279,7 +281,7 @@ def _send(
 
 def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
     """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
-    record = _meant(context.state, event)
+    record = _acknowledged_record(context.state, event)
     if record is None:
         text = f"an acknowledgement for {event.id}, which this service never sent"
         context.warn("acknowledgement.unknown", text)
@@ -302,8 +304,8 @@ def _acknowledged(
     if state is MatrixState.APPLIED:
         _trust(context, record.id)
         record = replace(record, applied_frame_seq=event.frame_seq, reason=reason)
-        change(context, record)
-        use(context, record.id)
+        replace_record(context, record)
+        mark_applied(context, record.id)
         gains = () if context.rtc is None else commanded_gains(context.rtc, record.n_modes)
         of_other = update_policy.verdict_doubtful_reason(context.state, record.judged, gains)
         context.matrices = replace(
@@ -324,7 +326,7 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
     Ids are not enough: an RTC that starts anew may list its slopes otherwise, and hold the matrix
     of an id that is known as it needs it then.
     """
-    not_fetched(context, "")
+    note_not_fetched(context, "")
     record = fetched.record
     known = context.state.reconstructor(record.id)
     if known is not None and known.sha256 not in {"", record.sha256}:
@@ -334,12 +336,12 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
     if context.matrices.in_use == record.id:
         return
     if known is None:
-        keep(context, record)
+        store_reconstructor(context, record)
     context.log("reconstructor.adopted", f"the RTC uses {record.id}, {record.n_modes} modes")
-    use_named(context, record.id)
+    apply_named(context, record.id)
 
 
-def use_named(context: StepContext, matrix_id: str) -> None:
+def apply_named(context: StepContext, matrix_id: str) -> None:
     """Take the reconstructor that the RTC's status names for applied, acknowledged or not.
 
     Only once its numbers are known to be the RTC's, or are not to be had.
@@ -347,7 +349,7 @@ def use_named(context: StepContext, matrix_id: str) -> None:
     record = context.state.reconstructor(matrix_id)
     if record is None or why_unread(context.state, matrix_id):
         return
-    use(context, matrix_id)
+    mark_applied(context, matrix_id)
     if record.state is MatrixState.FAILED:
         text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
         change_state(context, matrix_id, MatrixState.APPLIED, text)
@@ -366,9 +368,9 @@ def on_margin(context: StepContext, event: ev.MarginJudged) -> None:
         and update_policy.verdict_doubtful_reason(context.state, judged, gains) is not None
     ):
         if used:
-            judge_again(context)
+            forget_when_judged(context)
         return
-    change(context, replace(record, gate=verdict, judged=judged))
+    replace_record(context, replace(record, gate=verdict, judged=judged))
     if not used:
         return
     assessment = None
@@ -389,7 +391,7 @@ def _sendable(
     CommandError
         If it cannot be sent now.
     """
-    record, rtc = known_record(context.state, matrix_id), context.rtc
+    record, rtc = require_record(context.state, matrix_id), context.rtc
     reason = why_refused(context.state, record, swapped_ns_utc)
     if rtc is None or reason is not None:
         raise CommandError(f"{matrix_id} cannot be sent: {reason}")
@@ -431,7 +433,7 @@ def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
     registration, began_ns = state.alpha.registration, state.matrices.making_since_ns_utc
     if registration is None or registration.jumped_ns_utc is None or began_ns is None:
         return False
-    return registration.jumped_ns_utc >= began_ns and update_policy.outdated(state, record)
+    return registration.jumped_ns_utc >= began_ns and update_policy.is_outdated(state, record)
 
 
 def _why_unjudged(record: ReconstructorRecord) -> str:
@@ -440,7 +442,7 @@ def _why_unjudged(record: ReconstructorRecord) -> str:
     return record.reason if record.gate is None and going else ""
 
 
-def _meant(state: TrackerState, event: Acknowledgement) -> ReconstructorRecord | None:
+def _acknowledged_record(state: TrackerState, event: Acknowledgement) -> ReconstructorRecord | None:
     """Return which reconstructor is acknowledged: a commit nobody could read was the last one."""
     if event.id is not None:
         return state.reconstructor(event.id)

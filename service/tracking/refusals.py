@@ -7,9 +7,9 @@ from dataclasses import replace
 from service.estimation.windows import RefusalKind
 from service.tracking import alarms
 from service.tracking.alarms import Interlock
-from service.tracking.operations.running import ramping
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
-from service.tracking.step_context import StepContext, says_the_same
+from service.tracking.step_context import StepContext, same_but_for_numbers
 
 IN_A_ROW = 3
 """Windows refused one after the other that are no chance, and windows used that end it."""
@@ -22,26 +22,26 @@ AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 """Kinds of refusals that are no fault, and say nothing of the windows before and after."""
 
 
-def count(context: StepContext) -> None:
+def count_refused(context: StepContext) -> None:
     """Count a window that was refused."""
     context.windows = replace(context.windows, refused=context.windows.refused + 1)
 
 
-def refuse(context: StepContext, reason: str, kind: RefusalKind) -> None:
+def note_refused(context: StepContext, reason: str, kind: RefusalKind) -> None:
     """Count a window that gave nothing, and why."""
-    count(context)
+    count_refused(context)
     if kind in AS_EXPECTED:
         return
     run = min(context.windows.run, 0) - 1
     context.windows = replace(context.windows, run=run, refused_because=reason)
 
 
-def use(context: StepContext) -> None:
+def note_used(context: StepContext) -> None:
     """Note that a window could be used."""
     context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
 
 
-def follow(context: StepContext) -> None:
+def reset_run(context: StepContext) -> None:
     """Begin to count anew where no window is expected any more."""
     if context.windows.run < 0 and _excused(context):
         context.windows = replace(context.windows, run=0)
@@ -57,7 +57,7 @@ def refused_text(context: StepContext) -> str | None:
     if run <= -IN_A_ROW:
         because = context.windows.refused_because
         text = f"windows are refused one after the other: {because}; α is not measured meanwhile"
-        if raised is not None and says_the_same(raised, text):
+        if raised is not None and same_but_for_numbers(raised, text):
             text = raised  # one cause is one text: of each window the log tells the numbers
     elif raised is not None:
         text = raised if run < IN_A_ROW else ""
@@ -85,7 +85,7 @@ def _excused(context: StepContext) -> bool:
     if context.acquisition.under_way or state.measuring is not None:
         return True
     return (
-        ramping(state, context.now_ns) is not None
+        running_ramp(state, context.now_ns) is not None
         or context.blocking_alarm(Interlock.MEASURE) is not None
         or context.blocking_alarm(Interlock.ASK) is not None
     )

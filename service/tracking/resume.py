@@ -6,20 +6,20 @@ from dataclasses import replace
 
 from service.tracking import commands as cmd
 from service.tracking import dither, mode_proof, offload
-from service.tracking.alarm_records import take_over
+from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.alarms import Interlock
-from service.tracking.operations.acquisition import inherit, left_behind
-from service.tracking.operations.acquisition_stages import abort
+from service.tracking.operations.acquisition import acquisition_to_save, restore_acquisition
+from service.tracking.operations.acquisition_stages import abort_acquisition
 from service.tracking.operations.measurement import give_up
-from service.tracking.operations.running import ramping
+from service.tracking.operations.running import running_ramp
 from service.tracking.operator import change_mode
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import prune
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import age, forget, restore
+from service.tracking.validity import age_registration, forget_registration, restore_registration
 from service.tracking.void_intervals import restore_intervals
 
 CLOCKS_AGREE_S = 60.0
@@ -32,7 +32,7 @@ _RESTARTED = {
 }
 
 
-def stop(context: StepContext, command: cmd.StopEverything) -> None:
+def stop_everything(context: StepContext, command: cmd.StopEverything) -> None:
     """End what runs as its own command would; from then on ask only for dithers to end.
 
     An acquisition gives back the loop as it was found, now. One that a measurement has opened is
@@ -40,22 +40,22 @@ def stop(context: StepContext, command: cmd.StopEverything) -> None:
     ends by itself; only opening the loop would end it sooner.
     """
     if not context.operator.stopped_because:
-        ramp = ramping(context.state, context.now_ns)
+        ramp = running_ramp(context.state, context.now_ns)
         left = "" if ramp is None else f"; {ramp.id} is the RTC's and ends by itself"
         text = f"everything was stopped {command.signed}{left}"
         context.operator = replace(context.operator, stopped_because=text)
     if context.acquisition.under_way:
-        abort(context, "by the operator", held_off=True)
+        abort_acquisition(context, "by the operator", held_off=True)
     for record in (context.state.measuring, context.state.noisy_measurement):
         if record is not None:
             give_up(context, record.id)
     if context.rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
-        dither.drop(context)
+        dither.forget_dither(context)
     else:
-        dither.make_way(context)
+        dither.stop_running_dither(context)
 
 
-def release(context: StepContext, command: cmd.Resume) -> None:
+def resume_everything(context: StepContext, command: cmd.Resume) -> None:
     """Go on in the mode and with the dither that were ordered before, or meanwhile."""
     context.operator = replace(context.operator, stopped_because="")
     context.log("resumed", command.signed)
@@ -78,14 +78,14 @@ def orders_of(state: TrackerState) -> Orders:
     )
 
 
-def obey(context: StepContext, orders: Orders) -> None:
+def obey_orders(context: StepContext, orders: Orders) -> None:
     """Take over what was ordered before a restart, the mode being the settings' so far.
 
     What was said last counts: an order outlives the service, and ends with the next one, or when
     the settings say something else than they did when it was given.
     """
     if orders.dither_stopped:
-        dither.allow(context, allowed=False)
+        dither.allow_dither(context, allowed=False)
         text = "by an operator before the restart; start the dither to let it dither again"
         context.warn("dither.stopped", text)
     of_settings, ordered = context.operator.mode, orders.mode
@@ -124,7 +124,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     """Return what is worth keeping of a state; None: nothing is known yet, nor ordered."""
     registration, acquisition, orders = (
         state.alpha.registration,
-        left_behind(state),
+        acquisition_to_save(state),
         orders_of(state),
     )
     if registration is not None:
@@ -169,15 +169,15 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     """
     context = StepContext(state, policy, now_ns)
     if saved.orders is not None and saved.system == state.system:
-        obey(context, saved.orders)
+        obey_orders(context, saved.orders)
         stopped = saved.orders.stopped
         context.operator = replace(context.operator, stopped_because=stopped)
-        take_over(context, saved.orders)
+        restore_records(context, saved.orders)
     if saved.system == state.system:
         restore_intervals(context, saved.void_intervals)
     _take_over_alpha(context, saved, now_ns)
     if saved.offload is not None and saved.system == state.system:
-        offload.go_on(context, saved.offload)
+        offload.restore_offload(context, saved.offload)
     derive_alarms(context)
     return context.state
 
@@ -187,19 +187,19 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"
         context.warn("registration.not-restored", text)
-        forget(context)
+        forget_registration(context)
         return
     if saved.acquisition is not None:
-        inherit(context, saved.acquisition)
+        restore_acquisition(context, saved.acquisition)
     registration = saved.registration
     if registration is not None:
         away_s = max(now_ns - registration.arrived_ns_utc, 0) / SECOND_NS
-        restore(context, registration)
+        restore_registration(context, registration)
         text = f"α of {away_s:.0f} s ago; {saved.in_use or 'no known matrix'} was in use then"
         context.log("registration.restored", text)
-        age(context)
+        age_registration(context)
     if saved.mode_proof is not None and saved.session is not None:
-        mode_proof.restore(context, saved.mode_proof, saved.session)
+        mode_proof.restore_proof(context, saved.mode_proof, saved.session)
 
 
 def _why_not(state: TrackerState, saved: Saved, now_ns: int) -> str | None:

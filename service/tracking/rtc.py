@@ -11,7 +11,7 @@ from service.tracking.events import Effect
 from service.tracking.operator import end_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState
-from service.tracking.step_context import StepContext, tell_bursts
+from service.tracking.step_context import StepContext, log_bursts
 from service.wire import DitherRequest, DitherStop, Status
 
 ACKNOWLEDGE_WITHIN_S = 3.0
@@ -37,10 +37,10 @@ def on_tick(context: StepContext) -> None:
                 context.raise_alarm(alarms.NOT_ACKNOWLEDGED, text)
     since_ns = context.matrices.making_since_ns_utc
     if since_ns is not None and context.now_ns - since_ns > COMPUTE_WITHIN_S * SECOND_NS:
-        reconstructors.made_none(context)
+        reconstructors.note_none_made(context)
         text = f"no reconstructor came within {COMPUTE_WITHIN_S:.0f} s"
         context.warn("reconstructor.lost", text)
-    tell_bursts(context)
+    log_bursts(context)
 
 
 def on_status(context: StepContext, rtc: Status) -> None:
@@ -48,7 +48,7 @@ def on_status(context: StepContext, rtc: Status) -> None:
     before, registration = context.rtc, context.registration
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
-        reconstructors.judge_again(context)
+        reconstructors.forget_when_judged(context)
     biases = () if registration is None else registration.biases
     numbers = loop_numbers(rtc)
     if any(bias.looked_ns_utc and not same_numbers(bias.loop, numbers) for bias in biases):
@@ -60,12 +60,12 @@ def on_status(context: StepContext, rtc: Status) -> None:
         basis_id=context.loop.basis_id or rtc.basis_id,
         config_id=context.loop.config_id or rtc.config_id,
     )
-    validity.point(context, rtc.pointing)
+    validity.note_pointing(context, rtc.pointing)
     _drop_other_basis(context)
-    mode_proof.take_over(context, rtc)
-    _tell_of_gains(context, before, rtc)
+    mode_proof.believe_restored(context, rtc)
+    _log_partial_loop(context, before, rtc)
     if rtc.cm_id is not None:
-        reconstructors.use_named(context, rtc.cm_id)
+        reconstructors.apply_named(context, rtc.cm_id)
     dither.follow_status(context, rtc)
 
 
@@ -83,7 +83,7 @@ def on_loop_held(context: StepContext, event: ev.LoopHeld) -> None:
     context.loop = replace(context.loop, holds=event.holds)
 
 
-def _tell_of_gains(context: StepContext, before: Status | None, rtc: Status) -> None:
+def _log_partial_loop(context: StepContext, before: Status | None, rtc: Status) -> None:
     """Say how many modes are in the loop where it is not all that are controlled."""
     n_before = rtc.n_controlled if before is None else len(before.in_loop)
     n_now = len(rtc.in_loop)
@@ -101,7 +101,7 @@ def _drop_other_basis(context: StepContext) -> None:
         state.loop.basis_id,
         state.loop.config_id,
     ):
-        validity.forget(context)
+        validity.forget_registration(context)
         text = (
             f"α was measured with {registration.basis_id}, {registration.config_id}; the RTC has "
             f"{state.loop.basis_id}, {state.loop.config_id}"
@@ -113,12 +113,12 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
     reconstructors.forget_session(context)
     void_intervals.invalidate_telemetry(context, "the RTC was in another session")
-    dither.drop(context)
+    dither.forget_dither(context)
     end_ramp(context)
-    validity.require_confirmation(context)
+    validity.require_new_windows(context)
     context.retry_all()
     context.loop = replace(context.loop, rtc=None, holds=False)
-    dither.found_again(context)
+    dither.note_found(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)
     context.log("rtc.session", f"the RTC started session {started.session}")
@@ -126,9 +126,9 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
 
 def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:
     """Forget what belonged to the RTC, and nothing else."""
-    dither.drop(context)
+    dither.forget_dither(context)
     context.loop = replace(context.loop, rtc=None)
-    dither.found_again(context)
+    dither.note_found(context)
     dither.forget_unwanted(context)
     text = (
         "the RTC's token is gone: it has ended, stood still for over 2 s or lost the network; α "
@@ -152,7 +152,7 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
         )
         context.raise_alarm(alarms.SECOND_SERVICE, text)
     if not event.drives:
-        dither.drop(context)
+        dither.forget_dither(context)
         text = (
             f"another service drives the RTC: {who}; this one asks and sends nothing until that "
             "one has gone: end one of them"
@@ -170,11 +170,11 @@ def on_failure(context: StepContext, effect: Effect, text: str) -> None:
     match effect:
         case ev.MakeMatrix() | ev.RepublishMatrix():
             context.put_off(make_s=5.0)
-            reconstructors.made_none(context)
+            reconstructors.note_none_made(context)
             context.fail(text)
         case ev.Ask(request=DitherRequest()):
             context.put_off(dither_s=5.0)
-            dither.drop(context)
+            dither.forget_dither(context)
             context.fail(text)
         case ev.JudgeProposal():
             context.put_off(make_s=5.0)
@@ -182,7 +182,7 @@ def on_failure(context: StepContext, effect: Effect, text: str) -> None:
         case ev.Ask(request=DitherStop()):
             pass  # it is asked again while it must be; nothing else has to wait for that
         case ev.FetchMatrix():
-            reconstructors.not_fetched(context, text)
+            reconstructors.note_not_fetched(context, text)
         case ev.SendMatrix(id=matrix_id):
             reconstructors.change_state(context, matrix_id, MatrixState.FAILED, text)
         case _:

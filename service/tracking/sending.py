@@ -98,7 +98,7 @@ def may_follow(state: TrackerState) -> bool:
         or why_no_return(state) is not None
     ):
         return False
-    return registration is not None and update_policy.settled(registration)
+    return registration is not None and update_policy.is_settled(registration)
 
 
 def beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:

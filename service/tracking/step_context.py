@@ -295,10 +295,10 @@ def _same(before: LogEntry, entry: LogEntry) -> bool:
         return False
     if entry.name not in REPEATING:
         return before.text == entry.text
-    return says_the_same(before.text, entry.text)
+    return same_but_for_numbers(before.text, entry.text)
 
 
-def says_the_same(one: str, other: str) -> bool:
+def same_but_for_numbers(one: str, other: str) -> bool:
     """Return whether two texts differ in nothing but numbers."""
     return _NUMBERS.sub("", one) == _NUMBERS.sub("", other)
 
@@ -320,7 +320,7 @@ def _widened(
     )
 
 
-def _of_burst(entry: LogEntry) -> str:
+def _burst_text(entry: LogEntry) -> str:
     """Return what a burst has said in all: the range of each number, how often, and when."""
     left = iter(entry.ranges)
 
@@ -338,7 +338,7 @@ def _of_burst(entry: LogEntry) -> str:
     )
 
 
-def tell_bursts(context: StepContext) -> None:
+def log_bursts(context: StepContext) -> None:
     """Add a line for each burst that is over: when it was, how often, and from what to what.
 
     It has the time of the burst's end, and not of when it is told.
@@ -346,7 +346,7 @@ def tell_bursts(context: StepContext) -> None:
     for entry in context.state.log:
         if entry.times > 1 and context.now_ns - entry.t_ns_utc >= BURST_NS:
             told = replace(
-                entry, t_ns_utc=entry.last_ns_utc, text=_of_burst(entry), times=1, ranges=()
+                entry, t_ns_utc=entry.last_ns_utc, text=_burst_text(entry), times=1, ranges=()
             )
             log = (replace(e, times=1, ranges=()) if e is entry else e for e in context.state.log)
             context.state = replace(context.state, log=(*log, told)[-LOG_LENGTH:])

@@ -42,7 +42,7 @@ VERDICT_REACH = np.array([0.01, 0.01, np.deg2rad(0.02), 0.001])
 """A verdict of the gate is not for a registration further away than this (numeric units)."""
 
 
-def settled(registration: Registration) -> bool:
+def is_settled(registration: Registration) -> bool:
     """Return whether α may be believed: windows agree, and none of them hints at a jump."""
     sure = registration.suspected_jump is None and not registration.doubt
     return registration.n_windows >= MIN_WINDOWS and sure and registration.usable
@@ -111,7 +111,7 @@ def update_reason(
         return f"{in_use.id} was not made for a known registration"
     if state.matrices.margin is not None and not state.matrices.margin.accepted:
         return f"{in_use.id}: {state.matrices.margin.reason}"
-    if moved(state, in_use, policy):
+    if has_moved(state, in_use, policy):
         step = registration.alpha.vector - in_use.alpha.vector
         return f"moved by {step_text(step)} since {in_use.id}"
     if _jumped(state, in_use, registration):
@@ -199,7 +199,7 @@ def _step_since(
     return (step, covariance) if far else None
 
 
-def moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
+def has_moved(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
     """Return whether α is so far from what this reconstructor was made for that it must go.
 
     Whatever is expected of it: the linear model knows nothing of how a pyramid's gains change.
@@ -216,18 +216,18 @@ def _jumped(state: TrackerState, in_use: ReconstructorRecord, registration: Regi
         registration.jumped_ns_utc is not None
         and registration.jumped_ns_utc > in_use.created_ns_utc
     )
-    return since and outdated(state, in_use)
+    return since and is_outdated(state, in_use)
 
 
-def left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
+def is_left_behind(state: TrackerState, record: ReconstructorRecord, policy: Policy) -> bool:
     """Return whether α has gone so far from this reconstructor that nobody may want it now."""
     registration = state.alpha.registration
     return registration is not None and (
-        moved(state, record, policy) or _jumped(state, record, registration)
+        has_moved(state, record, policy) or _jumped(state, record, registration)
     )
 
 
-def outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
+def is_outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether this reconstructor's verdict is of another registration than the present."""
     return _apart(state, record, VERDICT_REACH)
 
@@ -270,17 +270,19 @@ _DECLINED = frozenset({MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FA
 """By the gate when it judged it again, or by the RTC."""
 
 
-def half_of(n_modes: int) -> int:
+def half_of_modes(n_modes: int) -> int:
     """Return the largest rung that is at most half of ``n_modes``, or these where there is none."""
     return max((rung for rung in LADDER if 2 * rung <= n_modes), default=n_modes)
 
 
-def fewer_than(n_modes: int) -> tuple[int, ...]:
+def fewer_modes_than(n_modes: int) -> tuple[int, ...]:
     """Return the rungs below ``n_modes``, largest first."""
     return tuple(rung for rung in LADDER if rung < n_modes)
 
 
-def more_to_try(state: TrackerState, rtc: Status, policy: Policy, now_ns: int) -> tuple[int, ...]:
+def more_modes_to_try(
+    state: TrackerState, rtc: Status, policy: Policy, now_ns: int
+) -> tuple[int, ...]:
     """Return the numbers of modes above the present one that may be tried now, largest first.
 
     New modes get the gain of the last: where that is 0 they would not be in the loop.
@@ -291,7 +293,7 @@ def more_to_try(state: TrackerState, rtc: Status, policy: Policy, now_ns: int) -
     limit = state.matrices.mode_limit
     if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):
         target = min(target, limit.n_modes)
-    rungs = {target, *fewer_than(target)}
+    rungs = {target, *fewer_modes_than(target)}
     return tuple(sorted((rung for rung in rungs if rung > rtc.n_controlled), reverse=True))
 
 

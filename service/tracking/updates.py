@@ -6,21 +6,21 @@ from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
 from service.tracking.mode_proof import awaits_proof, n_proven_modes
-from service.tracking.operations.running import ramping
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.reconstructors import fetch, judge, make
+from service.tracking.reconstructors import request_applied, request_matrix, request_verdict
 from service.tracking.sending import why_no_return, why_unsendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import (
     PROPOSAL_STANDS_S,
     assessment_is_old,
-    fewer_than,
-    left_behind,
-    more_to_try,
-    outdated,
-    settled,
+    fewer_modes_than,
+    is_left_behind,
+    is_outdated,
+    is_settled,
+    more_modes_to_try,
     update_reason,
 )
 from service.wire import Status
@@ -56,17 +56,17 @@ def fetch_in_use(context: StepContext) -> None:
     )
     every_s = ASK_FIRST_S if anew else ASK_AGAIN_S
     if context.now_ns - state.matrices.applied_asked_ns_utc >= every_s * SECOND_NS:
-        fetch(context, rtc)
+        request_applied(context, rtc)
 
 
-def decide(context: StepContext) -> None:
+def decide_updates(context: StepContext) -> None:
     """Ask for what is wanted now."""
     rtc = context.rtc
     if rtc is None or context.blocking_alarm(Interlock.ASK) is not None:
         return
     idle = (
         context.blocking_alarm(Interlock.DECIDE) is not None
-        or ramping(context.state, context.now_ns) is not None
+        or running_ramp(context.state, context.now_ns) is not None
     )
     if idle:
         stop_unwanted(context, rtc)
@@ -76,7 +76,7 @@ def decide(context: StepContext) -> None:
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
     if unjudged is not None:
-        judge(context, unjudged)
+        request_verdict(context, unjudged)
 
 
 def _unjudged_in_use(context: StepContext) -> str | None:
@@ -86,7 +86,7 @@ def _unjudged_in_use(context: StepContext) -> str | None:
     there and then.
     """
     state, registration = context.state, context.registration
-    if registration is None or state.matrices.in_use is None or not settled(registration):
+    if registration is None or state.matrices.in_use is None or not is_settled(registration):
         return None
     making = state.matrices.making_since_ns_utc is not None
     return (
@@ -114,7 +114,7 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
         state.operator.mode is Mode.HOLD
         or state.on_probation
         or registration is None
-        or not settled(registration)
+        or not is_settled(registration)
     ):
         return
     if not rtc.in_loop or state.matrices.making_since_ns_utc is not None:
@@ -125,22 +125,22 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
         _next_attempt_ns(state, rtc, context.policy), state.matrices.no_making_before_ns_utc
     )
     in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
-    if _busy(context) or now_ns < first_ns or in_use is None:
+    if _is_busy(context) or now_ns < first_ns or in_use is None:
         return
     why, n_now = update_reason(state, in_use, context.policy, now_ns), rtc.n_controlled
     n_safe = n_proven_modes(state, rtc.n_modes)
     if n_safe < n_now:
         return
     if why is not None:
-        make(context, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_than(n_now)))
+        request_matrix(context, MakeMatrix(n_modes=n_now, why=why, fewer=fewer_modes_than(n_now)))
         return
-    more = tuple(n for n in more_to_try(state, rtc, context.policy, now_ns) if n <= n_safe)
+    more = tuple(n for n in more_modes_to_try(state, rtc, context.policy, now_ns) if n <= n_safe)
     if more and not awaits_proof(context, rtc):
         why = f"{n_now} of {more[0]} modes controlled"
-        make(context, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
+        request_matrix(context, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
 
 
-def _busy(context: StepContext) -> bool:
+def _is_busy(context: StepContext) -> bool:
     """Return whether a reconstructor is on its way, or one awaits an operator.
 
     In auto nobody is going to decide on a proposal left from another mode or an absent RTC, but
@@ -149,19 +149,20 @@ def _busy(context: StepContext) -> bool:
     state = context.state
     awaited = state.operator.mode is not Mode.AUTO or why_no_return(state) is not None
     return any(
-        r.on_its_way or (r.state is MatrixState.PROPOSED and awaited and _stands(context, r))
+        r.on_its_way
+        or (r.state is MatrixState.PROPOSED and awaited and _is_left_to_operator(context, r))
         for r in state.matrices.reconstructors
     )
 
 
-def _stands(context: StepContext, record: ReconstructorRecord) -> bool:
+def _is_left_to_operator(context: StepContext, record: ReconstructorRecord) -> bool:
     """Return whether a proposal is left for an operator to decide on: it fits α, or is new."""
     state = context.state
-    if not outdated(state, record):
+    if not is_outdated(state, record):
         return True
     age_s = (context.now_ns - record.created_ns_utc) / SECOND_NS
     usable = (
-        not left_behind(state, record, context.policy) and why_unsendable(state, record) is None
+        not is_left_behind(state, record, context.policy) and why_unsendable(state, record) is None
     )
     return usable and age_s < PROPOSAL_STANDS_S
 
@@ -174,17 +175,19 @@ def _next_attempt_ns(state: TrackerState, rtc: Status, policy: Policy) -> int:
     own = [
         r
         for r in state.matrices.reconstructors
-        if r.parent is not None and not _overtaken(state, r)
+        if r.parent is not None and not _is_overtaken(state, r)
     ]
     if not own:
         return 0
     last = own[-1]
     failed = (MatrixState.REFUSED, MatrixState.REJECTED, MatrixState.FAILED, MatrixState.DISCARDED)
-    again = last.state in failed and not outdated(state, last) and last.n_modes <= rtc.n_controlled
+    again = (
+        last.state in failed and not is_outdated(state, last) and last.n_modes <= rtc.n_controlled
+    )
     wait_s = policy.refused_interval_s if again else policy.minimum_interval_s
     return last.created_ns_utc + int(wait_s * SECOND_NS)
 
 
-def _overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
+def _is_overtaken(state: TrackerState, record: ReconstructorRecord) -> bool:
     """Return whether a reconstructor was never sent, and α is elsewhere by now."""
-    return record.state is MatrixState.DISCARDED and outdated(state, record)
+    return record.state is MatrixState.DISCARDED and is_outdated(state, record)

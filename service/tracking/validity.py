@@ -45,7 +45,7 @@ _WORTHLESS = (Validity.STALE, Validity.INVALID)
 Array = NDArray[np.float64]
 
 
-def point(context: StepContext, pointing: Pointing | None) -> None:
+def note_pointing(context: StepContext, pointing: Pointing | None) -> None:
     """Note where the telescope looks, and remember its way; None: nobody tells."""
     if pointing is None:
         return
@@ -97,11 +97,11 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
         ),
     )
     void_until(context, still_ns_utc, MOVING, Purpose.PASSIVE)
-    want_window(context, MOVING)
-    age(context)
+    request_window(context, MOVING)
+    age_registration(context)
 
 
-def forget(context: StepContext) -> None:
+def forget_registration(context: StepContext) -> None:
     """Know nothing of α any more, nor of what has been doubted of it."""
     make_valid(context, Purpose.PASSIVE)
     make_valid(context, Purpose.SETTLE)
@@ -114,18 +114,18 @@ def forget_biases(context: StepContext) -> None:
         store_registration(context, replace(context.registration, biases=()))
 
 
-def require_confirmation(context: StepContext) -> None:
+def require_new_windows(context: StepContext) -> None:
     """Have windows confirm what is known anew."""
     if context.registration is not None:
         store_registration(context, replace(context.registration, n_windows=0))
 
 
-def restore(context: StepContext, registration: Registration) -> None:
+def restore_registration(context: StepContext, registration: Registration) -> None:
     """Take over what was known before a restart of the service."""
     store_registration(context, replace(registration, n_windows=0, restored_ns_utc=context.now_ns))
 
 
-def age(context: StepContext) -> None:
+def age_registration(context: StepContext) -> None:
     """Let σ grow to the present, and say what α is then worth."""
     registration = context.registration
     if registration is not None:
@@ -137,13 +137,13 @@ def age(context: StepContext) -> None:
         registration = replace(registration, grown=walked + bent**2)
         standing = _validity_of(context, registration)
         if standing.level in _WORTHLESS:
-            want_window(context, standing.reason)
+            request_window(context, standing.reason)
         elif context.dither is None and _too_wide_for_the_gate(context.state, registration):
-            want_window(context, "σ has grown beyond what the stability gate accepts")
+            request_window(context, "σ has grown beyond what the stability gate accepts")
         store_registration(context, replace(registration, validity=standing))
 
 
-def want_window(context: StepContext, reason: str) -> None:
+def request_window(context: StepContext, reason: str) -> None:
     """Want a dithered window; a wish that stands keeps its beginning."""
     if context.alpha.dither_due_since_ns_utc is None:
         due = replace(
@@ -158,7 +158,7 @@ def want_window(context: StepContext, reason: str) -> None:
         context.log("dither.due", reason)
 
 
-def have_window(context: StepContext) -> None:
+def end_window_request(context: StepContext) -> None:
     """Note that the wish has been fulfilled."""
     context.alpha = replace(context.alpha, dither_due_since_ns_utc=None, dither_due_reason="")
 

@@ -124,7 +124,7 @@ def end_alarm(context: StepContext, name: str, t_ns_utc: int = 0) -> None:
         invalidate_telemetry(context, alarm.definition.because, t_ns_utc)
 
 
-def tells_of(state: TrackerState, name: str, span: TelemetrySpan) -> bool:
+def is_since_alarm(state: TrackerState, name: str, span: TelemetrySpan) -> bool:
     """Return whether telemetry was taken since this alarm was raised, or there is no such alarm."""
     alarm = state.alarm(name)
     return alarm is None or not precedes(state, span, alarm.t_ns_utc)

@@ -23,8 +23,8 @@ from service.estimation.windows import RefusalKind
 from service.model.misregistration import Misregistration, step_text
 from service.tracking import alarms, filtering, jumps, refusals, validity, void_intervals
 from service.tracking import events as ev
-from service.tracking.dither import found_again
-from service.tracking.dither_plan import why_none as why_no_dither
+from service.tracking.dither import note_found
+from service.tracking.dither_plan import why_no_dither
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
 from service.tracking.operations.acquisition_stages import count_miss
@@ -57,12 +57,12 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         kind, reason = why
         reject_window(context, reason, kind)
         return
-    refusals.use(context)
-    if void_intervals.tells_of(context.state, alarms.DITHER_LOST, when):
-        found_again(context)
+    refusals.note_used(context)
+    if void_intervals.is_since_alarm(context.state, alarms.DITHER_LOST, when):
+        note_found(context)
     random = isinstance(estimate, RandomEstimate)
     for name in (alarms.MISALIGNED, *(() if random else (alarms.WRONG_ANSWER,))):
-        if void_intervals.tells_of(context.state, name, when):
+        if void_intervals.is_since_alarm(context.state, name, when):
             context.clear_alarm(name)
     registration = context.registration
     modes, gains, gain_sigma = filtering.gains_of(estimate)
@@ -74,7 +74,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         began_ns_utc=when.began_ns_utc,
         source=Source.RANDOM if random else Source.LOCK_IN,
         optical_gain=float(gains.mean()),
-        optical_gains=filtering.followed_gains(
+        optical_gains=filtering.update_gains(
             () if registration is None else registration.optical_gains,
             modes,
             gains[: len(modes)],
@@ -101,7 +101,7 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     _note_refusal(context, reason, level)
-    refusals.refuse(context, reason, kind)
+    refusals.note_refused(context, reason, kind)
 
 
 def _note_refusal(context: StepContext, reason: str, level: Level = Level.INFO) -> None:
@@ -127,14 +127,13 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     far = jumps.window_innovation(registration, measured, context.policy)
     too_early = void_intervals.why_void(context.state, measured.when, Purpose.SETTLE)
     if too_early is not None and not far.is_outlier:
-        refusals.count(context)
+        refusals.count_refused(context)
         _note_refusal(context, too_early)
         return
     if registration.suspected_jump is not None:
         text = (
-            f"the window {_away(registration.suspected_jump, registration)} from α was not "
-            f"confirmed: the one after "
-            f"it lies {_away(measured, registration)} away"
+            f"the window {_distance_text(registration.suspected_jump, registration)} from α was "
+            f"not confirmed: the one after it lies {_distance_text(measured, registration)} away"
         )
         n_outlying = context.windows.outlying + 1
         context.windows = replace(context.windows, outlying=n_outlying)
@@ -145,10 +144,10 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     if far.is_outlier:
         _suspect_jump(context, registration, measured, far)
         return
-    prior = filtering.brought_forward(context, registration, measured.t_ns_utc)
+    prior = filtering.predict(context, registration, measured.t_ns_utc)
     update = FilterUpdate(
         joint=kalman.corrected(prior, measured.alpha.vector, measured.covariance),
-        n_windows=filtering.counted(context, registration, prior),
+        n_windows=filtering.n_agreeing(context, registration, prior),
         innovation=_innovation(prior, measured),
         scatter=kalman.learnt(registration.scatter, far.mahalanobis_squared),
     )
@@ -168,8 +167,8 @@ def _suspect_jump(
     """
     innovation = far.mahalanobis_squared
     text = (
-        f"a window lies {_away(measured, registration)} from α (innovation {innovation:.0f}, "
-        f"expected 4, "
+        f"a window lies {_distance_text(measured, registration)} from α "
+        f"(innovation {innovation:.0f}, expected 4, "
         f"rotation {np.sqrt(far.rotation):.1f} sigma): the next one decides; nothing is made or "
         "sent meanwhile"
     )
@@ -186,13 +185,13 @@ def _suspect_jump(
         context, replace(registration, doubt=doubt, doubt_voids=True, suspected_jump=candidate)
     )
     _cast_doubt(context, measured.t_ns_utc)
-    filtering.remember(
-        context, filtering.entry_of(measured, registration, innovation, entered=False)
+    filtering.add_history(
+        context, filtering.history_entry(measured, registration, innovation, entered=False)
     )
     if first is None or registration.suspected_jump is None:
         context.warn("registration.jump-suspected", text)
-    validity.want_window(context, doubt)
-    validity.age(context)
+    validity.request_window(context, doubt)
+    validity.age_registration(context)
 
 
 def _jump(
@@ -203,7 +202,7 @@ def _jump(
     The first of them is used if it is wholly of the new place.
     """
     policy = context.policy
-    prior = filtering.brought_forward(context, registration, measured.t_ns_utc)
+    prior = filtering.predict(context, registration, measured.t_ns_utc)
     noise = measured.covariance
     whole = jumps.wholly_after(first, measured, registration.alpha, policy)
     if whole:
@@ -224,7 +223,8 @@ def _jump(
     both = whole and registration.suspected_jump is not None
     filtering.accept(context, update, measured, n_accepted=2 if both else 1)
     context.warn(
-        "registration.jump", f"jumped by {_away(measured, registration)}, as two windows have seen"
+        "registration.jump",
+        f"jumped by {_distance_text(measured, registration)}, as two windows have seen",
     )
 
 
@@ -238,7 +238,7 @@ def _innovation(prior: Joint, measured: WindowEstimate) -> float:
     return kalman.innovation(prior, measured.alpha.vector, measured.covariance)
 
 
-def _away(window: TimedEstimate, registration: Registration) -> str:
+def _distance_text(window: TimedEstimate, registration: Registration) -> str:
     return step_text(window.alpha.vector - registration.alpha.vector)
 
 
@@ -253,15 +253,17 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         _show_passive_alone(context, event)
         return
     block = estimate.bias
-    registration = _expecting(registration, estimate)
-    forward = filtering.brought_forward(context, registration, event.t_ns_utc)
+    registration = _with_first_bias(registration, estimate)
+    forward = filtering.predict(context, registration, event.t_ns_utc)
     prior = kalman.allowing(forward, block, estimate.bias_excess)
     mixed = _why_of_two_places(context.state, registration, event)
     if mixed is not None:
-        looked = _looked(context.state, registration, filtering.joint_of(registration), event)
+        looked = _biases_after_look(
+            context.state, registration, filtering.joint_of(registration), event
+        )
         validity.store_registration(context, replace(registration, biases=looked))
         sigma = _passive_sigma(estimate, prior)
-        _show(context, event, sigma, prior.bias(block), f"not used: {mixed}")
+        _show_passive(context, event, sigma, prior.bias(block), f"not used: {mixed}")
         return
     measured = estimate.alpha.vector
     window = PointedEstimate(
@@ -280,7 +282,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     joint = kalman.scattered(joint, block, far)
     registration = _registration_after_passive(context, registration, joint, event)
     validity.store_registration(context, registration)
-    validity.age(context)
+    validity.age_registration(context)
     sigma = _passive_sigma(estimate, prior)
     entry = HistoryEntry(
         t_ns_utc=event.t_ns_utc,
@@ -292,9 +294,9 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
         misfit=estimate.misfit,
         source=Source.PASSIVE,
     )
-    filtering.remember(context, entry)
+    filtering.add_history(context, entry)
     text = "agrees with α and with what is known of its own bias"
-    _show(context, event, sigma, joint.bias(block), text)
+    _show_passive(context, event, sigma, joint.bias(block), text)
 
 
 def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
@@ -345,13 +347,13 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
             f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
             "begins, the nominal rotation; let the service acquire, or dither"
         )
-        _show(context, event, np.full(4, np.inf), np.zeros(4), text)
+        _show_passive(context, event, np.full(4, np.inf), np.zeros(4), text)
         return
     text = "no dithered estimate to compare with: nothing is made from this reading alone"
-    _show(context, event, event.estimate.sigma, np.zeros(4), text)
+    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text)
 
 
-def _expecting(registration: Registration, estimate: PassiveEstimate) -> Registration:
+def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> Registration:
     """Return what is known with the bias as large as the first look at it says that it may be.
 
     A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
@@ -364,7 +366,7 @@ def _expecting(registration: Registration, estimate: PassiveEstimate) -> Registr
     return replace(registration, biases=filtering.biases_of(joint, registration.biases))
 
 
-def _looked(
+def _biases_after_look(
     state: TrackerState,
     registration: Registration,
     joint: Joint,
@@ -427,17 +429,17 @@ def _ask_for_window(
     why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
     gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
-    biases = _looked(context.state, registration, gone, event)
+    biases = _biases_after_look(context.state, registration, gone, event)
     doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
     validity.store_registration(context, doubted)
     _cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
-    validity.want_window(context, text)
+    validity.request_window(context, text)
     if why_none is not None or waits:
         cannot = "none has since the last look that did" if why_none is None else why_none
         context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
-    validity.age(context)
-    _show(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
+    validity.age_registration(context)
+    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
 
 
 def _registration_after_passive(
@@ -453,7 +455,7 @@ def _registration_after_passive(
         covariance=joint.alpha_covariance,
         t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
         arrived_ns_utc=context.now_ns,
-        biases=_looked(context.state, registration, joint, event, was),
+        biases=_biases_after_look(context.state, registration, joint, event, was),
         pointing=validity.pointing_at(context.state, event.t_ns_utc),
     )
 
@@ -464,7 +466,7 @@ def _passive_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
     return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[place])
 
 
-def _show(
+def _show_passive(
     context: StepContext,
     event: ev.PassiveFitted,
     sigma: Array,

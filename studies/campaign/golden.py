@@ -24,7 +24,7 @@ from service.errors import PyrcalError
 from service.model.misregistration import Misregistration
 from service.tracker import step
 from service.tracking.events import Effect, Event
-from service.tracking.operations.running import under_way
+from service.tracking.operations.running import running_operations
 from service.tracking.policy import Policy
 from service.tracking.resume import restored, resumed, saved_of
 from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
@@ -105,7 +105,7 @@ def seen_by_operator(state: TrackerState, now_ns: int) -> dict[str, Json]:
     registration = state.alpha.registration
     return {
         "mode": state.operator.mode.value,
-        "runs": [running.kind.name for running in under_way(state, now_ns)],
+        "runs": [running.kind.name for running in running_operations(state, now_ns)],
         "acquisition": state.operations.acquisition.stage.value,
         "alarms": {alarm.name: alarm.text for alarm in state.alarms.active},
         "alpha": None if registration is None else registration.alpha.vector.tolist(),

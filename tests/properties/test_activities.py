@@ -7,7 +7,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.interlocks import ALLOWS
-from service.tracking.operations.running import OperationKind, under_way
+from service.tracking.operations.running import OperationKind, running_operations
 from service.tracking.products import MeasureState
 from service.wire import DitherStop
 from tests.unit.tracking.operations.test_running import (
@@ -46,7 +46,7 @@ class Operators(RuleBasedStateMachine):
 
     @rule(command=st.sampled_from(COMMANDS))
     def ask(self, command):
-        running = under_way(self.world.state, self.world.now_ns)
+        running = running_operations(self.world.state, self.world.now_ns)
         refusal = refused(self.world, command)
         assert "\n" not in refusal
         forbidding = [one.text for one in running if type(command) not in ALLOWS[one.kind]]
@@ -69,7 +69,7 @@ class Operators(RuleBasedStateMachine):
 
     @invariant()
     def the_mirror_has_one_owner(self):
-        running = under_way(self.world.state, self.world.now_ns)
+        running = running_operations(self.world.state, self.world.now_ns)
         owners = [one.text for one in running if one.kind in OWNERS]
         assert len(owners) <= 1, owners
 
@@ -90,7 +90,7 @@ class Operators(RuleBasedStateMachine):
         stopped, effects = bool(self.world.state.operator.stopped_because), self.world.effects
         if stopped and self.quiet_from is not None:
             assert not [one for one in effects[self.quiet_from :] if not harmless(one)]
-            running = under_way(self.world.state, self.world.now_ns)
+            running = running_operations(self.world.state, self.world.now_ns)
             assert not [one for one in running if one.kind in OWNERS - {OperationKind.RAMPING}]
         self.quiet_from = len(effects) if stopped else None
 

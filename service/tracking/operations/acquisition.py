@@ -23,12 +23,12 @@ from service.tracking import events as ev
 from service.tracking import reconstructors, update_policy
 from service.tracking.acquisition_state import Acquisition, AcquisitionStage, Interruption
 from service.tracking.alarms import Interlock
-from service.tracking.dither import allow, choose_dither, make_way
+from service.tracking.dither import allow_dither, choose_dither, stop_running_dither
 from service.tracking.events import Event
 from service.tracking.loop import present
 from service.tracking.operations import acquisition_stages as stages
-from service.tracking.operations.noisy_measurement import cut_off
-from service.tracking.operations.running import ramping
+from service.tracking.operations.noisy_measurement import fail_noisy_measurement
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
@@ -52,37 +52,37 @@ _LOST = (MatrixState.REJECTED, MatrixState.FAILED)
 
 def acquire_on_command(context: StepContext, _: cmd.Acquire) -> None:
     """Begin one because an operator says so."""
-    allow(context)
+    allow_dither(context)
     _begin(context, present(context.rtc), "the operator asks", commanded=True)
 
 
 def abort_on_command(context: StepContext, _: cmd.AbortAcquisition) -> None:
     """End one because an operator says so."""
-    stages.abort(context, "by the operator", held_off=True)
+    stages.abort_acquisition(context, "by the operator", held_off=True)
 
 
-def acquire(context: StepContext, event: Event) -> None:
+def advance(context: StepContext, event: Event) -> None:
     """Take an acquisition further after an event, or begin one where the service needs it."""
     acquisition = context.acquisition
     if acquisition.stage is AcquisitionStage.INTERRUPTED:
-        _take_up(context)
+        _resume_interrupted(context)
     elif not acquisition.under_way:
         if context.windows.accepted > context.before.windows.accepted:
-            stages.go_on(context, replace(acquisition, misses=0))
+            stages.set_acquisition(context, replace(acquisition, misses=0))
         _forget_when_over(context, event)
         why = stages.why_needed(context.state, context.policy, context.now_ns)
-        if why is not None and context.rtc and ramping(context.state, context.now_ns) is None:
+        if why is not None and context.rtc and running_ramp(context.state, context.now_ns) is None:
             _begin(context, context.rtc, why, commanded=False)
     elif isinstance(event, ev.RtcVanished):
         # the state before still knows in which session that was
-        stages.go_on(context, _cut_off(context.before, "the RTC vanished"))
-        _wait(context, NO_RTC)
+        stages.set_acquisition(context, _interrupted(context.before, "the RTC vanished"))
+        _note_interrupted(context, NO_RTC)
     else:
         with context.because_of("" if isinstance(event, cmd.Instruction) else acquisition.cause):
             _advance(context, event)
 
 
-def left_behind(state: TrackerState) -> Acquisition | None:
+def acquisition_to_save(state: TrackerState) -> Acquisition | None:
     """Return what the next service must know of an acquisition; None: nothing.
 
     One that was aborted matters while α is not known: it says why, and why the loop may be open. So
@@ -90,29 +90,29 @@ def left_behind(state: TrackerState) -> Acquisition | None:
     """
     acquisition = state.operations.acquisition
     if acquisition.under_way:
-        return _cut_off(state, "the service ended")
+        return _interrupted(state, "the service ended")
     aborted = acquisition.stage is AcquisitionStage.ABORTED and state.alpha.registration is None
     lasts = acquisition.stage in _LASTING or acquisition.held_off
-    return _kept(acquisition) if aborted or lasts else None
+    return _saved_part(acquisition) if aborted or lasts else None
 
 
-def inherit(context: StepContext, left: Acquisition) -> None:
+def restore_acquisition(context: StepContext, left: Acquisition) -> None:
     """Take over the acquisition that the service before this one has left."""
-    stages.go_on(context, left)
+    stages.set_acquisition(context, left)
     if left.stage not in {AcquisitionStage.FAILED, AcquisitionStage.ABORTED}:
-        _wait(context, NO_RTC)
+        _note_interrupted(context, NO_RTC)
 
 
 def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> None:
-    make_way(context)
-    cut_off(context, "an acquisition has begun")
+    stop_running_dither(context)
+    fail_noisy_measurement(context, "an acquisition has begun")
     lost = _own_loop_lost(context)
-    stages.begin(context, rtc, why=why, commanded=commanded)
+    stages.begin_acquisition(context, rtc, why=why, commanded=commanded)
     context.log("acquisition.begun", why)
     if lost is not None:
-        most = update_policy.half_of(rtc.n_controlled)
+        most = update_policy.half_of_modes(rtc.n_controlled)
         first = min(context.acquisition.n_modes, most)
-        stages.go_on(context, replace(context.acquisition, max_modes=most, n_modes=first))
+        stages.set_acquisition(context, replace(context.acquisition, max_modes=most, n_modes=first))
         update_policy.limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
     stages.wide_capture_stage(context, rtc)
 
@@ -152,17 +152,19 @@ def _end_by_event(context: StepContext, event: Event) -> bool:
     late = context.now_ns - acquisition.since_ns_utc > PATIENCE_S * SECOND_NS
     match event:
         case cmd.StopDither():
-            stages.abort(context, "because the dither was stopped")
+            stages.abort_acquisition(context, "because the dither was stopped")
         case cmd.SetMode(mode=mode) if mode is not Mode.AUTO and not acquisition.commanded:
-            stages.abort(context, f"because the mode is {mode}")
+            stages.abort_acquisition(context, f"because the mode is {mode}")
         case ev.SessionStarted() if acquisition.stage is not AcquisitionStage.OPENING:
-            stages.restart(context, "the RTC began a new session")
+            stages.restart_acquisition(context, "the RTC began a new session")
         case ev.DitherMeasured(id=loud, text=text) if loud == state.dithers.policy.loud_id and text:
-            stages.give_up(context, text)
+            stages.fail_acquisition(context, text)
         case ev.DitherUnusable(text=text):
-            stages.give_up(context, f"its dither cannot be read: {text}")
+            stages.fail_acquisition(context, f"its dither cannot be read: {text}")
         case ev.Tick() if late:
-            stages.restart(context, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s")
+            stages.restart_acquisition(
+                context, f"{acquisition.text}: not done in {PATIENCE_S:.0f} s"
+            )
         case _:
             return _end_by_answer(context, event)
     return True
@@ -174,9 +176,9 @@ def _end_by_answer(context: StepContext, event: Event) -> bool:
         case ev.Answered(
             request=LoopRequest(id=acquisition.command), reply=Reply(accepted=False, reason=reason)
         ):
-            stages.give_up(context, f"the RTC will not change its loop: {reason}")
+            stages.fail_acquisition(context, f"the RTC will not change its loop: {reason}")
         case ev.JobFailed(effect=ev.Ask(request=LoopRequest(id=acquisition.command)), text=text):
-            stages.restart(context, text)
+            stages.restart_acquisition(context, text)
         case _:
             return False
     return True
@@ -201,7 +203,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
     acquisition = context.acquisition
     record = context.state.reconstructor(acquisition.matrix) if acquisition.matrix else None
     if record is not None and record.state in _LOST:
-        stages.restart(context, f"{record.id} was not applied: {record.reason}")
+        stages.restart_acquisition(context, f"{record.id} was not applied: {record.reason}")
     elif acquisition.stage is AcquisitionStage.WIDENING:
         _widen(context, rtc, record)
     elif record is None:
@@ -214,7 +216,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
             stages.request_loop(context, cmd.SetLoop(loop="closed"))
     else:
         n_windows = context.windows.accepted
-        stages.go_on(context, replace(acquisition, applied=record.id, windows=n_windows))
+        stages.set_acquisition(context, replace(acquisition, applied=record.id, windows=n_windows))
         text = f"closed on {record.n_modes} modes: sharpening the registration"
         stages.enter_stage(context, AcquisitionStage.WIDENING, text)
 
@@ -229,7 +231,7 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         return
     found = acquisition.found
     if rtc is None or found is None:
-        stages.restart(context, f"{record.id} cannot be sent: no RTC is there")
+        stages.restart_acquisition(context, f"{record.id} cannot be sent: no RTC is there")
         return
     gains = stages.gains_for(found, record.n_modes, rtc.n_modes)
     stale = update_policy.verdict_doubtful_reason(
@@ -243,14 +245,14 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
         return
     reason = why_unsendable(context.state, record)
     if reason is not None:
-        stages.restart(context, f"{record.id} cannot be sent: {reason}")
+        stages.restart_acquisition(context, f"{record.id} cannot be sent: {reason}")
         return
     reconstructors.send_with(context, record.id, gains)
     most = acquisition.max_modes
     if acquisition.stage is AcquisitionStage.WIDENING and record.n_modes < (made.asked_modes or 0):
         most = record.n_modes
     sent = replace(acquisition, matrix=record.id, n_modes=record.n_modes, sent=True, command=None)
-    stages.go_on(context, replace(sent, max_modes=most))
+    stages.set_acquisition(context, replace(sent, max_modes=most))
 
 
 def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
@@ -258,24 +260,26 @@ def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     acquisition, gate, rtc = context.acquisition, record.gate, context.rtc
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
-        stages.go_on(context, replace(acquisition, max_modes=acquisition.n_modes))
+        stages.set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
     elif slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
         text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
         context.log("acquisition.leak", text)
         stages.request_loop(context, cmd.SetLoop(leak=FORGIVING_LEAK))
     else:
         reason = gate.reason if gate is not None else record.reason
-        stages.give_up(context, f"no number of modes passes the gate: {reason}")
+        stages.fail_acquisition(context, f"no number of modes passes the gate: {reason}")
 
 
 def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None) -> None:
     acquisition, registration = context.acquisition, context.registration
     slipped = context.blocking_alarm(Interlock.HOLD)
     if slipped is not None:
-        stages.restart(context, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True)
+        stages.restart_acquisition(
+            context, f"{slipped.name} with {acquisition.n_modes} modes", slipped=True
+        )
         return
     if rtc.loop == "open":
-        stages.restart(context, "somebody opened the loop")
+        stages.restart_acquisition(context, "somebody opened the loop")
         return
     doubted = registration is not None and bool(registration.doubt)
     waiting = doubted or context.matrices.making_since_ns_utc is not None
@@ -283,10 +287,10 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         if record.applied_frame_seq is not None and acquisition.applied != record.id:
             n_windows = context.windows.accepted
             acquisition = replace(acquisition, applied=record.id, windows=n_windows)
-            stages.go_on(context, acquisition)
+            stages.set_acquisition(context, acquisition)
         seen, goal = context.windows.accepted - acquisition.windows, _goal(acquisition)
         if seen >= 1 and (
-            record.n_modes < goal or update_policy.moved(context.state, record, context.policy)
+            record.n_modes < goal or update_policy.has_moved(context.state, record, context.policy)
         ):
             _make(context, goal, rtc, at_least=record.n_modes)
             return
@@ -306,9 +310,11 @@ def _make(context: StepContext, n_modes: int, rtc: Status, *, at_least: int = 0)
             n_modes=n_modes,
             why=f"acquisition: {n_modes} modes",
             gains=stages.gains_for(found, n_modes, rtc.n_modes),
-            fewer=tuple(rung for rung in update_policy.fewer_than(n_modes) if rung > at_least),
+            fewer=tuple(
+                rung for rung in update_policy.fewer_modes_than(n_modes) if rung > at_least
+            ),
         )
-        reconstructors.make(context, effect)
+        reconstructors.request_matrix(context, effect)
 
 
 def _goal(acquisition: Acquisition) -> int:
@@ -337,15 +343,15 @@ def _forget_when_over(context: StepContext, event: Event) -> None:
         return
     if acquisition.held_off and isinstance(event, cmd.SetMode):
         text = f"an operator has set the mode, {event.mode}, since the last was ended"
-    elif _followed(context.state):
+    elif _is_followed(context.state):
         text = f"{ENOUGH_WINDOWS} windows agree in the closed loop: none is needed any more"
     else:
         return
-    stages.go_on(context, Acquisition(text=text, since_ns_utc=context.now_ns))
+    stages.set_acquisition(context, Acquisition(text=text, since_ns_utc=context.now_ns))
     context.log("acquisition.idle", text)
 
 
-def _followed(state: TrackerState) -> bool:
+def _is_followed(state: TrackerState) -> bool:
     """Return whether windows that came since agree on α, in a closed loop."""
     rtc, registration = state.loop.rtc, state.alpha.registration
     if rtc is None or not rtc.in_loop or registration is None:
@@ -355,19 +361,19 @@ def _followed(state: TrackerState) -> bool:
     return believed and min(since, registration.n_windows) >= ENOUGH_WINDOWS
 
 
-def _kept(acquisition: Acquisition) -> Acquisition:
+def _saved_part(acquisition: Acquisition) -> Acquisition:
     """Return it without what is of telemetry and commands that have been overtaken."""
     return replace(acquisition, alpha=None, covariance=None, command=None, applied=None, windows=0)
 
 
-def _cut_off(state: TrackerState, cause: str) -> Acquisition:
+def _interrupted(state: TrackerState, cause: str) -> Acquisition:
     session = None if state.loop.rtc is None else state.loop.rtc.session
     doing = f"{state.operations.acquisition.stage}: {state.operations.acquisition.text}"
     interruption = Interruption(doing=doing, session=session, cause=cause)
-    return replace(_kept(state.operations.acquisition), interruption=interruption)
+    return replace(_saved_part(state.operations.acquisition), interruption=interruption)
 
 
-def _take_up(context: StepContext) -> None:
+def _resume_interrupted(context: StepContext) -> None:
     """Begin an acquisition that was cut off anew, or say why not and what the operator can do."""
     rtc = context.rtc
     if rtc is None:
@@ -381,16 +387,16 @@ def _take_up(context: StepContext) -> None:
             "The loop may be open, and its matrix is for a registration that was not believed: "
             "acquire again, or close the loop on a matrix of your own"
         )
-        _wait(context, f"it does not begin anew by itself: {why_not}", do)
+        _note_interrupted(context, f"it does not begin anew by itself: {why_not}", do)
         return
     cause = _cause(context.acquisition)
-    stages.go_on(context, replace(context.acquisition, interruption=None))
-    stages.restart(context, cause)
+    stages.set_acquisition(context, replace(context.acquisition, interruption=None))
+    stages.restart_acquisition(context, cause)
 
 
 def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
     state = context.state
-    if stages.left_open(state, rtc) is None:
+    if stages.acquisition_left_open(state, rtc) is None:
         return "the RTC has begun another session since, and who left its loop open is not known"
     if state.operator.mode is not Mode.AUTO:
         return f"the mode is {state.operator.mode}"
@@ -401,13 +407,15 @@ def _why_not_by_itself(context: StepContext, rtc: Status) -> str | None:
     return stages.why_not_now(state, context.policy)
 
 
-def _wait(context: StepContext, what: str, do: str = "") -> None:
+def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
     """Say what was going on, and what it waits for."""
     text = f"{_cause_text(context.acquisition)}; {what}{'. ' if do else ''}{do}"
     acquisition, stage = context.acquisition, AcquisitionStage.INTERRUPTED
     if (acquisition.stage, acquisition.text) == (stage, text):
         return
-    stages.go_on(context, replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns))
+    stages.set_acquisition(
+        context, replace(acquisition, stage=stage, text=text, since_ns_utc=context.now_ns)
+    )
     context.warn("acquisition.interrupted", what)
 
 

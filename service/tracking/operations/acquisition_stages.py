@@ -22,7 +22,7 @@ from service.tracking import events as ev
 from service.tracking import validity, void_intervals
 from service.tracking.acquisition_state import Acquisition, AcquisitionStage, LoopFound
 from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
-from service.tracking.dither import ask_for, ask_to_stop, make_way
+from service.tracking.dither import request_dither, request_stop, stop_running_dither
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
 from service.tracking.loop import NO_RTC
 from service.tracking.operator import set_loop
@@ -31,7 +31,7 @@ from service.tracking.reconstructors import forget_verdict
 from service.tracking.registration import Registration
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import half_of, limit_modes
+from service.tracking.update_policy import half_of_modes, limit_modes
 from service.wire import DitherKind, DitherRequest, Status
 
 WINDOW_S = 2.0
@@ -78,7 +78,7 @@ STOPS_WITHIN_S = 2.0
 """A dither that was told to stop, by the status."""
 
 
-def reach_of(stage: AcquisitionStage) -> Band:
+def band_of(stage: AcquisitionStage) -> Band:
     """Return the band of modes that is dithered in a stage with the loop open."""
     return SMOOTH if stage is AcquisitionStage.COARSE else FINER
 
@@ -91,7 +91,7 @@ def wide_capture_dither(
     It is strong: an open loop leaves the pyramid little response, and nothing is observed
     meanwhile that could be spoilt.
     """
-    modes, lines = _far_modes(stage, rtc)
+    modes, lines = _wide_capture_modes(stage, rtc)
     reason = _why_too_few(modes, rtc)
     if reason is not None:
         return reason
@@ -106,10 +106,12 @@ def wide_capture_dither(
     return Dither(request=request, asked_ns_utc=now_ns, window_s=WINDOW_S)
 
 
-def _far_modes(stage: AcquisitionStage, rtc: Status) -> tuple[tuple[int, ...], tuple[float, ...]]:
+def _wide_capture_modes(
+    stage: AcquisitionStage, rtc: Status
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return the modes dithered in a stage with the loop open, and lines for them, Hz."""
     lines = _lines(rtc.frame_rate_hz, rtc.max_dither_modes)
-    return modes_of(reach_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
+    return modes_of(band_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
 
 
 @lru_cache(maxsize=4)
@@ -143,7 +145,7 @@ def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
     )
 
 
-def left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
+def acquisition_left_open(state: TrackerState, rtc: Status) -> Acquisition | None:
     """Return the acquisition that was cut off, if the loop is as it left it.
 
     Opening a loop begins a session: the same one means that nobody has closed it in between.
@@ -159,12 +161,12 @@ def gains_for(found: LoopFound, n_modes: int, of_basis: int) -> tuple[float, ...
     return (*found.gains[:n_modes], *(0.0,) * (of_basis - n_modes))
 
 
-def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> None:
+def begin_acquisition(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> None:
     """Begin one: nothing is known of α any more."""
-    left = left_open(context.state, rtc)
+    left = acquisition_left_open(context.state, rtc)
     found = left.found if left is not None else None
     found = found or loop_found(context.state, rtc, context.policy)
-    go_on(
+    set_acquisition(
         context,
         Acquisition(
             stage=AcquisitionStage.OPENING,
@@ -180,7 +182,7 @@ def begin(context: StepContext, rtc: Status, *, why: str, commanded: bool) -> No
         ),
     )
     void_intervals.invalidate_telemetry(context, "the acquisition had not begun")
-    validity.forget(context)
+    validity.forget_registration(context)
     forget_verdict(context)
 
 
@@ -221,7 +223,9 @@ def missed_enough(state: TrackerState) -> bool:
 def count_miss(context: StepContext, kind: RefusalKind) -> None:
     """Count a refused window, if α was out of its reach and no acquisition is under way."""
     if not context.acquisition.under_way and kind is RefusalKind.OUT_OF_REACH:
-        go_on(context, replace(context.acquisition, misses=context.acquisition.misses + 1))
+        set_acquisition(
+            context, replace(context.acquisition, misses=context.acquisition.misses + 1)
+        )
 
 
 def why_not_now(state: TrackerState, policy: Policy) -> str | None:
@@ -233,7 +237,7 @@ def why_not_now(state: TrackerState, policy: Policy) -> str | None:
     alarm = blocking_alarm(state.alarms.active, Interlock.SEND_NEW)
     if alarm is not None:
         return f"{alarm.name}: {alarm.text}"
-    modes, _ = _far_modes(AcquisitionStage.COARSE, state.loop.rtc)
+    modes, _ = _wide_capture_modes(AcquisitionStage.COARSE, state.loop.rtc)
     return _why_too_few(modes, state.loop.rtc)
 
 
@@ -245,14 +249,14 @@ def sigma_of(acquisition: Acquisition) -> str:
     return f"{x:.3f}, {y:.3f} subap, {np.rad2deg(rotation):.2f} deg, {magnification:.3f} (1 sigma)"
 
 
-def go_on(context: StepContext, acquisition: Acquisition) -> None:
+def set_acquisition(context: StepContext, acquisition: Acquisition) -> None:
     """Note how far it has come."""
     context.operations = replace(context.operations, acquisition=acquisition)
 
 
 def enter_stage(context: StepContext, stage: AcquisitionStage, text: str) -> None:
     """Begin a stage."""
-    go_on(
+    set_acquisition(
         context,
         replace(
             context.acquisition,
@@ -271,27 +275,29 @@ def request_loop(context: StepContext, command: cmd.SetLoop) -> None:
     """Ask the RTC to change its loop, and remember having asked."""
     set_loop(context, command)
     asked = context.loop.command
-    go_on(context, replace(context.acquisition, command=None if asked is None else asked.id))
+    set_acquisition(
+        context, replace(context.acquisition, command=None if asked is None else asked.id)
+    )
 
 
-def restart(context: StepContext, reason: str, *, slipped: bool = False) -> None:
+def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = False) -> None:
     """Begin anew with the loop opened again, at once, a few times; then give up.
 
     A loop that has slipped is closed on half as many modes next time.
     """
     acquisition = context.acquisition
     if acquisition.attempt >= MAX_ATTEMPTS:
-        give_up(context, f"{reason}, after {acquisition.attempt} attempts")
+        fail_acquisition(context, f"{reason}, after {acquisition.attempt} attempts")
         return
     most = acquisition.max_modes
     if slipped:
-        most = half_of(acquisition.n_modes)
+        most = half_of_modes(acquisition.n_modes)
         limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
     void_intervals.invalidate_telemetry(context, "the acquisition had not begun anew")
-    make_way(context)
-    validity.forget(context)
-    go_on(
+    stop_running_dither(context)
+    validity.forget_registration(context)
+    set_acquisition(
         context,
         replace(
             acquisition,
@@ -308,13 +314,13 @@ def restart(context: StepContext, reason: str, *, slipped: bool = False) -> None
         request_loop(context, cmd.SetLoop(loop="open"))
 
 
-def give_up(context: StepContext, reason: str) -> None:
+def fail_acquisition(context: StepContext, reason: str) -> None:
     """Give up: the loop stays as it is, but one that is out of hand is opened."""
     closed = context.rtc is not None and context.rtc.loop != "open"
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None
-    make_way(context)
-    validity.forget(context)
-    go_on(context, replace(context.acquisition, windows=context.windows.accepted))
+    stop_running_dither(context)
+    validity.forget_registration(context)
+    set_acquisition(context, replace(context.acquisition, windows=context.windows.accepted))
     if closed and out_of_hand:
         request_loop(context, cmd.SetLoop(loop="open"))
     text = (
@@ -324,22 +330,22 @@ def give_up(context: StepContext, reason: str) -> None:
     enter_stage(context, AcquisitionStage.FAILED, text)
 
 
-def abort(context: StepContext, why: str, *, held_off: bool = False) -> None:
+def abort_acquisition(context: StepContext, why: str, *, held_off: bool = False) -> None:
     """End it at once: the loop as it was found, if it held then and nothing was sent; else as is.
 
     As is means open, or closed on a reconstructor that has passed the gate. ``held_off``: none
     begins by itself for now, though what made this one begin may last.
     """
-    make_way(context)
+    stop_running_dither(context)
     if context.acquisition.stage not in _BELIEVED:
-        validity.forget(context)
+        validity.forget_registration(context)
     left, found = "left as it is", _to_give_back(context.state)
     if found is not None:
         left = "closed as it was found"
         request_loop(context, cmd.SetLoop(loop="closed", leak=found.leak))
     text = f"ended {why}; the loop is {left}{HELD_OFF if held_off else ''}"
     over = replace(context.acquisition, held_off=held_off, windows=context.windows.accepted)
-    go_on(context, over)
+    set_acquisition(context, over)
     enter_stage(context, AcquisitionStage.ABORTED, text)
 
 
@@ -354,7 +360,7 @@ def wide_capture_stage(context: StepContext, rtc: Status) -> None:
         text = "looking for the registration with the loop open, on smooth modes"
         enter_stage(context, AcquisitionStage.COARSE, text)
     elif rtc.loop != "open":
-        restart(context, "somebody closed the loop")
+        restart_acquisition(context, "somebody closed the loop")
         return
     _keep_dithering(context, rtc)
 
@@ -373,22 +379,22 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         return
     if not _of_stage(context, rtc, estimate.modes):
         return
-    covariance = estimate.covariance + np.diag(reach_of(before.stage).floor ** 2)
-    go_on(context, replace(before, alpha=estimate.alpha, covariance=covariance))
+    covariance = estimate.covariance + np.diag(band_of(before.stage).floor ** 2)
+    set_acquisition(context, replace(before, alpha=estimate.alpha, covariance=covariance))
     place = f"{estimate.alpha} +- {sigma_of(context.acquisition)}"
     if before.stage is AcquisitionStage.COARSE or before.alpha is None or before.covariance is None:
-        make_way(context)
+        stop_running_dither(context)
         enter_stage(context, AcquisitionStage.CONFIRMING, f"{place}: other modes must confirm it")
         return
     difference = estimate.alpha.vector - before.alpha.vector
     chi2 = float(difference @ np.linalg.solve(covariance + before.covariance, difference))
     if chi2 > AGREE:
-        go_on(context, before)
+        set_acquisition(context, before)
         reason = (
             f"two sets of modes disagree: {before.alpha} and {estimate.alpha}, "
             f"chi2 {chi2:.0f}, expected at most {AGREE}"
         )
-        restart(context, reason)
+        restart_acquisition(context, reason)
         return
     registration = Registration(
         alpha=estimate.alpha,
@@ -401,7 +407,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         config_id=context.loop.config_id,
     )
     validity.store_registration(context, registration)
-    make_way(context)
+    stop_running_dither(context)
     enter_stage(context, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
 
 
@@ -409,9 +415,9 @@ def on_missed(context: StepContext, reason: str) -> None:
     """Count a window that led nowhere; after a few begin anew."""
     misses = context.acquisition.misses + 1
     if misses >= MAX_MISSES:
-        restart(context, reason)
+        restart_acquisition(context, reason)
     else:
-        go_on(context, replace(context.acquisition, misses=misses))
+        set_acquisition(context, replace(context.acquisition, misses=misses))
 
 
 def _keep_dithering(context: StepContext, rtc: Status) -> None:
@@ -423,13 +429,13 @@ def _keep_dithering(context: StepContext, rtc: Status) -> None:
         since_s = (context.now_ns - context.acquisition.since_ns_utc) / SECOND_NS
         if not (stopping and since_s < STOPS_WITHIN_S):
             context.put_off(dither_s=STOPS_WITHIN_S)
-            ask_to_stop(context)
+            request_stop(context)
         return
     dither = wide_capture_dither(context.acquisition.stage, rtc, context.policy, context.now_ns)
     if isinstance(dither, str):
-        give_up(context, dither)
+        fail_acquisition(context, dither)
     else:
-        ask_for(context, dither)
+        request_dither(context, dither)
 
 
 def _to_give_back(state: TrackerState) -> LoopFound | None:
@@ -438,7 +444,7 @@ def _to_give_back(state: TrackerState) -> LoopFound | None:
     found = acquisition.found
     if rtc is None or found is None or acquisition.sent or not (found.closed and found.held):
         return None
-    if acquisition.interruption is not None and left_open(state, rtc) is None:
+    if acquisition.interruption is not None and acquisition_left_open(state, rtc) is None:
         return None
     return found
 

@@ -9,7 +9,7 @@ import numpy as np
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither import make_way
+from service.tracking.dither import stop_running_dither
 from service.tracking.dither_request import check_modes
 from service.tracking.events import Event
 from service.tracking.loop import present
@@ -58,7 +58,7 @@ def measure(context: StepContext, command: cmd.Measure) -> None:
         raise CommandError(f"{command.id} was measured before; ids are never reused")
     record = replace(_planned(command, rtc, context.policy, context.now_ns), cause=context.cause)
     check_modes(record.modes, rtc)
-    keep(context, record)
+    store_measurement(context, record)
     context.log("measurement.asked", f"{record.id}: {record.pattern} of {len(record.modes)} modes")
     strokes = {field.name: getattr(record, field.name) for field in fields(MatrixStrokes)}
     context.ask(
@@ -83,13 +83,13 @@ def give_up(context: StepContext, measurement_id: str) -> None:
         return
     given_up = replace(record, state=MeasureState.GIVEN_UP)
     if record.pattern is None:
-        keep(context, replace(given_up, reason="by the operator"))
+        store_measurement(context, replace(given_up, reason="by the operator"))
         context.log("noisy-matrix.given-up", record.id)
         if context.dither is not None and context.dither.id == record.id:
-            make_way(context)
+            stop_running_dither(context)
         return
     text = "given up by the operator; the RTC may go on with it, what it sends is ignored"
-    keep(context, replace(given_up, reason=text))
+    store_measurement(context, replace(given_up, reason=text))
     context.log("measurement.given-up", f"{record.id}: {text}")
     if record.opens_loop and record.closed_before:
         begin_closing(context)
@@ -100,13 +100,13 @@ def give_up(context: StepContext, measurement_id: str) -> None:
     context.put_off(dither_s=left_s, make_s=left_s)
 
 
-def watch(context: StepContext, event: Event) -> None:
+def give_up_lost(context: StepContext, event: Event) -> None:
     """Give up a matrix that cannot come any more, before anybody else sees the event."""
     record, rtc = context.state.measuring, context.rtc
     if record is None:
         return
     if isinstance(event, ev.RtcVanished):
-        fail(context, record, "the RTC vanished")
+        fail_measurement(context, record, "the RTC vanished")
     elif isinstance(event, ev.Tick):
         closed = rtc is not None and rtc.loop != "open"
         _give_up_overdue(context, record, closed=closed)
@@ -118,17 +118,17 @@ def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> No
     if record is not None:
         state = MeasureState.RUNNING if reply.accepted else MeasureState.REFUSED
         answered = replace(record, state=state, reason=reply.reason, start_seq=reply.start_seq)
-        _note(context, answered)
+        _update(context, answered)
 
 
 def on_measured(context: StepContext, event: ev.MatrixMeasured) -> None:
     """Take over how far a measurement is, from whoever makes its matrix."""
     known = context.state.measurement(event.record.id)
     with context.because_of("" if known is None else known.cause):
-        _note(context, event.record)
+        _update(context, event.record)
 
 
-def _note(context: StepContext, record: MeasurementRecord) -> None:
+def _update(context: StepContext, record: MeasurementRecord) -> None:
     """Take over how far a measurement is; one that is over does not begin again."""
     known = context.state.measurement(record.id)
     if known is not None:
@@ -145,9 +145,9 @@ def _note(context: StepContext, record: MeasurementRecord) -> None:
             start_seq=known.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
-        fail(context, record, record.reason)
+        fail_measurement(context, record, record.reason)
         return
-    keep(context, record)
+    store_measurement(context, record)
     name, found = f"{_kind(record)}.{record.state}", record.finding
     match record.state:
         case MeasureState.RUNNING:
@@ -164,11 +164,11 @@ def _note(context: StepContext, record: MeasurementRecord) -> None:
             context.log(name, record.id)
 
 
-def fail(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
+def fail_measurement(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
     """Note why there is no matrix, unless nobody waits for it any more."""
     known = None if record is None else context.state.measurement(record.id)
     if record is not None and (known is None or known.state is not MeasureState.GIVEN_UP):
-        keep(context, replace(record, state=MeasureState.FAILED, reason=text))
+        store_measurement(context, replace(record, state=MeasureState.FAILED, reason=text))
         with context.because_of(record.cause):
             context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")
 
@@ -182,16 +182,16 @@ def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed:
     """Give up a matrix that does not come although everything looks as if it were over."""
     asked_ns = record.asked_ns_utc or context.now_ns
     if context.now_ns - asked_ns > LONGEST_S * SECOND_NS:
-        fail(context, record, f"no matrix came within {LONGEST_S:.0f} s")
+        fail_measurement(context, record, f"no matrix came within {LONGEST_S:.0f} s")
     elif not (record.opens_loop and closed and record.start_seq is not None):
-        keep(context, replace(record, overdue_since_ns_utc=None))
+        store_measurement(context, replace(record, overdue_since_ns_utc=None))
     else:
         since_ns = record.overdue_since_ns_utc or context.now_ns
         if context.now_ns - since_ns > OVERDUE_S * SECOND_NS:
             text = f"the loop has been closed for {OVERDUE_S:.0f} s and no matrix came"
-            fail(context, record, text)
+            fail_measurement(context, record, text)
         else:
-            keep(context, replace(record, overdue_since_ns_utc=since_ns))
+            store_measurement(context, replace(record, overdue_since_ns_utc=since_ns))
 
 
 def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> MeasurementRecord:
@@ -220,7 +220,7 @@ def _planned(command: cmd.Measure, rtc: Status, policy: Policy, now_ns: int) -> 
     )
 
 
-def keep(context: StepContext, record: MeasurementRecord) -> None:
+def store_measurement(context: StepContext, record: MeasurementRecord) -> None:
     """Keep what is known of a measurement in place of what was known before."""
     others = tuple(r for r in context.operations.measurements if r.id != record.id)
     context.operations = replace(

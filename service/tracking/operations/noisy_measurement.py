@@ -10,11 +10,11 @@ from dataclasses import replace
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.dither import ask_for, make_way
+from service.tracking.dither import request_dither, stop_running_dither
 from service.tracking.dither_request import RANDOM_TOTAL_M, cost_of, plan_random
 from service.tracking.events import Event
 from service.tracking.loop import present
-from service.tracking.operations.measurement import fail, keep
+from service.tracking.operations.measurement import fail_measurement, store_measurement
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
@@ -68,16 +68,16 @@ def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:
         config_id=rtc.config_id,
         cause=context.cause,
     )
-    keep(context, record)
+    store_measurement(context, record)
     text = (
         f"{record.id}: {len(record.modes)} modes, {1e9 * record.total_m:.3g} nm RMS in all, "
         f"{duration_s:g} s"
     )
     context.log("noisy-matrix.asked", text)
-    make_way(context)
+    stop_running_dither(context)
 
 
-def follow(context: StepContext, event: Event) -> None:
+def advance(context: StepContext, event: Event) -> None:
     """Go on with the one under way, if there is one."""
     record = context.state.noisy_measurement
     if record is not None:
@@ -91,25 +91,27 @@ def _go_on(context: StepContext, record: MeasurementRecord, event: Event) -> Non
     waited_s = (context.now_ns - (record.asked_ns_utc or 0)) / SECOND_NS
     match record.state:
         case MeasureState.WAITING if isinstance(event, cmd.StopDither):
-            cut_off(context, "the operator stopped the dither")
+            fail_noisy_measurement(context, "the operator stopped the dither")
         case MeasureState.WAITING:
             if rtc is not None and rtc.loop != "open" and rtc.dither_id is None:
                 _begin_noisy(context, record, rtc)
             elif waited_s > FREE_WITHIN_S:
-                cut_off(context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s")
+                fail_noisy_measurement(
+                    context, f"the dither that ran did not end within {FREE_WITHIN_S:.0f} s"
+                )
         case MeasureState.ASKED | MeasureState.RUNNING:
             _follow_playing(context, record, event)
         case _:
             # a simulated RTC may be ten times slower than its timestamps
             if waited_s >= 10.0 * ((record.duration_s or 0.0) + FREE_WITHIN_S + MADE_WITHIN_S):
-                cut_off(context, "the worker did not answer")
+                fail_noisy_measurement(context, "the worker did not answer")
 
 
-def cut_off(context: StepContext, why: str) -> None:
+def fail_noisy_measurement(context: StepContext, why: str) -> None:
     """End the one under way, if there is one, without a matrix."""
     record = context.state.noisy_measurement
     if record is not None:
-        fail(context, record, why)
+        fail_measurement(context, record, why)
 
 
 def awaits_its_dither(state: TrackerState) -> bool:
@@ -130,11 +132,13 @@ def _begin_noisy(context: StepContext, record: MeasurementRecord, rtc: Status) -
             duration_s=record.duration_s or DURATION_S,
         )
     except CommandError as error:  # the RTC is another than when it was asked for
-        fail(context, record, str(error))
+        fail_measurement(context, record, str(error))
         return
     window_s, seed = dither.window_s, dither.request.seed
-    keep(context, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed))
-    ask_for(context, dither)
+    store_measurement(
+        context, replace(record, state=MeasureState.ASKED, window_s=window_s, seed=seed)
+    )
+    request_dither(context, dither)
 
 
 def _follow_playing(context: StepContext, record: MeasurementRecord, event: Event) -> None:
@@ -142,20 +146,20 @@ def _follow_playing(context: StepContext, record: MeasurementRecord, event: Even
         case ev.Answered(
             request=DitherRequest(id=record.id), reply=Reply(accepted=False, reason=reason)
         ):
-            fail(context, record, f"the RTC refused the dither: {reason}")
+            fail_measurement(context, record, f"the RTC refused the dither: {reason}")
             return
         case ev.JobFailed(effect=ev.Ask(request=DitherRequest(id=record.id)), text=text):
-            fail(context, record, text)
+            fail_measurement(context, record, text)
             return
         case _:
             pass
     dither, asked = context.dither, record.state is MeasureState.ASKED
     if dither is not None and dither.id == record.id:
         if asked and dither.start_seq is not None:
-            keep(context, replace(record, state=MeasureState.RUNNING))
+            store_measurement(context, replace(record, state=MeasureState.RUNNING))
     elif asked:
-        fail(context, record, "its dither never began")
+        fail_measurement(context, record, "its dither never began")
     else:
         record = replace(record, state=MeasureState.FINISHING)
-        keep(context, record)
+        store_measurement(context, record)
         context.ask(ev.FinishNoisy(record=record))

@@ -72,7 +72,7 @@ _WORSE = frozenset(
 )
 
 
-def follow(context: StepContext, event: Event) -> None:
+def advance(context: StepContext, event: Event) -> None:
     """Begin a probation with every matrix that is applied, and end one that nothing can end."""
     if context.matrices.in_use != context.before.matrices.in_use:
         _on_swap(context, context.before.matrices.in_use, context.matrices.in_use)
@@ -80,9 +80,9 @@ def follow(context: StepContext, event: Event) -> None:
     trial = context.operations.probation
     if trial is None:
         return
-    told = _told_by_alarm(context, trial)
+    told = _alarm_of_swap(context, trial)
     if told:
-        _go_back(context, trial, told)
+        _begin_rollback(context, trial, told)
     else:
         _go_on(context, trial, event)
 
@@ -119,7 +119,7 @@ def on_compared(context: StepContext, event: ev.Compared) -> None:
         _end(context, trial, ProbationState.PASSED, found.text)
         context.clear_alarm(PROBATION)
     else:
-        _go_back(context, trial, found.text)
+        _begin_rollback(context, trial, found.text)
 
 
 def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
@@ -134,7 +134,7 @@ def is_way_back(state: TrackerState, made: ev.MatrixMade) -> bool:
     return before is not None and made.record.sha256 == before.sha256 != ""
 
 
-def go_back(context: StepContext, made: ev.MatrixMade) -> None:
+def send_way_back(context: StepContext, made: ev.MatrixMade) -> None:
     """Send the matrix before under its new id, unless something forbids it by now."""
     trial = context.operations.probation
     reconstructors.propose(context, made.record)
@@ -142,25 +142,27 @@ def go_back(context: StepContext, made: ev.MatrixMade) -> None:
         return
     why = _why_no_way_back(context, trial)
     if why is not None:
-        _keep(context, trial, why)
+        _keep_worse(context, trial, why)
         return
     reconstructors.send(context, made.record.id, trial.since_ns_utc)
     _set(context, replace(trial, rollback=made.record.id))
 
 
-def _go_back(context: StepContext, trial: Probation, found: str) -> None:
+def _begin_rollback(context: StepContext, trial: Probation, found: str) -> None:
     """Have the matrix before sent again; where that cannot be say why."""
     enter_hold(context, f"{trial.id} made the loop worse")
     trial = replace(trial, worse=f"made the loop worse: {found}")
     why = _why_no_way_back(context, trial)
     if why is not None:
-        _keep(context, trial, why)
+        _keep_worse(context, trial, why)
         return
     text = f"{trial.worse}: going back to {trial.before}"
     _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
     context.raise_alarm(PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
-    reconstructors.make(context, ev.RepublishMatrix(source=trial.before, why=why, judged=False))
+    reconstructors.request_matrix(
+        context, ev.RepublishMatrix(source=trial.before, why=why, judged=False)
+    )
 
 
 def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> None:
@@ -204,7 +206,7 @@ def _await_verdict(context: StepContext, trial: Probation) -> None:
 def _await_republished(context: StepContext, trial: Probation, event: Event) -> None:
     why = _why_stuck(context, trial, event)
     if why:
-        _keep(context, trial, why)
+        _keep_worse(context, trial, why)
 
 
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
@@ -286,7 +288,7 @@ def opening_text(context: StepContext) -> str | None:
     )
 
 
-def _told_by_alarm(context: StepContext, trial: Probation) -> str:
+def _alarm_of_swap(context: StepContext, trial: Probation) -> str:
     """Return what an alarm says of a matrix just applied; empty: none has come with it."""
     judged = {ProbationState.RUNNING, ProbationState.OVERDUE, ProbationState.PASSED}
     late = context.now_ns > trial.since_ns_utc + LAW_WITHIN_S * SECOND_NS
@@ -348,7 +350,7 @@ def _why_no_way_back(context: StepContext, trial: Probation) -> str | None:
     return why_unsendable(state, record, trial.since_ns_utc)
 
 
-def _keep(context: StepContext, trial: Probation, why: str) -> None:
+def _keep_worse(context: StepContext, trial: Probation, why: str) -> None:
     """Say that a matrix that is worse stays in use; open the loop that is lost with it."""
     text = f"{trial.worse}; the service did not go back to {trial.before}: {why}"
     out_of_hand = context.blocking_alarm(Interlock.HOLD) is not None

@@ -45,12 +45,12 @@ class RunningOperation:
     """What runs, and what ends it."""
 
 
-def under_way(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:
+def running_operations(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:
     """Return all that runs now, what is exclusive first."""
     return (*_exclusive(state, now_ns), *_dither(state, now_ns), *_of_matrices(state))
 
 
-def ramping(state: TrackerState, now_ns: int) -> LoopCommand | None:
+def running_ramp(state: TrackerState, now_ns: int) -> LoopCommand | None:
     """Return the gain ramp that the RTC is busy with, or None: opening the loop ends one."""
     asked, rtc = state.loop.command, state.loop.rtc
     if asked is None or not asked.lasts_s or rtc is None or rtc.loop == "open":
@@ -76,7 +76,7 @@ def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     if state.noisy_measurement is not None:
         text = f"noisy matrix {state.noisy_measurement.id} is under way; wait for it, or give it up"
         yield RunningOperation(OperationKind.GATHERING, text)
-    ramp = ramping(state, now_ns)
+    ramp = running_ramp(state, now_ns)
     if ramp is not None:
         left_s = max((ramp.until_ns_utc - now_ns) / SECOND_NS, 0.0) or ramp.lasts_s
         text = f"gain ramp {ramp.id} is under way; wait for it, {left_s:.0f} s"
@@ -203,7 +203,7 @@ def operating(state: TrackerState, hindered: str, now_ns: int) -> Operating:
 
 
 def _current_operation(state: TrackerState, now_ns: int) -> tuple[CurrentOperation, str]:
-    for running in under_way(state, now_ns):
+    for running in running_operations(state, now_ns):
         if running.kind in OPERATION_OF:
             return OPERATION_OF[running.kind], running.text
     if state.operator.mode is Mode.HOLD:

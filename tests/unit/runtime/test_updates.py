@@ -22,7 +22,7 @@ from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.products import MatrixState
-from service.tracking.update_policy import fewer_than
+from service.tracking.update_policy import fewer_modes_than
 from service.wire import LoopRequest
 from tests.states import changed
 from tests.unit.runtime.handmade import N_MODES, REGISTRATION, STATE
@@ -115,13 +115,13 @@ class TestEdge:
     """The most modes where the outer ring decides, and a loop that has them already."""
 
     def test_one_that_is_to_be_closed_gets_fewer(self, bench, just_beyond):
-        made = make_in(bench, just_beyond, fewer_than(N_CONTROLLED))
-        assert len(made.matrix) == fewer_than(N_CONTROLLED)[0] == 40
+        made = make_in(bench, just_beyond, fewer_modes_than(N_CONTROLLED))
+        assert len(made.matrix) == fewer_modes_than(N_CONTROLLED)[0] == 40
         assert "outer ring" in made.why_fewer
 
     def test_one_that_holds_with_as_many_keeps_them(self, bench, just_beyond):
         held = replace(just_beyond, n_holding=N_CONTROLLED)
-        made = make_in(bench, held, fewer_than(N_CONTROLLED))
+        made = make_in(bench, held, fewer_modes_than(N_CONTROLLED))
         assert made.gate.accepted
         assert (len(made.matrix), made.why_fewer) == (N_CONTROLLED, "")
         assert LIMIT_M < made.gate.edge_motion_m < HELD_LIMIT_M
@@ -135,7 +135,7 @@ class TestEdge:
         gain = float(just_beyond.gains[0])
         registration = replace(REGISTRATION, alpha=Misregistration(), optical_gain=None)
         state = changed(STATE, registration=registration, rtc=loop_of(gain))
-        made = await make(actions, state, fewer=fewer_than(N_CONTROLLED))
+        made = await make(actions, state, fewer=fewer_modes_than(N_CONTROLLED))
         assert made.record.n_modes == N_CONTROLLED
         assert LIMIT_M < made.record.gate.edge_motion_m < HELD_LIMIT_M
         state = changed(state, reconstructors=(made.record,))

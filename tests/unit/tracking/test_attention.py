@@ -9,7 +9,7 @@ from service.archive.serialisation import TrackingFile
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.alarm_records import muted, stale, worst
+from service.tracking.alarm_records import muted_records, stale_records, worst_severity
 from service.tracking.alarms import ALARMS, AlarmState, Interlock, Severity, blocking_alarm
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import TrackerState
@@ -53,11 +53,11 @@ def test_one_that_goes_unseen_is_stale_until_somebody_has_seen_it(story):
     raised(story, "edge-slip")
     assert note(story, "edge-slip").alarm_state is AlarmState.ACTIVE
     raised(story, "edge-slip", over=True)
-    (left,) = stale(story.state)
+    (left,) = stale_records(story.state)
     assert (left.text, left.worst) == ("edge-slip found", Severity.CRITICAL)
     assert left.over_ns_utc == story.now_ns
     story.wait(20)
-    assert stale(story.state) == (left,)
+    assert stale_records(story.state) == (left,)
     story.tell(cmd.AcknowledgeAlarm(name="edge-slip", **ADA))
     assert note(story, "edge-slip") is None
     assert story.state.log[-1].text == "edge-slip by Ada (seen)"
@@ -91,7 +91,7 @@ def test_the_worst_is_kept_and_what_becomes_worse_is_acknowledged_again(story):
     margin(1.02)
     assert note(story, "margin").alarm_state is AlarmState.ACTIVE
     margin(0.97)
-    assert note(story, "margin").worst is worst(story.state) is Severity.CRITICAL
+    assert note(story, "margin").worst is worst_severity(story.state) is Severity.CRITICAL
     assert (
         next(a for a in story.state.alarms.active if a.name == "margin").definition
         is ALARMS["margin"]
@@ -127,11 +127,11 @@ def test_what_makes_no_sense_is_refused_in_a_sentence(story):
 def test_a_muted_one_forbids_what_it_forbids_and_comes_back_by_itself(story):
     story.tell(cmd.MuteAlarm(name="matrix-mismatch", for_s=60.0, **ADA))
     raised(story, "matrix-mismatch")
-    (quiet,) = muted(story.state)
+    (quiet,) = muted_records(story.state)
     assert (quiet.name, quiet.alarm_state) == ("matrix-mismatch", AlarmState.ACTIVE)
     assert blocking_alarm(story.state.alarms.active, Interlock.SEND_NEW).name == "matrix-mismatch"
     story.wait(61)
-    assert muted(story.state) == ()
+    assert muted_records(story.state) == ()
     assert note(story, "matrix-mismatch").alarm_state is AlarmState.ACTIVE
 
 
@@ -148,8 +148,8 @@ def test_a_restart_changes_nothing_of_what_was_seen_and_what_was_not(small, tmp_
     small.tell(cmd.AcknowledgeAlarm(name="edge-slip", **ADA))
     small.tell(cmd.MuteAlarm(name="second-rtc", for_s=3600.0, **ADA))
     again = restarted(small, tmp_path)
-    assert {left.name for left in stale(again.state)} == {"disk-low", "frames-lost"}
-    assert [quiet.name for quiet in muted(again.state)] == ["second-rtc"]
+    assert {left.name for left in stale_records(again.state)} == {"disk-low", "frames-lost"}
+    assert [quiet.name for quiet in muted_records(again.state)] == ["second-rtc"]
     raised(again, "edge-slip")
     assert note(again, "edge-slip").alarm_state is AlarmState.ACKNOWLEDGED
     raised(again, "frames-lost")

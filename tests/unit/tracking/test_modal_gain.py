@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.tracking import events as ev
-from service.tracking.filtering import FIRST_SCATTER, GAIN_RATE, MODES_KEPT, followed_gains
+from service.tracking.filtering import FIRST_SCATTER, GAIN_RATE, MODES_KEPT, update_gains
 from service.tracking.state import Mode
 from tests.unit.tracking.situations import SECOND, START_NS, Story, estimate
 
@@ -13,7 +13,7 @@ def windows(gains, mode=501, every_s=2.0, sigma=0.001):
     table = ()
     for k, gain in enumerate(gains):
         t_ns = START_NS + round(k * every_s * SECOND)
-        table = followed_gains(table, (mode,), np.array([gain]), np.array([sigma]), t_ns)
+        table = update_gains(table, (mode,), np.array([gain]), np.array([sigma]), t_ns)
     return table[0]
 
 
@@ -45,13 +45,13 @@ def test_one_mad_window_does_not_move_it_far():
 
 
 def test_after_a_pause_the_next_window_counts_more():
-    steady = followed_gains((), (7,), np.array([0.6]), None, START_NS)
+    steady = update_gains((), (7,), np.array([0.6]), None, START_NS)
     for k in range(1, 30):
         t_ns = START_NS + k * 2 * SECOND
-        steady = followed_gains(steady, (7,), np.array([0.6]), np.array([0.02]), t_ns)
+        steady = update_gains(steady, (7,), np.array([0.6]), np.array([0.02]), t_ns)
     (known,) = steady
     later = known.t_ns_utc + 600 * SECOND
-    (found,) = followed_gains(steady, (7,), np.array([0.5]), np.array([0.02]), later)
+    (found,) = update_gains(steady, (7,), np.array([0.5]), np.array([0.02]), later)
     walked = (GAIN_RATE * 0.6) ** 2 * 600.0
     assert walked > 10 * known.scatter**2
     assert found.gain == pytest.approx(0.5, abs=0.01)
@@ -60,7 +60,7 @@ def test_after_a_pause_the_next_window_counts_more():
 def test_modes_that_are_dithered_no_more_are_kept_and_the_oldest_forgotten():
     table = ()
     for mode in range(MODES_KEPT + 10):
-        table = followed_gains(table, (mode,), np.array([0.5]), None, START_NS + mode)
+        table = update_gains(table, (mode,), np.array([0.5]), None, START_NS + mode)
     assert [gain.mode for gain in table] == list(range(10, MODES_KEPT + 10))
 
 

@@ -14,7 +14,7 @@ from service.tracking.update_policy import (
     LADDER,
     LONGEST_WAIT_S,
     OPERATORS_WAIT_S,
-    fewer_than,
+    fewer_modes_than,
 )
 from tests.unit.tracking.situations import (
     POLICY,
@@ -75,7 +75,7 @@ class Night(Story):
 def test_every_request_of_the_services_own_names_fewer_modes_to_try():
     (effect,) = of_kind(Night().see(n_windows=2), ev.MakeMatrix)
     assert effect.n_modes == 400
-    assert effect.fewer == fewer_than(400)
+    assert effect.fewer == fewer_modes_than(400)
     assert (effect.fewer[0], effect.fewer[-1]) == (350, 30)
 
 

@@ -10,7 +10,7 @@ from service.tracking.loop import extended_gains
 from service.tracking.products import MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
-from service.tracking.update_policy import more_to_try
+from service.tracking.update_policy import more_modes_to_try
 from service.wire import LoopRequest
 from tests.unit.tracking.dithered import DitheredNight
 from tests.unit.tracking.situations import ALPHA, N_MODES, POLICY, Story, moved, of_kind, rtc
@@ -72,7 +72,7 @@ def test_modes_above_those_that_were_taken_out_are_not_tried(last_gain):
     story = Story(Mode.AUTO).meet()
     view = partial(gains)
     assert extended_gains(view, 500)[450] == last_gain
-    assert bool(more_to_try(story.state, view, POLICY, story.now_ns)) is bool(last_gain)
+    assert bool(more_modes_to_try(story.state, view, POLICY, story.now_ns)) is bool(last_gain)
 
 
 def test_a_measurement_that_found_it_partial_is_over_when_it_is_partial_again():

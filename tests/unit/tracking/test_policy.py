@@ -9,7 +9,7 @@ from service.tracking import events as ev
 from service.tracking.dither_request import DitherParameters, lock_in_plan, plan_dither
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.tracking.update_policy import outdated
+from service.tracking.update_policy import is_outdated
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     N_MODES,
@@ -314,7 +314,7 @@ class TestProposals:
         for k in range(1, 6):
             story.see(moved(shift_x_subap=0.005 * k), every_s=1.0)
         story.see(moved(shift_x_subap=0.025), n_windows=5, every_s=0.2)
-        assert outdated(story.state, story.state.reconstructor("cm-1"))
+        assert is_outdated(story.state, story.state.reconstructor("cm-1"))
         return story
 
     def looked_at(self, story, seconds):

@@ -8,8 +8,8 @@ from service.tracking.reconstructors import (
     RETURNS_KEPT,
     UNSENT_KEPT,
     change_state,
-    keep,
-    use,
+    mark_applied,
+    store_reconstructor,
 )
 from service.tracking.resume import restored
 from service.tracking.state import TrackerState
@@ -20,11 +20,11 @@ STATE = TrackerState(system="flao")
 
 
 def with_record(state, made):
-    return turned(state, keep, made)
+    return turned(state, store_reconstructor, made)
 
 
 def with_in_use(state, matrix_id):
-    return turned(state, use, matrix_id)
+    return turned(state, mark_applied, matrix_id)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.interlocks import ALLOWS
-from service.tracking.operations.running import under_way
+from service.tracking.operations.running import running_operations
 from service.tracking.products import MatrixState, MeasureState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode
@@ -167,7 +167,9 @@ def test_a_restart_releases_nothing():
     assert [one for one in world.effects if not harmless(one)] == []
     world.tell(cmd.Resume())
     assert not world.state.operator.stopped_because
-    assert not [one for one in under_way(world.state, world.now_ns) if "stopped" in one.text]
+    assert not [
+        one for one in running_operations(world.state, world.now_ns) if "stopped" in one.text
+    ]
 
 
 def test_it_stays_so_while_the_rtc_is_away_and_comes_back():

@@ -1,12 +1,12 @@
 from service.tracking.state import Level, TrackerState
-from service.tracking.step_context import LOG_LENGTH, StepContext, logged, tell_bursts
+from service.tracking.step_context import LOG_LENGTH, StepContext, log_bursts, logged
 from tests.unit.tracking.situations import turned
 
 STATE = TrackerState(system="flao")
 
 
 def counted(state, now_ns):
-    return turned(state, tell_bursts, now_ns=now_ns)
+    return turned(state, log_bursts, now_ns=now_ns)
 
 
 def with_alarm(state, name, text, now_ns):

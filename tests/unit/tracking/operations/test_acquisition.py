@@ -24,7 +24,7 @@ from service.tracking.operations.acquisition_stages import (
 )
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
-from service.tracking.update_policy import fewer_than
+from service.tracking.update_policy import fewer_modes_than
 from service.wire import DitherRequest, DitherStop, Loop, LoopRequest
 from tests.unit.tracking.situations import (
     POLICY,
@@ -336,7 +336,7 @@ class TestNothingWrong:
     def test_fewer_modes_are_made_where_the_gate_refuses_many(self):
         story = Acquiring().to_partial()
         (made,) = story.asked(ev.MakeMatrix)
-        assert (made.n_modes, made.fewer) == (150, fewer_than(150))
+        assert (made.n_modes, made.fewer) == (150, fewer_modes_than(150))
         story.close(60)
         (sent,) = story.asked(ev.SendMatrix)
         assert sent.gains == (0.4,) * 60 + (0.0,) * 534

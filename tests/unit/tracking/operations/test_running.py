@@ -10,7 +10,7 @@ from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.acquisition_state import AcquisitionStage
-from service.tracking.operations.running import under_way
+from service.tracking.operations.running import running_operations
 from service.tracking.products import MatrixState, MeasureState, ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern
@@ -39,7 +39,7 @@ def quiet():
     world.tell(cmd.SetMode(mode=Mode.PROPOSE))
     world.pass_(4.0)
     assert world.state.matrices.in_use == "cm-1"
-    assert not under_way(world.state, world.now_ns)
+    assert not running_operations(world.state, world.now_ns)
     return world
 
 
@@ -244,7 +244,7 @@ def refused(world, command):
 @pytest.mark.parametrize("activity", ACTIVITIES[1:], ids=lambda activity: activity.__name__)
 def test_what_runs_is_named_with_what_ends_it(activity):
     world = activity()
-    running = under_way(world.state, world.now_ns)
+    running = running_operations(world.state, world.now_ns)
     assert running
     assert all("; " in one.text for one in running)
     assert all("\n" not in one.text for one in running)
@@ -300,7 +300,7 @@ def test_a_gain_ramp_ends_when_the_loop_is_opened():
     world.tell(cmd.SetLoop(loop="open"))
     world.pass_(2.0)
     assert world.state.loop.rtc.loop == "open"
-    assert not under_way(world.state, world.now_ns)
+    assert not running_operations(world.state, world.now_ns)
 
 
 def test_while_gains_are_tried_nothing_is_made_sent_or_dithered():
@@ -310,7 +310,7 @@ def test_while_gains_are_tried_nothing_is_made_sent_or_dithered():
     world.pass_(15.0)
     assert not world.effects
     world.pass_(10.0)
-    assert not under_way(world.state, world.now_ns)
+    assert not running_operations(world.state, world.now_ns)
 
 
 def test_a_loop_that_goes_out_of_hand_while_signs_are_gathered_takes_the_dither_with_it():
@@ -338,9 +338,9 @@ def test_a_stopped_dither_ends_the_wait_for_one_that_measures():
 def test_a_ramp_nobody_answers_for_keeps_nothing_back_for_ever():
     story = Story().meet()
     story.tell(cmd.Ramp())
-    assert under_way(story.state, story.now_ns)
+    assert running_operations(story.state, story.now_ns)
     story.wait(60.0)
-    assert not [one for one in under_way(story.state, story.now_ns) if "ramp" in one.text]
+    assert not [one for one in running_operations(story.state, story.now_ns) if "ramp" in one.text]
 
 
 def test_an_acquisition_after_all_this_leads_to_tracking():

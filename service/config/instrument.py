@@ -114,6 +114,10 @@ def _slopes(file: Section[SlopesTable], sensor: SensorKind, *, has_frames: bool)
     table = file.said
     if table.kind not in sensor.signals:
         refuse(file.where("kind"), f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
+    if not sensor.normalised and "normalisation" in file.given:
+        raise ConfigurationError(
+            f'{file.where("normalisation")}: has no meaning beside wfs.kind = "{sensor.name}"'
+        )
     if has_frames and "order" in file.given:
         raise ConfigurationError(
             f'{file.where("order")}: has no meaning beside wfs.input = "frames", '

@@ -61,6 +61,9 @@ class SensorKind(ABC):
     signals: ClassVar[tuple[SignalKind, ...]]
     """What its subapertures give."""
 
+    normalised: ClassVar[bool] = False
+    """Whether signals are divided by a flux, by which one ``slopes.normalisation`` says."""
+
     edge_slips: ClassVar[bool] = False
     """Whether it can take the mirror's edge for one a fringe away, and hold it there."""
 

@@ -38,6 +38,7 @@ class PyramidKind(SensorKind):
         "modulation_lambda_over_d": 3.0,
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
+    normalised = True
     edge_slips = True
     aot: ClassVar[tuple[str, Mapping[str, Any]]] = ("Pyramid", {"n_sides": 4})
 

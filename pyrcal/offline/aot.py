@@ -153,12 +153,11 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, .
     valid = valid_subapertures(instrument)
     places = np.full(valid.shape, -1, dtype=np.int32)
     places[valid] = np.arange(valid.sum())
-    aot_class, own = kind_of(instrument).aot
+    aot_class, own = kind_of(instrument).aot(instrument.slopes)
     sensor = getattr(aotpy, aot_class)(
         **own,
         uid="sensor",
         source=source,
-        dimensions=instrument.slopes.kind.n_planes,
         n_valid_subapertures=int(valid.sum()),
         subaperture_mask=aotpy.Image("subaperture mask", places),
         wavelength=instrument.wfs.wavelength_m,

@@ -67,9 +67,6 @@ class SensorKind(ABC):
     edge_slips: ClassVar[bool] = False
     """Whether it can take the mirror's edge for one a fringe away, and hold it there."""
 
-    aot: ClassVar[tuple[str, Mapping[str, Any]]]
-    """Class of AOT files that it is, and the fields that only this class has."""
-
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return ``[wfs]`` as it is to be held against the table.
 
@@ -191,6 +188,10 @@ class SensorKind(ABC):
     def other_recipes(self, recipe: SlopeRecipe) -> dict[str, SlopeRecipe]:
         """Return recipes that this one may be taken for, by what a file would say of them."""
         return {}
+
+    @abstractmethod
+    def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
+        """Return its class in AOT files, and the fields that only this class is given."""
 
     def light(self, instrument: Instrument) -> Light | CannotTell:
         """Return how an instrument's light tells of the pupil, or that it does not."""

@@ -40,7 +40,6 @@ class PyramidKind(SensorKind):
     signals = (SignalKind.XY, SignalKind.INTENSITY)
     normalised = True
     edge_slips = True
-    aot: ClassVar[tuple[str, Mapping[str, Any]]] = ("Pyramid", {"n_sides": 4})
 
     @override
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -160,6 +159,10 @@ class PyramidKind(SensorKind):
         local = recipe.normalisation is Normalisation.LOCAL
         divisor = Normalisation.GLOBAL if local else Normalisation.LOCAL
         return {f'normalisation = "{divisor}"': replace(recipe, normalisation=divisor)}
+
+    @override
+    def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
+        return "Pyramid", {"n_sides": 4, "dimensions": recipe.kind.n_planes}
 
     @override
     def light(self, instrument: Instrument) -> PyramidLight:

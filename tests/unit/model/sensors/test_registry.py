@@ -59,8 +59,7 @@ class CurvatureKind(SensorKind):
     table = CurvatureTable
     unknown: ClassVar[dict[str, float]] = {"extra_m": 2.0}
     signals = (SignalKind.XY,)
-    aot = ("WavefrontSensor", {})
-    sensor = pixels = slope_noise = None
+    sensor = pixels = slope_noise = aot = None
 
     def described(self, table, given):
         return Curvature(**{one.name: getattr(table, one.name) for one in fields(Numbers)})

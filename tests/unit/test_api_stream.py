@@ -165,7 +165,8 @@ async def test_who_was_away_for_longer_than_the_log_reaches_is_told_to_read_it_a
         service.change(log=(line(1),))
         async with listening(empty) as listener:
             assert json.loads((await listener.event("log"))["data"])["text"] == "line 1"
-        service.change(log=tuple(line(k) for k in range(LOG_LENGTH)))
+        # line 1 is not among them: who has just been sent it from the look before has missed others
+        service.change(log=tuple(line(k) for k in range(10, 10 + LOG_LENGTH)))
         for last in (empty, "of another run"):
             async with listening(last) as listener:
                 assert (await listener.event("reset"))["id"] not in {"", empty}

@@ -357,3 +357,6 @@ class PassiveState:
 
     bias: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what is known of its bias, numeric units; 0: nothing."""
+
+    estimator: str = PASSIVE_BIAS.name
+    """Which estimate it is, by the name of its bias: of several the last is shown."""

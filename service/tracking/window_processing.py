@@ -483,5 +483,6 @@ def _show_passive(
         consistent=consistent,
         text=text,
         bias=bias,
+        estimator=event.estimate.bias.name,
     )
     context.alpha = replace(context.alpha, passive=watchdog, passive_unavailable_reason="")

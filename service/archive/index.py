@@ -126,16 +126,7 @@ class Actor:
     check: Callable[[], None] = lambda: None
     """Raises where what the order was decided on has changed."""
 
-    def entry(
-        self,
-        name: str,
-        text: str = "",
-        *,
-        by: str = "",
-        why: str = "",
-        answer: str = "",
-        cause: str = "",
-    ) -> AuditEntry:
+    def entry(self, name: str, text: str = "", *, by: str = "", why: str = "") -> AuditEntry:
         """Return a line of the audit trail on what they do; ``by``: what they call themselves."""
         return AuditEntry(
             t_ns_utc=time.time_ns(),
@@ -145,8 +136,6 @@ class Actor:
             address=self.address,
             channel=self.channel,
             why=why,
-            answer=answer,
-            cause=cause,
         )
 
 

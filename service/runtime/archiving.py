@@ -10,7 +10,7 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from itertools import takewhile
 
@@ -120,17 +120,9 @@ class ArchiveWriter:
                 self._estimates += found[:room]
                 self._lost += len(found[room:])
         for entry in lines:
-            if entry.level is Level.DEBUG:
-                continue
-            self.add(
-                AuditEntry(
-                    t_ns_utc=entry.t_ns_utc,
-                    who="service",
-                    name=entry.name,
-                    text=entry.text,
-                    cause=entry.cause,
-                )
-            )
+            if entry.level is not Level.DEBUG:
+                said = {key: getattr(entry, key) for key in ("t_ns_utc", "name", "text", "cause")}
+                self.add(AuditEntry(who="service", **said))
 
     async def ordered(self, order: GivenCommand, actor: Actor) -> None:
         """Write down what an operator asks for, before it is done.
@@ -152,15 +144,10 @@ class ArchiveWriter:
         self._order(order, actor, ".refused", str(error))
 
     def _order(self, order: GivenCommand, actor: Actor, end: str = "", answer: str = "") -> None:
-        command = order.command
-        entry = actor.entry(
-            f"{type(command).__name__}{end}",
-            asked_for(command, actor),
-            by=command.by,
-            why=command.reason,
-            answer=answer,
-            cause=order.id,
-        )
+        command, asked = order.command, asked_for(order.command, actor)
+        name = f"{type(command).__name__}{end}"
+        entry = actor.entry(name, asked, by=command.by, why=command.reason)
+        entry = replace(entry, answer=answer, cause=order.id)
         self.add(entry)
         said = {key: getattr(entry, key) for key in _LOGGED if getattr(entry, key)}
         self._log.info(entry.name, **said, **ids_of(f"{entry.text} {answer}", self._state()))

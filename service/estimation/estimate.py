@@ -123,9 +123,19 @@ class DitheredEstimate(Estimate):
     gain_sigma: NDArray[np.float64] | None = None
     """``(n,)`` 1 σ of each gain's modulus; None: not known."""
 
+    weak: tuple[int, ...] = ()
+    """Modes that were dithered far more weakly than the others: nothing of α depends on them."""
+
     answers_as: tuple[int, ...] = ()
     """Mode of the model whose response each mode's answer certainly is, its own where that is not
     certain; empty: not looked at."""
+
+    @property
+    def strong(self) -> NDArray[np.bool_]:
+        """``(n,)`` which gains are of modes that tell of α."""
+        which = np.ones(len(self.optical_gain), dtype=bool)
+        which[: len(self.modes)] = [mode not in self.weak for mode in self.modes]
+        return which
 
 
 def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:

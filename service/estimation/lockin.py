@@ -214,6 +214,9 @@ LIKER = 3.0
 CERTAIN = 6.0
 """And more than it explains beside the line, root mean square."""
 
+WEAK = 0.3
+"""Of the strongest line's amplitude: weaker ones have a tenth of its weight, and less."""
+
 MAX_LAG_FRAMES = 0.2
 """A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
 
@@ -272,6 +275,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         session=spectra.session,
         modes=spectra.plan.modes,
         gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
+        weak=_weak(spectra),
         answers_as=_answers_as(spectra, matrix),
         dither_m=_total_dither_m(spectra),
         window_s=spectra.window_s,
@@ -371,6 +375,12 @@ def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
             best[line] = own[line]
     clear = size[lines, best] > LIKER * size[lines, own]
     return tuple(np.where(clear, best, own).tolist())
+
+
+def _weak(spectra: Spectra) -> tuple[int, ...]:
+    """Return the modes whose dither is far weaker than that of the strongest."""
+    size = np.abs(spectra.dither).max(axis=1)
+    return tuple(np.array(spectra.plan.modes)[size < WEAK * size.max()].tolist())
 
 
 def _total_dither_m(spectra: Spectra) -> float:

@@ -32,6 +32,7 @@ from service.tracking.dither_request import (
     DitherParameters,
     DitherPhase,
     DitherPlan,
+    clear_lines,
     is_own_sine,
     is_proving,
     n_lines,
@@ -78,6 +79,16 @@ tenth of a degree."""
 STANDS_OUT = 6.0
 """A jump of so many σ of one window is told by two, wherever in the first it falls."""
 
+ALL_BESIDE, ONE_BESIDE = 0.25, 0.02
+"""Share of the power of the first dither that all weak lines have, and each at most: less than a
+tenth of what a strong one has, or nothing of α would be told where such a mode is another."""
+
+BESIDE_HZ = 4.0
+"""Between a weak line and a strong one."""
+
+MIN_BESIDE = 2
+"""Windows that such a dither lasts for: they name a mode, and are enough to make a matrix."""
+
 ROUNDING = 1.001
 """What a dither may be stronger by than what was asked for."""
 
@@ -111,7 +122,8 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     found = schedule(kappa, requirement)
     plan = _plan(state, found, requirement, window_s, phase)
     shown: tuple[int, ...] = ()
-    early = state.alpha.dither_due_since_ns_utc is None and mode_proof.unknown_loop(state, rtc)
+    no_matrix = state.matrices.in_use is None or mode_proof.unknown_loop(state, rtc)
+    early = state.alpha.dither_due_since_ns_utc is None and no_matrix
     if phase in {DitherPhase.FOLLOW, DitherPhase.SPARSE} or early:
         shown = mode_proof.modes_to_show(context, rtc, window_s)
     if shown:
@@ -119,6 +131,8 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     fixed = policy.dither_amplitude_m is not None
     total_m = requirement.budget_m if fixed else plan.total_m
     choice = _parameters(context, total_m, window_s, max(requirement.window_s, _lasting_s(phase)))
+    if phase is DitherPhase.ACQUIRE and not context.acquisition.under_way:
+        choice = _with_others(context, rtc, choice)
     return WantedDither(phase=phase, reason=reason, parameters=choice, next_ns_utc=next_ns), plan
 
 
@@ -136,6 +150,43 @@ def _to_show(
     reason = f"modes up to {max(modes)} are shown before they are controlled"
     return WantedDither(
         phase=DitherPhase.PROVE, reason=reason, parameters=choice, next_ns_utc=context.now_ns
+    )
+
+
+def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) -> DitherParameters:
+    """Return the first dither with weak lines that show other modes: they cost no time.
+
+    The modes that tell of α keep most of the power, and there are none where the star is so faint
+    that one window is not as precise as is asked. It lasts for the two windows that are asked for
+    before anything is made, and ends by itself.
+    """
+    registration, policy = context.registration, context.policy
+    begun = registration is not None and registration.n_windows > 0
+    window_sigma = precision(context.state, rtc) / (choice.total_m * np.sqrt(choice.window_s))
+    if begun or policy.dither_frequencies_hz or np.any(window_sigma > policy.dither_sigma):
+        return choice
+    telling = chosen_modes(rtc, policy, choice.shunned)[: rtc.max_dither_modes]
+    strong = clear_lines(rtc, len(telling), choice)
+    free = [
+        line
+        for line in mode_proof.lines_clear(context, rtc, choice.window_s)
+        if min(abs(line - other) for other in strong) >= BESIDE_HZ
+    ]
+    others = mode_proof.modes_beside(context, rtc, telling)
+    others = others[: min(len(free), rtc.max_dither_modes - len(telling))]
+    if not others:
+        return choice
+    spread = np.linspace(0, len(free) - 1, len(others)).round().astype(int)
+    share = min(ALL_BESIDE / len(others), ONE_BESIDE)
+    lines = {mode: (free[k], share) for mode, k in zip(others, spread.tolist(), strict=True)}
+    rest = (1.0 - share * len(others)) / len(telling)
+    lines |= {mode: (line, rest) for mode, line in zip(telling, strong, strict=True)}
+    return replace(
+        choice,
+        modes=tuple(sorted(lines)),
+        lines_hz=tuple(lines[mode][0] for mode in sorted(lines)),
+        shares=tuple(lines[mode][1] for mode in sorted(lines)),
+        n_windows=MIN_BESIDE,
     )
 
 

@@ -20,11 +20,10 @@ from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, Status
 
 CLEARANCES_HZ = (21.0, 8.0)
-"""Between a line and a vibration: beyond the side bins that measure the noise, or at least beyond
-a vibration's own width."""
+"""Between a line and a vibration: beyond the side bins of noise, or beyond its own width."""
 
 SPARE_S = 0.3
-"""Of dither behind the last window, for one that begins late because frames were lost."""
+"""Of dither behind the last window, if it begins late because frames were lost."""
 
 PROVING_SPARE_S = 0.9
 """The same where one window is all there is: frames may wait for half a second, and a status that
@@ -97,7 +96,8 @@ class DitherParameters:
     """Modes that are to be seen to answer; empty: those that tell most of α."""
 
     lines_hz: tuple[float, ...] = ()
-    """Their lines."""
+    shares: tuple[float, ...] = ()
+    """Of the power, one for each; empty: all alike."""
 
     shunned: frozenset[int] = frozenset()
     """Modes that are not to be dithered to follow α."""
@@ -128,17 +128,17 @@ def plan_dither(
 ) -> Dither:
     """Return the dither to ask for: what is not given is the policy's own choice.
 
-    The lines are rounded to whole periods in a window. The modes are ones the loop does not and
-    will not control, where there are such: nothing there amplifies the dither or the noise.
+    Lines have whole periods in a window. The loop leaves the modes alone, if there are such.
     """
     asked = any(wish is not None for wish in (modes, amplitude_m, frequency_hz, duration_s))
     proving = choice.modes and not asked
     chosen = modes or choice.modes or chosen_modes(rtc, policy, choice.shunned)
     chosen = chosen[: rtc.max_dither_modes]
     lines = choice.lines_hz if proving else frequency_hz or policy.dither_frequencies_hz
-    if lines is None:
-        lines = clear_lines(rtc, len(chosen), choice)
-    amplitude = amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))
+    lines = clear_lines(rtc, len(chosen), choice) if lines is None else lines
+    sizes = [amplitude_m or choice.total_m / np.sqrt(max(len(chosen), 1))] * len(chosen)
+    if proving and choice.shares:
+        sizes = [choice.total_m * np.sqrt(share) for share in choice.shares]
     spare_s = PROVING_SPARE_S if proving else SPARE_S
     lasting_s = SETTLING_S + choice.n_windows * choice.window_s + spare_s
     step_hz = step_of(rtc, choice.window_s)
@@ -147,7 +147,7 @@ def plan_dither(
         id=f"{begins}{now_ns}",
         kind=DitherKind.SINE,
         modes=chosen,
-        amplitude_m=(float(min(amplitude, rtc.max_dither_m)),) * len(chosen),
+        amplitude_m=tuple(float(min(size, rtc.max_dither_m)) for size in sizes),
         frequency_hz=tuple(round(f / step_hz) * step_hz for f in lines),
         duration_s=duration_s or lasting_s,
     )

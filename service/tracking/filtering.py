@@ -339,6 +339,12 @@ def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
     return estimate.modes, np.abs(estimate.optical_gain), estimate.gain_sigma
 
 
+def strong_gains(estimate: DitheredEstimate) -> Array:
+    """Return moduli of the gains that α is told by."""
+    modes, gains, _ = gains_of(estimate)
+    return gains if len(modes) != len(estimate.strong) else gains[estimate.strong]
+
+
 def why_no_window(
     context: StepContext, estimate: DitheredEstimate, when: TelemetrySpan
 ) -> Why | None:
@@ -355,7 +361,7 @@ def why_no_window(
     if abs(lag) > MAX_LAG_FRAMES:
         late = f"slopes lag commands by {lag:+.2f} frame, 0 is expected"
         return RefusalKind.MISALIGNED, f"columns misaligned: {late}"
-    _, gains, _ = gains_of(estimate)
+    gains = strong_gains(estimate)
     if gains.min() < GAIN_RANGE[0] or gains.max() > GAIN_RANGE[1]:
         return RefusalKind.OTHER, (
             f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "

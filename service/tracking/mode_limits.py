@@ -2,7 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+UNEVEN, HEALTHY = 1.6, 1.3
+"""A mode that answers so many times as the modes beside it, or one over that, is named, where it
+certainly is beyond what healthy ones do; it may be controlled."""
+
+PERHAPS_UNEVEN = 1.45
+"""From here on another window is asked."""
+
+CERTAIN = 3.0
+"""1 σ by which a ratio must lie beyond a limit to be certainly there."""
+
+NEIGHBOURS = 10
+"""Modes that one is compared with; a window of no more tells nothing of it."""
+
+MAX_WINDOWS = 3
+"""That compare a mode, before it is let be though none of them was certain."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +56,80 @@ class ModeAnswer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ModeRatio:
+    """How a mode answers beside its neighbours, where that is not as healthy ones do."""
+
+    mode: int
+    ratio: float
+    """Its response over the median of the modes beside it, the mean of all windows."""
+
+    sigma: float
+    """1 σ of that."""
+
+    n_windows: int = 1
+
+    def plus(self, other: ModeRatio) -> ModeRatio:
+        """Return what two sets of windows say together."""
+        weight = other.sigma**2 / (self.sigma**2 + other.sigma**2)
+        return ModeRatio(
+            mode=self.mode,
+            ratio=weight * self.ratio + (1.0 - weight) * other.ratio,
+            sigma=self.sigma * float(np.sqrt(weight)),
+            n_windows=self.n_windows + other.n_windows,
+        )
+
+    @property
+    def stands_out(self) -> bool:
+        """Whether it may be uneven, and is certainly not like the others."""
+        return self._beyond(PERHAPS_UNEVEN) and self._certainly_beyond(1.0)
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is uneven, as more than one window has it."""
+        beyond = self._beyond(UNEVEN) and self._certainly_beyond(HEALTHY)
+        return self.n_windows > 1 and beyond
+
+    def _beyond(self, limit: float) -> bool:
+        return self.ratio > limit or self.ratio < 1.0 / limit
+
+    def _certainly_beyond(self, limit: float) -> bool:
+        spare = CERTAIN * self.sigma
+        return self.ratio - spare > limit or self.ratio + spare < 1.0 / limit
+
+    @property
+    def undecided(self) -> bool:
+        """Whether another window should tell."""
+        return self.stands_out and not self.certain and self.n_windows < MAX_WINDOWS
+
+
+def compare(
+    modes: NDArray[np.intp], gains: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> dict[int, ModeRatio]:
+    """Return how each mode of one window answers beside those next to it in the basis.
+
+    Optical gains change slowly from mode to mode; with few modes in a window nobody can tell.
+    """
+    found: dict[int, ModeRatio] = {}
+    if len(modes) <= NEIGHBOURS:
+        return found
+    for k, mode in enumerate(modes.tolist()):
+        beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : NEIGHBOURS + 1]
+        usual = float(np.median(gains[beside]))
+        if usual > 0.0:
+            found[mode] = ModeRatio(
+                mode=mode, ratio=float(gains[k]) / usual, sigma=float(sigma[k]) / usual
+            )
+    return found
+
+
+def add_ratios(
+    before: Mapping[int, ModeRatio], now: Mapping[int, ModeRatio]
+) -> dict[int, ModeRatio]:
+    """Return what this window and those before say of each mode that this one compares."""
+    return {mode: before[mode].plus(one) if mode in before else one for mode, one in now.items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModeProof:
     """Which modes have been seen to answer as the instrument file says, apart from any matrix."""
 
@@ -55,10 +149,13 @@ class ModeProof:
     """Of those contrary or suspected, in order."""
 
     uneven: frozenset[int] = frozenset()
-    """Proven, and in two windows far stronger or weaker than the modes beside them."""
+    """Certainly far stronger or weaker than the modes beside them, by two windows and more."""
 
-    perhaps_uneven: frozenset[int] = frozenset()
-    """Seen so in one window: not proven before the next one."""
+    doubtful: tuple[ModeRatio, ...] = ()
+    """Perhaps so, in order: not proven before other windows have told."""
+
+    compared: frozenset[int] = frozenset()
+    """Seen beside enough others to tell."""
 
     own_uneven: str = ""
     """Which modes are so by the RTC's own matrix; empty: none."""

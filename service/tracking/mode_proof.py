@@ -22,7 +22,15 @@ from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.dither_modes import N_LINES, PROVING_RANGE, chosen_modes
 from service.tracking.dither_request import CLEARANCES_HZ, step_of
-from service.tracking.mode_limits import ModeAnswer, ModeProof
+from service.tracking.mode_limits import (
+    NEIGHBOURS,
+    UNEVEN,
+    ModeAnswer,
+    ModeProof,
+    ModeRatio,
+    add_ratios,
+    compare,
+)
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import Registration
@@ -34,16 +42,6 @@ from service.wire import Status
 SIZE_RANGE = (0.4, 2.0)
 """Of a mode's response over the median of the modes dithered with it: optical gains lie within."""
 
-UNEVEN = 1.6
-"""A mode that answers certainly so many times as the modes beside it, or one over that, is named;
-it may be controlled."""
-
-CERTAIN = 3.0
-"""1 σ by which it must be so, in each of two windows."""
-
-NEIGHBOURS = 10
-"""Modes that one is compared with; a window of no more tells nothing of it."""
-
 MIN_RESPONSE = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
 
@@ -52,6 +50,9 @@ SIGNIFICANT = 4.0
 
 MAX_AT_ONCE = 100
 """Modes that are shown together: each has a line of its own, and shares the budget."""
+
+MAX_BESIDE = 40
+"""Modes that weak lines show beside the first dither."""
 
 FEWER = 4
 """Divides that number after each dither that has told nothing: fewer modes are stronger."""
@@ -74,12 +75,16 @@ def proven_modes(state: TrackerState) -> frozenset[int]:
     Those of the matrix in use are, whatever a dither says of one: the RTC's own tells them, of the
     service's only proven ones are controlled, and the loop runs with them.
     """
-    proof = state.matrices.mode_proof
+    return state.matrices.mode_proof.proven | _controlled(state)
+
+
+def _controlled(state: TrackerState) -> frozenset[int]:
+    """Return the modes that the matrix in use is known to control as they are."""
     in_use = None if state.matrices.in_use is None else state.reconstructor(state.matrices.in_use)
-    controlled = frozenset(range(0 if in_use is None else in_use.n_modes))
-    if in_use is not None and in_use.parent is None:
-        controlled -= proof.strange
-    return proof.proven | controlled
+    if in_use is None:
+        return frozenset()
+    strange = state.matrices.mode_proof.strange if in_use.parent is None else frozenset()
+    return frozenset(range(in_use.n_modes)) - strange
 
 
 def shunned_modes(state: TrackerState) -> frozenset[int]:
@@ -96,7 +101,7 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
         return None  # there is no choice of others
     proof = context.matrices.mode_proof
     odd = (proof.contrary | proof.suspected).intersection(estimate.modes)
-    odd -= proven_modes(context.state)
+    odd -= proven_modes(context.state).union(estimate.weak)
     if not odd:
         return None
     return f"{_as_subject(odd)} not answered as the instrument file says: such a window tells no α"
@@ -149,9 +154,40 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     at_once = max(MAX_AT_ONCE // FEWER**state.matrices.mode_proof.n_tries, N_LINES)
     most = min(len(lines_clear(context, rtc, window_s)), at_once, rtc.max_dither_modes)
     shown = missing[:most]
+    others = [mode for mode in _to_compare(context, rtc, shown) if mode not in shown]
+    shown += others[: most - len(shown)]
     telling = chosen_modes(rtc, context.policy, shunned_modes(state))
     spare = [mode for mode in telling if mode not in shown]
     return tuple(sorted([*shown, *spare[: max(min(N_LINES, most) - len(shown), 0)]]))
+
+
+def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) -> list[int]:
+    """Return the modes that weak lines show beside the first dither of those that tell of α.
+
+    Where somebody knows how the modes answer that the loop controls: others are free.
+    """
+    state = context.state
+    known = state.matrices.in_use is not None and not unknown_loop(state, rtc)
+    chosen = context.policy.mode_information is not None and state.operator.mode is not Mode.HOLD
+    if not known or not chosen or not awaits_proof(context, rtc):
+        return []
+    free = (mode for mode in _missing_modes(context, rtc) if mode >= rtc.n_controlled)
+    return [mode for mode in free if mode not in telling][:MAX_BESIDE]
+
+
+def _to_compare(context: StepContext, rtc: Status, shown: list[int]) -> list[int]:
+    """Return the modes beside those that may be uneven, and those that were never compared."""
+    state, proof = context.state, context.matrices.mode_proof
+    controlled, odd = _controlled(state), proof.contrary | proof.suspected
+    healthy = [m for m in range(rtc.n_modes) if m not in odd and m not in shown]
+    found: dict[int, None] = {}
+    for doubted in (one.mode for one in proof.doubtful if one.mode in shown):
+        # the loop answers a dither of its own modes: rather those that it leaves alone, too
+        side = doubted in controlled
+        healthy.sort(key=lambda m: ((m in controlled) != side, abs(m - doubted)))
+        found |= dict.fromkeys(healthy[:NEIGHBOURS])
+    new = range(_wanted_modes(context, rtc)) if shown else ()
+    return [*found, *(m for m in new if m not in proof.compared | controlled | odd)]
 
 
 def unknown_loop(state: TrackerState, rtc: Status) -> bool:
@@ -207,29 +243,51 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
         return
     modes, gains = np.array(estimate.modes), np.real(estimate.optical_gain)
     proven, contrary = _classify(gains, np.abs(estimate.optical_gain), estimate.gain_sigma)
-    odd = proven & _uneven(modes, gains, estimate.gain_sigma)
-    good, bad, uneven = (frozenset(modes[which].tolist()) for which in (proven, contrary, odd))
+    good, bad = (frozenset(modes[which].tolist()) for which in (proven, contrary))
     before = proof
     sure = bad & (proof.suspected | proof.contrary)
-    doubted = uneven - proof.perhaps_uneven - proof.uneven - proof.proven
+    compared = _without(
+        compare(modes, gains, estimate.gain_sigma), bad | _controlled(context.state)
+    )
+    uneven, doubtful = _judge_ratios(proof, compared, bad)
+    doubted = frozenset(one.mode for one in doubtful)
     accused = (proof.suspected | bad | proof.contrary) - good
     proof = replace(
         proof,
         proven=(proof.proven | (good - doubted)) - bad,
+        compared=proof.compared | compared.keys(),
         contrary=(proof.contrary | sure) - good,
         suspected=(proof.suspected | bad) - good - sure,
         answers=_answers(proof, estimate, gains, bad, accused),
-        uneven=(proof.uneven - good - bad) | (uneven & (proof.perhaps_uneven | proof.uneven)),
-        perhaps_uneven=(proof.perhaps_uneven - good - bad) | doubted,
+        uneven=uneven,
+        doubtful=doubtful,
     )
     if proof.shown and proof.shown <= frozenset(estimate.modes):
         told = (good | bad) & (proof.shown - before.proven)
+        told |= compared.keys() & {one.mode for one in before.doubtful}
         proof = replace(proof, n_tries=0) if told else _after_miss(proof)
         proof = replace(proof, shown=frozenset())
     if proof == before:
         return
     context.matrices = replace(context.matrices, mode_proof=proof)
     _limit_to_proven(context, rtc, bad)
+
+
+def _without(ratios: dict[int, ModeRatio], modes: frozenset[int]) -> dict[int, ModeRatio]:
+    """Return the ratios of all other modes, in order."""
+    return {mode: ratios[mode] for mode in sorted(ratios) if mode not in modes}
+
+
+def _judge_ratios(
+    proof: ModeProof, compared: dict[int, ModeRatio], bad: frozenset[int]
+) -> tuple[frozenset[int], tuple[ModeRatio, ...]]:
+    """Return which modes are uneven, and which may be, by this window and those before it."""
+    before = {one.mode: one for one in proof.doubtful}
+    together = add_ratios(before, compared)
+    uneven = {mode for mode, one in together.items() if one.certain}
+    uneven |= {m for m in proof.uneven if m not in compared or compared[m].stands_out}
+    rest = _without(before | together, bad | uneven)
+    return frozenset(uneven - bad), tuple(one for one in rest.values() if one.undecided)
 
 
 def _answers(
@@ -309,23 +367,6 @@ def _classify(
     proven = seen & (gains > low) & (gains < high)
     contrary = (gains + SIGNIFICANT * sigma < low) | (gains - SIGNIFICANT * sigma > high)
     return proven, contrary & ~proven
-
-
-def _uneven(
-    modes: NDArray[np.intp], gains: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Return which modes answer certainly otherwise than those beside them in the basis.
-
-    Optical gains change slowly from mode to mode; with few modes in a window nobody can tell.
-    """
-    odd = np.zeros(len(modes), dtype=bool)
-    if len(modes) <= NEIGHBOURS:
-        return odd
-    for k, mode in enumerate(modes):
-        beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : NEIGHBOURS + 1]
-        usual, spare = float(np.median(gains[beside])), CERTAIN * sigma[k]
-        odd[k] = gains[k] - spare > UNEVEN * usual or gains[k] + spare < usual / UNEVEN
-    return odd
 
 
 def _limit_to_proven(context: StepContext, rtc: Status, bad: frozenset[int]) -> None:
@@ -417,11 +458,11 @@ def _missing_modes(context: StepContext, rtc: Status) -> list[int]:
     Those that one window has accused are shown again whatever is wanted: an accusation is named,
     or it is none.
     """
-    proven, wanted = proven_modes(context.state), _wanted_modes(context, rtc)
-    accused = (
-        mode for mode in context.matrices.mode_proof.suspected if wanted <= mode < rtc.n_modes
-    )
-    return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
+    proof, wanted = context.matrices.mode_proof, _wanted_modes(context, rtc)
+    doubted = {one.mode for one in proof.doubtful} - _controlled(context.state)
+    accused = {mode for mode in proof.suspected | doubted if wanted <= mode < rtc.n_modes}
+    known = proven_modes(context.state) - doubted
+    return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in known]
 
 
 def _wanted_modes(context: StepContext, rtc: Status) -> int:

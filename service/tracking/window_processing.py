@@ -73,7 +73,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         pointing=validity.pointing_at(context.state, estimate.t_ns_utc),
         began_ns_utc=when.began_ns_utc,
         source=Source.RANDOM if random else Source.LOCK_IN,
-        optical_gain=float(gains.mean()),
+        optical_gain=float(filtering.strong_gains(estimate).mean()),
         optical_gains=filtering.update_gains(
             () if registration is None else registration.optical_gains,
             modes,

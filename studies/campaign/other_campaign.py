@@ -1,7 +1,8 @@
 """Forty RTCs whose single modes differ, the same with the service killed, healthy nights, jumps.
 
 Run: ``python -m studies.campaign.other_campaign differ --output var/differ.jsonl``, and ``killed``,
-``healthy``, ``jumps`` instead of ``differ``; nights that are there already are not run again.
+``healthy``, ``healthy_diffractive``, ``jumps`` instead of ``differ``; nights that are there already
+are not run again.
 """
 
 from __future__ import annotations
@@ -67,6 +68,14 @@ def healthy(seed: int) -> Plan:
     return Plan(seed=seed, seconds=300.0, magnitude=round(float(rng.uniform(7.0, 11.0)), 1))
 
 
+def healthy_diffractive(seed: int) -> Plan:
+    """Return the same of a diffractive telescope; every other RTC keeps its matrix to itself."""
+    rng = np.random.default_rng([_SEED, 4, seed])
+    plan = replace(healthy(seed), magnitude=round(float(rng.uniform(7.0, 11.0)), 1), seconds=60.0)
+    plan = replace(plan, truth=Truth(offered=seed % 2 == 0), n_controlled=45, n_target=60)
+    return replace(plan, instrument=SMALL, plant="diffractive")
+
+
 def jumping(seed: int) -> Plan:
     """Return a night whose mirror jumps once all modes are controlled."""
     rng = np.random.default_rng([_SEED, 3, seed])
@@ -78,6 +87,7 @@ CAMPAIGNS: Mapping[str, Callable[[int], Plan]] = {
     "differ": differing,
     "killed": killed,
     "healthy": healthy,
+    "healthy_diffractive": healthy_diffractive,
     "jumps": jumping,
 }
 

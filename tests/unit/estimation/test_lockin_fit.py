@@ -341,3 +341,15 @@ def test_a_mode_in_the_place_of_another_is_told_and_no_other_is():
 
 def test_noise_puts_no_mode_in_the_place_of_another():
     assert {estimate.answers_as for estimate in faint_estimates()} == {(33, 37)}
+
+
+def test_a_line_far_weaker_than_the_strongest_is_told():
+    spectra, here = bright_windows()[0], small_model().linearise(SOMEWHERE)
+    estimate = fit_window(spectra, here, BRIGHT.loop)
+    assert estimate.weak == ()
+    assert estimate.strong.all()
+    dither = spectra.dither.copy()
+    dither[1] *= 0.2
+    weaker = fit_window(replace(spectra, dither=dither), here, BRIGHT.loop)
+    assert weaker.weak == (37,)
+    np.testing.assert_array_equal(weaker.strong, [True, False])

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from service.errors import CommandError
+from service.estimation.lockin import WEAK
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_modes import PROVING_RANGE
-from service.tracking.mode_limits import ModeProof
-from service.tracking.mode_proof import TRIES, n_proven_modes, proven_modes
+from service.tracking.mode_limits import MAX_WINDOWS, ModeProof, ModeRatio, compare
+from service.tracking.mode_proof import MAX_BESIDE, TRIES, n_proven_modes, proven_modes
 from service.tracking.products import MatrixState
 from service.tracking.resume import restored, resumed, saved_of
 from service.tracking.state import Mode
@@ -49,6 +50,8 @@ class Shown(World):
         self.since_window_s = STEP_S
         modes = playing.request.modes
         gains = np.array([self.answers_of.get(mode, 0.6) for mode in modes], dtype=complex)
+        size = np.array(playing.request.amplitude_m)
+        faint = size < WEAK * size.max()
         fitted = estimate(
             t_ns=self.now_ns,
             session=f"s{self.session}",
@@ -56,6 +59,7 @@ class Shown(World):
             optical_gain=gains,
             gain_sigma=np.array([self.sigma_of.get(mode, 0.02) for mode in modes]),
             lag_frames=np.zeros(len(modes)),
+            weak=tuple(np.array(modes)[faint].tolist()),
         )
         self.tell(ev.WindowFitted(estimate=fitted))
 
@@ -296,7 +300,7 @@ def test_optical_gains_that_change_along_the_basis_are_not_uneven():
     for _ in range(3):
         told(world, np.linspace(0.3, 0.9, 40).tolist())
     assert not world.state.matrices.mode_proof.uneven
-    assert not world.state.matrices.mode_proof.perhaps_uneven
+    assert not world.state.matrices.mode_proof.doubtful
 
 
 def test_a_mode_that_answers_otherwise_is_dithered_no_more_and_its_window_tells_no_alpha():
@@ -369,3 +373,113 @@ def test_a_mode_that_the_loop_runs_with_is_not_accused_after_a_restart():
     assert world.state.loop.rtc.n_controlled == 450
     assert alarms.MODES_CONTRARY not in killed(world).alarms
     assert alarms.MODES_CONTRARY not in world.pass_(2.0).alarms
+
+
+def informed(telling=(460, 470, 480, 490), **changes):
+    """A policy that knows which modes tell most of α."""
+    information = np.broadcast_to(np.eye(4), (N_MODES, 4, 4)).copy()
+    information[list(telling)] *= 100.0
+    return replace(TARGET, mode_information=information, **changes)
+
+
+def test_weak_lines_show_other_modes_beside_the_first_dither():
+    """Those that tell of α keep most of the power; one more line costs no time."""
+    first = Shown(policy=informed()).asked(DitherRequest)[0]
+    size = dict(zip(first.modes, first.amplitude_m, strict=True))
+    telling = {460, 470, 480, 490}
+    assert set(first.modes) == telling | set(range(400, 400 + MAX_BESIDE))
+    power = np.square(first.amplitude_m)
+    assert np.sqrt(power.sum()) <= POLICY.dither_budget_m * 1.001
+    assert sum(size[mode] ** 2 for mode in telling) >= 0.75 * power.sum() * 0.999
+    assert max(size[mode] for mode in size if mode not in telling) < WEAK * size[460]
+    lines = dict(zip(first.modes, first.frequency_hz, strict=True))
+    gaps = [abs(lines[mode] - lines[one]) for one in telling for mode in lines if mode != one]
+    assert min(gaps) >= 4.0
+    assert first.duration_s == pytest.approx(0.3 + 2 * WINDOW_S + 0.9)
+
+
+def test_a_mode_beyond_the_loop_is_named_while_the_first_matrix_is_made():
+    """Its line is weak: α is told by the others, and the matrix is asked for as soon as ever."""
+    healthy, odd = (Shown(answers, policy=informed()) for answers in ({}, {430: -0.6}))
+    for world in (healthy, odd):
+        while not world.made:
+            world.pass_(0.5)
+    assert odd.now_ns == healthy.now_ns
+    assert "mode 430 has" in odd.state.alarm(alarms.MODES_CONTRARY).text
+    assert odd.made == [400]
+    assert odd.state.windows.refused == 0
+
+
+def test_the_first_matrix_is_asked_for_as_soon_as_with_four_lines():
+    few = Shown(policy=informed(n_modes_target=400))
+    many = Shown(policy=informed())
+    for world in (few, many):
+        while not world.made:
+            world.pass_(0.5)
+    assert len(few.asked(DitherRequest)[0].modes) == 4
+    assert few.now_ns == many.now_ns
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"mode": Mode.HOLD}, {"offered": False}, {"max_dither_modes": 4}, {"magnitude": 10.0}],
+)
+def test_no_weak_lines_are_asked_for_where(changes):
+    """Nothing is made; nobody knows the modes of the loop; the RTC plays no more; a faint star."""
+    first = Shown(policy=informed(), **changes).asked(DitherRequest)[0]
+    assert len(first.modes) == 4
+
+
+def test_the_modes_beside_one_that_may_be_uneven_are_shown_with_it():
+    """In a window of few modes nobody could tell."""
+    world = Shown({430: 1.15}, policy=TARGET).pass_(60.0)
+    again = [modes for modes in world.shown if 430 in modes]
+    assert len(again) >= 2
+    assert all(len(modes) > 10 for modes in again)
+    assert set(range(425, 436)) <= set(again[1])
+    assert "mode 430 answers" in world.state.alarm(alarms.MODES_UNEVEN).text
+    assert world.state.loop.rtc.n_controlled == 450
+
+
+def test_a_window_of_few_modes_takes_nothing_back():
+    world = Shown().pass_(8.0)
+    for _ in range(2):
+        told(world, [0.6] * 5 + [1.1] + [0.6] * 6)
+    told(world, [0.6, 1.1, 0.6, 0.6], first=414)
+    assert "mode 415 answers" in world.state.alarm(alarms.MODES_UNEVEN).text
+
+
+def test_two_windows_say_together_what_neither_says_alone():
+    """Half as strong as its neighbours by one and a half σ more than a limit, twice."""
+    one, other = (
+        ModeRatio(mode=3, ratio=ratio, sigma=sigma)
+        for ratio, sigma in ((0.55, 0.095), (0.52, 0.08))
+    )
+    assert one.undecided
+    assert other.undecided
+    both = one.plus(other)
+    assert both.sigma == pytest.approx((0.095**-2 + 0.08**-2) ** -0.5)
+    assert both.certain
+    assert not replace(both, n_windows=1).certain
+    assert not replace(both, ratio=0.64).certain
+    assert not replace(both, sigma=0.1).certain
+
+
+def test_a_mode_that_no_window_is_sure_of_is_let_be_after_some():
+    world = Shown().pass_(8.0)
+    for _ in range(MAX_WINDOWS):
+        assert 415 not in proven_modes(world.state)
+        told(world, [0.6] * 5 + [0.9] + [0.6] * 6)
+    assert 415 in proven_modes(world.state)
+    assert alarms.MODES_UNEVEN not in world.alarms
+
+
+def test_a_mode_is_compared_with_those_beside_it_in_the_basis():
+    modes = np.arange(40)
+    gains = np.linspace(0.3, 0.9, 40)
+    gains[20] *= 2.0
+    found = compare(modes, gains, np.full(40, 0.03))
+    assert found[20].ratio == pytest.approx(2.0, rel=0.03)
+    assert found[20].sigma == pytest.approx(0.03 / gains[20] * 2.0, rel=0.03)
+    assert max(abs(one.ratio - 1.0) for mode, one in found.items() if mode != 20) < 0.25
+    assert compare(modes[:10], gains[:10], np.full(10, 0.03)) == {}

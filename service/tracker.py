@@ -31,7 +31,7 @@ from service.tracking import events as ev
 from service.tracking.alarm_rules import derive_alarms
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
-from service.tracking.loop import CommandState
+from service.tracking.operation_records import CommandState
 from service.tracking.operations import acquisition, measurement, noisy_measurement, probation
 from service.tracking.policy import Policy
 from service.tracking.state import TrackerState

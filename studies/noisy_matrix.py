@@ -32,7 +32,7 @@ from service.estimation.windows import WindowRefused
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.runtime.estimates import work_out
 from service.runtime.worker import Compute, OpticsWorker
-from service.tracking.products import MeasurementRecord, MeasureState
+from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.wire import DitherKind, DitherRequest
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import Ahead

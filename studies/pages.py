@@ -12,12 +12,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import get_args
 
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS
+from service.tracking.operation_records import AcquisitionStage, MeasureState, ProbationState
 from service.tracking.operations.running import OPERATION_OF, CurrentOperation, ServiceState
-from service.tracking.products import MatrixState, MeasureState, ProbationState
+from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from studies import dispatch, reference

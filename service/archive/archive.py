@@ -15,7 +15,8 @@ from service.archive.recordings import Recordings
 from service.archive.serialisation import TrackingFile
 from service.archive.store import Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
-from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.operation_records import MeasurementRecord
+from service.tracking.products import ReconstructorRecord
 from service.tracking.registration import HistoryEntry
 
 

@@ -16,7 +16,8 @@ from service.archive import nights
 from service.archive.nights import TrendSample, Values
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, shown
-from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.operation_records import MeasurementRecord
+from service.tracking.products import ReconstructorRecord
 from service.tracking.registration import HistoryEntry
 
 Product = ReconstructorRecord | MeasurementRecord

@@ -16,13 +16,8 @@ from service.control.gains import gain_table
 from service.errors import ArchiveError, StorageError
 from service.files.container import put_covariance
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
-from service.tracking.products import (
-    MatrixState,
-    MeasurementRecord,
-    MeasureState,
-    NoisyFinding,
-    ReconstructorRecord,
-)
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.wire import checksum
 
 PROBE_BYTES = 1 << 20

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from service.estimation.windows import ClosedLoop
 from service.wire import Loop, Status
 
+NO_RTC = "no RTC is there"
+
 SAME_GAIN = 0.05
 """Relative: an RTC may follow the seeing with its gains once a second, and the gate judges with the
 largest optical gains there may be, which are a tenth above those measured."""
@@ -98,3 +100,15 @@ def why_open(rtc: Status) -> str:
 def last_seq(rtc: Status) -> int:
     """Return the last frame processed when a status was made; -1: there had been none."""
     return -1 if rtc.seq is None else rtc.seq
+
+
+def extended_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
+    """Return gains for ``n_modes`` controlled modes: those in force, the last one for new modes."""
+    last = rtc.gains[rtc.n_controlled - 1]
+    kept = rtc.gains[: min(rtc.n_controlled, n_modes)]
+    return (*kept, *(last,) * (n_modes - len(kept)), *(0.0,) * (rtc.n_modes - n_modes))
+
+
+def commanded_gains(rtc: Status, n_modes: int) -> tuple[float, ...]:
+    """Return the gains of the modes that a reconstructor of ``n_modes`` would command."""
+    return extended_gains(rtc, n_modes)[:n_modes]

@@ -16,14 +16,15 @@ from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
-from service.estimation.loop import same_gains
+from service.estimation.loop import commanded_gains, extended_gains, same_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.runtime import estimates, ports
 from service.runtime.worker import Conditions, OpticsWorker
-from service.tracking import alarms, loop, products
+from service.tracking import alarms, products
 from service.tracking import events as ev
 from service.tracking.events import Effect, Event
+from service.tracking.operation_records import MeasurementRecord
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 
@@ -137,7 +138,7 @@ class Actions:
         ArchiveError
             If it cannot be written, or another one has its id.
         """
-        record = products.MeasurementRecord.sent(received.manifest)
+        record = MeasurementRecord.sent(received.manifest)
         if received.matrix is not None:
             instrument = self.instrument.name
             store = self._archive.measured.store
@@ -154,7 +155,7 @@ class Actions:
 
     async def _make(self, effect: ev.MakeMatrix, state: TrackerState) -> Event:
         rtc, registration = _there(state), _registered(state)
-        gains = (effect.gains or loop.extended_gains(rtc, effect.n_modes))[: effect.n_modes]
+        gains = (effect.gains or extended_gains(rtc, effect.n_modes))[: effect.n_modes]
         conditions = self._conditions(state, gains)
         made = await self._workers.call(OpticsWorker.make, conditions, effect.fewer)
         accepted = made.gate.accepted
@@ -178,7 +179,7 @@ class Actions:
         source = state.reconstructor(effect.source)
         matrix = await asyncio.to_thread(self.matrix, effect.source)
         gate, judged, why = None, None, effect.why
-        gains = loop.commanded_gains(rtc, len(matrix))
+        gains = commanded_gains(rtc, len(matrix))
         if not effect.judged and source is not None:
             # the loop ran with it: what the gate has against it since does not count
             held = source.gate is not None and source.gate.accepted

@@ -13,8 +13,8 @@ from service.tracking.alarm_rules import as_text
 from service.tracking.alarms import AlarmRecord
 from service.tracking.commands import Command
 from service.tracking.dither_request import total_m
-from service.tracking.loop import CommandState
-from service.tracking.products import MatrixState, MeasureState, ReconstructorRecord
+from service.tracking.operation_records import CommandState, MeasureState
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
 from service.tracking.state import TrackerState
 

@@ -26,6 +26,7 @@ from service.runtime.worker.records import waits
 from service.tracking import alarms, products
 from service.tracking import events as ev
 from service.tracking.events import Event
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.tracking.state import Level, TrackerState
 from service.tracking.window_processing import fit_begins_at
 from service.wire import checksum
@@ -265,7 +266,7 @@ class NoisySums:
         except ModelError:  # the RTC has started anew: what came before is of another loop
             self._total = window
 
-    async def finish(self, record: products.MeasurementRecord, state: TrackerState) -> Event:
+    async def finish(self, record: MeasurementRecord, state: TrackerState) -> Event:
         """Fit what has been summed, archive it and return what came of it.
 
         Raises
@@ -289,10 +290,10 @@ class NoisySums:
 @waits(at_most_s=5.0)
 def work_out(
     bench: OpticsWorker,
-    record: products.MeasurementRecord,
+    record: MeasurementRecord,
     total: Correlated,
     start: Misregistration | None,
-) -> tuple[products.MeasurementRecord, NoisyNumbers]:
+) -> tuple[MeasurementRecord, NoisyNumbers]:
     """Return the record of a matrix, ready for the archive, and its numbers; runs in the worker."""
     noisy = noisy_matrix(total)
     outcome, reason = bench.fit_random(total, start), ""
@@ -309,7 +310,7 @@ def work_out(
         gain_sigma=unknown if estimate is None else estimate.gain_sigma,
         snr=noisy.snr_of_modes,
     )
-    finding = products.NoisyFinding(
+    finding = NoisyFinding(
         n_slopes=len(numbers.matrix),
         n_frames=total.sums.n_pairs,
         n_missing=total.n_missing,
@@ -323,7 +324,7 @@ def work_out(
         created_ns_utc=total.t_end_ns_utc,
         sha256=checksum(numbers.matrix),
     )
-    record = replace(record, state=products.MeasureState.STORED, reason=reason, finding=finding)
+    record = replace(record, state=MeasureState.STORED, reason=reason, finding=finding)
     return record, numbers
 
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.runtime.worker import Done, OpticsWorker
-from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.operation_records import MeasurementRecord
+from service.tracking.products import ReconstructorRecord
 from service.wire import Command, Manifest, Reply
 
 P = ParamSpec("P")

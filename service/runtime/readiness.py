@@ -14,8 +14,8 @@ from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, Link
 from service.model.misregistration import at_boundary
 from service.tracking import alarms
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.running import operating
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord

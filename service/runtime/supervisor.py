@@ -37,8 +37,8 @@ from service.tracking import events as ev
 from service.tracking.alarm_rules import changes_value
 from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
 from service.tracking.events import Effect, Event
+from service.tracking.operation_records import MeasureState
 from service.tracking.policy import Policy
-from service.tracking.products import MeasureState
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
 

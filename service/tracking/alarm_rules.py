@@ -27,9 +27,9 @@ from service.tracking import (
     void_intervals,
 )
 from service.tracking import commands as cmd
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
 from service.tracking.dither_request import GONE_WITHIN_S
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition_stages import missed_enough
 from service.tracking.operations.probation import opening_text
 from service.tracking.policy import SECOND_NS, Rule

@@ -16,11 +16,8 @@ from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking.commands import Command
-from service.tracking.products import (
-    Judged,
-    MeasurementRecord,
-    ReconstructorRecord,
-)
+from service.tracking.operation_records import MeasurementRecord
+from service.tracking.products import Judged, ReconstructorRecord
 from service.tracking.state import Level, TrackerState
 from service.wire import Acknowledgement, Reply, Status
 from service.wire import Command as Request

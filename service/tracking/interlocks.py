@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Final, get_args
 
 from service.errors import CommandError, UnknownIdError
+from service.estimation.loop import NO_RTC
 from service.tracking import commands as cmd
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import ALARMS, RULE_PREFIX
 from service.tracking.commands import Command
 from service.tracking.events import kebab
-from service.tracking.loop import NO_RTC
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition_stages import why_not_now
 from service.tracking.operations.running import OperationKind, RunningOperation, running_operations
 from service.tracking.policy import Policy

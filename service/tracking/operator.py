@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from service.control.gains import gain_table
 from service.errors import CommandError
+from service.estimation.loop import extended_gains
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors
@@ -24,11 +25,11 @@ from service.tracking.dither_request import (
     total_m,
     why_unusable,
 )
-from service.tracking.loop import CommandState, LoopCommand, extended_gains, present
+from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Level, Mode
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.tracking.validity import note_pointing
 from service.wire import DitherKind, Loop, LoopRequest, RampRequest, Status
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.errors import CommandError, UnknownIdError
+from service.estimation.loop import commanded_gains, extended_gains
 from service.tracking import events as ev
 from service.tracking import update_policy
 from service.tracking.alarms import Interlock
-from service.tracking.loop import commanded_gains, extended_gains
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.sending import (
     beyond_judging,

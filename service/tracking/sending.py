@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from service.estimation.loop import NO_RTC
 from service.tracking import alarms, update_policy
 from service.tracking.alarms import Alarm, Interlock, alarm_blocks, blocking_alarm
-from service.tracking.loop import NO_RTC
 from service.tracking.mode_proof import why_unproven
 from service.tracking.products import ReconstructorRecord
 from service.tracking.state import Mode, TrackerState

@@ -6,18 +6,16 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.control.gate import GateVerdict
-from service.tracking.acquisition_state import Acquisition
 from service.tracking.alarms import Alarm, AlarmRecord
 from service.tracking.dither_request import Dither, DitherPolicyState
-from service.tracking.loop import LoopCommand
 from service.tracking.mode_limits import ModeLimit, ModeProof
-from service.tracking.products import (
-    Assessment,
-    MatrixState,
+from service.tracking.operation_records import (
+    Acquisition,
+    LoopCommand,
     MeasurementRecord,
     Probation,
-    ReconstructorRecord,
 )
+from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.registration import (
     HistoryEntry,
     Offload,

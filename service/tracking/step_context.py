@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 
-from service.tracking.acquisition_state import Acquisition
+from service.errors import CommandError
+from service.estimation.loop import NO_RTC
 from service.tracking.alarms import (
     ALARMS,
     Alarm,
@@ -19,6 +20,7 @@ from service.tracking.alarms import (
 )
 from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.events import Effect
+from service.tracking.operation_records import Acquisition
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Registration
 from service.tracking.state import (
@@ -358,3 +360,16 @@ def new_lines(before: TrackerState, after: TrackerState) -> list[LogEntry]:
         return []
     known = {entry.line for entry in before.log}
     return [entry for entry in after.log if entry.line not in known]
+
+
+def present(rtc: Status | None) -> Status:
+    """Return the RTC, for what is done only where one is there.
+
+    Raises
+    ------
+    CommandError
+        If none is.
+    """
+    if rtc is None:
+        raise CommandError(NO_RTC)
+    return rtc

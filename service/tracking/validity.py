@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.tracking.alarms import STALE
-from service.tracking.loop import separation_deg
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Purpose, Registration, Validity, ValidityState
 from service.tracking.state import TrackerState
@@ -262,3 +261,14 @@ def _too_wide_for_the_gate(state: TrackerState, registration: Registration) -> b
         return False
     own = np.sqrt(np.diag(registration.covariance) + registration.floor**2)
     return bool(np.any(registration.sigma > 2.0 * own))
+
+
+def separation_deg(one: Pointing, other: Pointing) -> float:
+    """Return the angle on the sky between two directions, degrees."""
+    return float(np.rad2deg(np.arccos(np.clip(_unit(one) @ _unit(other), -1.0, 1.0))))
+
+
+def _unit(pointing: Pointing) -> NDArray[np.float64]:
+    elevation, azimuth = np.deg2rad([pointing.elevation_deg, pointing.azimuth_deg])
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])

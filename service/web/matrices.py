@@ -14,7 +14,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from service.runtime.refits import RefitJob
-from service.tracking.products import MeasurementRecord, NoisyFinding
+from service.tracking.operation_records import MeasurementRecord, NoisyFinding
 from service.tracking.state import TrackerState
 from service.web import views
 from service.web.commands import MeasurementId, NoisyId, RefitId

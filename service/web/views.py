@@ -32,15 +32,19 @@ from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
 from service.runtime.supervisor import Supervisor
-from service.tracking.acquisition_state import Acquisition
 from service.tracking.alarms import Alarm, AlarmRecord, OperatorNote, Prerequisite
 from service.tracking.commands import GainGroup
 from service.tracking.dither_request import Dither, DitherPlan, DitherPolicyState
 from service.tracking.interlocks import Permission
-from service.tracking.loop import LoopCommand
 from service.tracking.mode_limits import ModeLimit, ModeProof
+from service.tracking.operation_records import (
+    Acquisition,
+    LoopCommand,
+    MeasurementRecord,
+    Probation,
+)
 from service.tracking.operations.running import Operating
-from service.tracking.products import Assessment, MeasurementRecord, Probation, ReconstructorRecord
+from service.tracking.products import Assessment, ReconstructorRecord
 from service.tracking.registration import HistoryEntry, Offload, PassiveState
 from service.tracking.state import LogEntry, ObservatoryValue, TrackerState
 from service.wire import Pointing

@@ -23,8 +23,8 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.openloop import WideCaptureEstimate
 from service.model.misregistration import BOUNDARY_SCALE
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import WideCaptureFitted
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.state import Mode
 from studies.campaign.acquisition_table import table
 from studies.campaign.observatory import Observatory

@@ -16,8 +16,9 @@ from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.tracking.policy import Policy
-from service.tracking.products import MatrixState, MeasurementRecord, MeasureState, NoisyFinding
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode, TrackerState
 from service.wire import Acknowledgement, DitherRequest, Reply
 from service.wire import Command as Order

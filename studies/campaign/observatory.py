@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from service.errors import PyrcalError
 from service.estimation.dither_windows import EndedWindow
+from service.estimation.loop import commanded_gains
 from service.estimation.passive_sums import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated
 from service.runtime.actions import Actions, Publishing, judged_now
@@ -32,7 +33,6 @@ from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
-from service.tracking.loop import commanded_gains
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode, OperatorState, TrackerState

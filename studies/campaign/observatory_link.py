@@ -14,7 +14,8 @@ from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
 from service.runtime.worker import Done, OpticsWorker
-from service.tracking.products import MeasurementRecord, ReconstructorRecord
+from service.tracking.operation_records import MeasurementRecord
+from service.tracking.products import ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
 from sim_rtc.computer.reconstructors import Outcome, Staging
 from studies.campaign.observatory_dome import Dome

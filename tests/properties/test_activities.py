@@ -7,8 +7,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.interlocks import ALLOWS
+from service.tracking.operation_records import MeasureState
 from service.tracking.operations.running import OperationKind, running_operations
-from service.tracking.products import MeasureState
 from service.wire import DitherStop
 from tests.unit.tracking.operations.test_running import (
     ACTIVITIES,

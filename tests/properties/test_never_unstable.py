@@ -6,9 +6,9 @@ import hypothesis.strategies as st
 from hypothesis import given
 
 from service.control.expected_gain import ExpectedGain
+from service.estimation.loop import commanded_gains
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.loop import commanded_gains
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.tracking.update_policy import verdict_invalid_reason

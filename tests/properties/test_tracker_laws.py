@@ -13,8 +13,9 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import total_m
 from service.tracking.filtering import HISTORY_LENGTH
+from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operations.measurement import MEASUREMENTS_KEPT
-from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
+from service.tracking.products import MatrixState
 from service.tracking.reconstructors import RECONSTRUCTORS_KEPT
 from service.tracking.state import Mode
 from service.tracking.step_context import LOG_LENGTH

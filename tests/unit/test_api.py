@@ -44,13 +44,13 @@ from service.tracking.commands import (
 )
 from service.tracking.dither_request import Dither, DitherPhase, DitherPlan, DitherPolicyState
 from service.tracking.events import MakeMatrix
-from service.tracking.loop import CommandState, LoopCommand
-from service.tracking.products import (
-    MatrixState,
+from service.tracking.operation_records import (
+    CommandState,
+    LoopCommand,
     MeasurementRecord,
     MeasureState,
-    ReconstructorRecord,
 )
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.registration import (
     HistoryEntry,
     PassiveBias,

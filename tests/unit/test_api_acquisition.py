@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from service.errors import CommandError
-from service.tracking.acquisition_state import Acquisition, AcquisitionStage
 from service.tracking.commands import AbortAcquisition, Acquire
+from service.tracking.operation_records import Acquisition, AcquisitionStage
 from service.web.views import to_json
 from tests.unit.obedient import Obedient
 from tests.unit.tracking.situations import ALPHA

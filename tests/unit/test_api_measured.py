@@ -10,7 +10,7 @@ import pytest
 
 from service.errors import CommandError, LinkError, UnknownIdError
 from service.tracking.commands import GiveUp, Measure
-from service.tracking.products import MeasurementRecord, MeasureState
+from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.wire import Pattern
 from tests.states import tracker_state
 from tests.unit.obedient import Obedient

@@ -9,7 +9,8 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.tracking.commands import GiveUp, MeasureNoisy
-from service.tracking.products import MeasurementRecord, MeasureState, ModeSet, NoisyFinding
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
+from service.tracking.products import ModeSet
 from service.web.views import NOISY_MEASUREMENT, to_json
 from tests.states import tracker_state
 from tests.unit.obedient import Obedient

@@ -9,7 +9,8 @@ import pytest
 
 from service.archive import Archive
 from service.errors import ArchiveError, UnknownIdError, WireError
-from service.tracking.products import MatrixState, MeasurementRecord, MeasureState
+from service.tracking.operation_records import MeasurementRecord, MeasureState
+from service.tracking.products import MatrixState
 from service.tracking.products import ReconstructorRecord as Reconstructor
 from service.wire import Pattern, checksum
 

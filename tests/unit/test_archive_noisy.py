@@ -13,7 +13,7 @@ from service.archive.serialisation import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.files.container import read_recorded
 from service.model.misregistration import Misregistration
-from service.tracking.products import MeasurementRecord, MeasureState, NoisyFinding
+from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6

@@ -11,8 +11,8 @@ from service.archive import Archive, AuditEntry
 from service.archive.serialisation import TrackingFile
 from service.control.gains import ModeGain
 from service.estimation.estimate import PASSIVE_BIAS
-from service.tracking.acquisition_state import AcquisitionStage
-from service.tracking.products import MatrixState, MeasureState
+from service.tracking.operation_records import AcquisitionStage, MeasureState
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode, Orders
 from service.wire import Pattern
 

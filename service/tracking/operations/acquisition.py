@@ -21,11 +21,10 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import reconstructors, update_policy
-from service.tracking.acquisition_state import Acquisition, AcquisitionStage, Interruption
 from service.tracking.alarms import Interlock
 from service.tracking.dither import allow_dither, choose_dither, stop_running_dither
 from service.tracking.events import Event
-from service.tracking.loop import present
+from service.tracking.operation_records import Acquisition, AcquisitionStage, Interruption
 from service.tracking.operations import acquisition_stages as stages
 from service.tracking.operations.noisy_measurement import fail_noisy_measurement
 from service.tracking.operations.running import running_ramp
@@ -33,7 +32,7 @@ from service.tracking.policy import SECOND_NS
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
 from service.tracking.state import Mode, TrackerState
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, LoopRequest, Reply, Status
 
 ENOUGH_WINDOWS = 2

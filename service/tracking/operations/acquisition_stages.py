@@ -16,15 +16,15 @@ from service.control.dither import (
     lines_of,
     modes_of,
 )
+from service.estimation.loop import NO_RTC
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity, void_intervals
-from service.tracking.acquisition_state import Acquisition, AcquisitionStage, LoopFound
 from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import request_dither, request_stop, stop_running_dither
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
-from service.tracking.loop import NO_RTC
+from service.tracking.operation_records import Acquisition, AcquisitionStage, LoopFound
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict

@@ -12,11 +12,10 @@ from service.tracking import events as ev
 from service.tracking.dither import stop_running_dither
 from service.tracking.dither_request import check_modes
 from service.tracking.events import Event
-from service.tracking.loop import present
+from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operator import begin_closing
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.products import MeasurementRecord, MeasureState
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.wire import MatrixStrokes, MeasureRequest, Pattern, Reply, Status
 
 MEASUREMENTS_KEPT = 300

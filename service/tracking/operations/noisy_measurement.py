@@ -13,12 +13,11 @@ from service.tracking import events as ev
 from service.tracking.dither import request_dither, stop_running_dither
 from service.tracking.dither_request import RANDOM_TOTAL_M, cost_of, plan_random
 from service.tracking.events import Event
-from service.tracking.loop import present
+from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.tracking.operations.measurement import fail_measurement, store_measurement
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import MeasurementRecord, MeasureState
 from service.tracking.state import TrackerState
-from service.tracking.step_context import StepContext
+from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, Reply, Status
 
 DURATION_S = 30.0

@@ -24,15 +24,10 @@ from service.tracking.alarms import (
     alarm_blocks,
 )
 from service.tracking.events import Event
-from service.tracking.loop import CommandState
+from service.tracking.operation_records import CommandState, Probation, ProbationState
 from service.tracking.operator import enter_hold, set_loop
 from service.tracking.policy import SECOND_NS
-from service.tracking.products import (
-    MatrixState,
-    Probation,
-    ProbationState,
-    ReconstructorRecord,
-)
+from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_unsendable
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from service.estimation.loop import why_open
+from service.estimation.loop import NO_RTC, why_open
 from service.tracking.alarms import STANDING_BY, Alarm, Severity
 from service.tracking.dither_request import GONE_WITHIN_S, OUR_DITHERS, OWN_DITHER
-from service.tracking.loop import NO_RTC, CommandState, LoopCommand
+from service.tracking.operation_records import CommandState, LoopCommand
 from service.tracking.policy import SECOND_NS
 from service.tracking.state import Mode, TrackerState
 

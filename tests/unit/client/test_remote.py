@@ -21,8 +21,8 @@ from service.archive import AuditEntry, Channel
 from service.archive.recordings import RecordingRecord
 from service.errors import CommandError
 from service.runtime.snapshot import Snapshot
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.events import MakeMatrix, MatrixMade
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.state import Mode
 from service.web.connections import Server

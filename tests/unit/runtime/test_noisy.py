@@ -13,7 +13,7 @@ from service.runtime.estimates import NoisySums
 from service.runtime.worker import OpticsWorker
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
-from service.tracking.products import MeasurementRecord, MeasureState
+from service.tracking.operation_records import MeasurementRecord, MeasureState
 from tests.states import changed, tracker_state
 from tests.unit.runtime.small import COMPUTE, small_instrument
 from tests.unit.tracking.situations import rtc

@@ -14,7 +14,7 @@ from service.runtime.supervisor import Supervisor
 from service.runtime.worker import OpticsWorker, start_worker
 from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.state import Mode
 from studies.campaign.observatory import Observatory
 from tests.states import tracker_state

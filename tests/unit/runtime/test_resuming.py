@@ -14,8 +14,8 @@ from service.runtime.estimates import PendingWindow
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.mode_limits import ModeProof
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
 from studies.campaign.acquisition import Start

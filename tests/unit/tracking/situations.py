@@ -10,11 +10,11 @@ from service.config.policy import policy_of
 from service.control.gate import GateVerdict
 from service.errors import CommandError
 from service.estimation.lockin import LockInEstimate
+from service.estimation.loop import commanded_gains
 from service.model.misregistration import Misregistration
 from service.tracker import step
 from service.tracking import events as ev
 from service.tracking.dither_request import Dither
-from service.tracking.loop import commanded_gains
 from service.tracking.mode_limits import ModeProof
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.tracking.state import Mode

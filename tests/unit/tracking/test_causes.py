@@ -5,7 +5,7 @@ import pytest
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.products import MeasureState
+from service.tracking.operation_records import MeasureState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, Reply
 from tests.unit.tracking.operations.test_running import idle, sending

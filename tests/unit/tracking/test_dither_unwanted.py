@@ -6,11 +6,10 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.alarms import NOT_AS_ASKED, NOT_STOPPED, OVER_BUDGET
 from service.tracking.dither import CALM_S, TELL_EVERY_S
 from service.tracking.dither_request import GONE_WITHIN_S, DitherPhase, total_m
-from service.tracking.products import MeasureState
+from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.situations import POLICY, Story, dither_answered, of_kind, rtc, stopping
 

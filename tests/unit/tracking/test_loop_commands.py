@@ -5,7 +5,7 @@ import pytest
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.loop import CommandState
+from service.tracking.operation_records import CommandState
 from service.tracking.operator import CLOSE_AGAIN_EVERY_S
 from service.tracking.state import Mode
 from service.wire import Loop, LoopRequest, Pattern, RampRequest

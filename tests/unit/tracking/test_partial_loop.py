@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from service.estimation.loop import extended_gains
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.loop import extended_gains
-from service.tracking.products import MeasureState
+from service.tracking.operation_records import MeasureState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from service.tracking.update_policy import more_modes_to_try

@@ -1,8 +1,8 @@
 import pytest
 
+from service.estimation.loop import extended_gains
 from service.tracker import step
 from service.tracking import events as ev
-from service.tracking.loop import extended_gains
 from service.tracking.products import MatrixState
 from service.tracking.state import Level, Mode
 from tests.states import changed, tracker_state

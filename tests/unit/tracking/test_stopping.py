@@ -5,10 +5,10 @@ import pytest
 from service.errors import CommandError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.interlocks import ALLOWS
+from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.tracking.operations.running import running_operations
-from service.tracking.products import MatrixState, MeasureState
+from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode
 from service.wire import DitherStop, Loop, LoopRequest

@@ -7,10 +7,10 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.loop import separation_deg
 from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode, TrackerState
+from service.tracking.validity import separation_deg
 from service.wire import Pointing
 from tests.states import changed
 from tests.unit.tracking.situations import (

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 from service.estimation.openloop import WideCaptureEstimate
 from service.tracking import events as ev
-from service.tracking.products import MatrixState, MeasureState, NoisyFinding
+from service.tracking.operation_records import MeasureState, NoisyFinding
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import (
     DitherRequest,

@@ -11,8 +11,8 @@ from service.estimation.windows import RefusalKind, WindowRefused
 from service.model.misregistration import Misregistration
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
 from service.tracking.dither_request import lock_in_plan
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import PATIENCE_S
 from service.tracking.operations.acquisition_stages import (
     MAX_ATTEMPTS,

@@ -5,7 +5,7 @@ import pytest
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
+from service.tracking.operation_records import AcquisitionStage
 from service.tracking.operations.acquisition import ENOUGH_WINDOWS
 from service.tracking.operations.acquisition_stages import MISSES_DESPITE
 from service.tracking.products import MatrixState

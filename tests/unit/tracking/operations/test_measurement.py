@@ -6,8 +6,9 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.operation_records import MeasureState
 from service.tracking.operations.measurement import LONGEST_S, OVERDUE_S
-from service.tracking.products import MatrixState, MeasureState
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest, MeasureRequest, Pattern
 from tests.states import changed

@@ -8,8 +8,9 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
+from service.tracking.operation_records import MeasureState, NoisyFinding
 from service.tracking.operations.noisy_measurement import FREE_WITHIN_S
-from service.tracking.products import MeasureState, ModeSet, NoisyFinding
+from service.tracking.products import ModeSet
 from service.wire import DitherKind, DitherRequest, DitherStop
 from tests.unit.tracking.situations import (
     ALPHA,

@@ -4,8 +4,8 @@ import pytest
 
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import Acquisition, AcquisitionStage
 from service.tracking.alarms import Alarm
+from service.tracking.operation_records import Acquisition, AcquisitionStage
 from service.tracking.operations.running import CurrentOperation, ServiceState, operating
 from service.tracking.state import Mode
 from service.wire import Loop

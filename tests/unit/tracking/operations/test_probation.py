@@ -7,7 +7,8 @@ import pytest
 from service.estimation.comparison import ProbationFinding, Verdict
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.products import MatrixState, ProbationState
+from service.tracking.operation_records import ProbationState
+from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from tests.states import changed
 from tests.unit.tracking.situations import Story, acknowledged, moved, rtc, verdict

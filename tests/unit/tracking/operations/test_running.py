@@ -9,9 +9,9 @@ import pytest
 from service.errors import CommandError, UnknownIdError
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking.acquisition_state import AcquisitionStage
+from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.tracking.operations.running import running_operations
-from service.tracking.products import MatrixState, MeasureState, ModeSet
+from service.tracking.products import MatrixState, ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind, DitherRequest, DitherStatus, Pattern
 from tests.unit.tracking.situations import POLICY, Story

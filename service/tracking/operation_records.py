@@ -1,0 +1,473 @@
+"""What may have the loop or the mirror for itself, as records: how far each has come."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation.comparison import ProbationFinding
+from service.model.misregistration import Misregistration
+from service.wire import MatrixStrokes, MeasuredManifest, Pattern, Status
+
+
+class AcquisitionStage(StrEnum):
+    """How far an acquisition has come."""
+
+    IDLE = "idle"
+    """None has been asked for, or needed."""
+
+    OPENING = "opening"
+    """The RTC has been asked to open the loop."""
+
+    COARSE = "coarse"
+    """Smooth modes are dithered with the loop open, to find α from afar."""
+
+    CONFIRMING = "confirming"
+    """Other modes are dithered, which must say the same."""
+
+    PARTIAL = "partial"
+    """A reconstructor for a part of the modes is made, judged and sent; then the loop closes."""
+
+    WIDENING = "widening"
+    """The loop is closed: α sharpens, and more modes are controlled."""
+
+    TRACKING = "tracking"
+    """Done: α is known and the loop closed on it."""
+
+    FAILED = "failed"
+    """Given up; the text says why, and what to do."""
+
+    ABORTED = "aborted"
+    """An operator ended it."""
+
+    INTERRUPTED = "interrupted"
+    """The service ended, or the RTC vanished, in the middle of it; the text says what is done."""
+
+
+UNDER_WAY = frozenset(
+    {
+        AcquisitionStage.OPENING,
+        AcquisitionStage.COARSE,
+        AcquisitionStage.CONFIRMING,
+        AcquisitionStage.PARTIAL,
+        AcquisitionStage.WIDENING,
+    }
+)
+"""Stages in which the loop is the acquisition's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopFound:
+    """The loop before anything was done to it."""
+
+    closed: bool
+    gains: tuple[float, ...]
+    """One per mode of the basis, as it will be closed again."""
+
+    n_controlled: int
+    """Modes to come back to."""
+
+    leak: float
+    """Per frame."""
+
+    held: bool
+    """Whether it was closed and no alarm said that it did not hold."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interruption:
+    """What an acquisition was at when it was cut off: the service ended, or the RTC vanished."""
+
+    doing: str
+    """Stage, and the text of it."""
+
+    session: str | None
+    """The RTC's; None: none was there. An open loop in the same session is the one it left."""
+
+    cause: str = "the service ended"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Acquisition:
+    """One acquisition, under way or over."""
+
+    stage: AcquisitionStage = AcquisitionStage.IDLE
+    text: str = "none was needed"
+    """What it does, or how it ended and what to do."""
+
+    started_ns_utc: int = 0
+    since_ns_utc: int = 0
+    """Since when it is in this stage."""
+
+    commanded: bool = False
+    """An operator asked for it: that allows its publications in every mode."""
+
+    attempt: int = 0
+    """How often the loop has been opened for it."""
+
+    misses: int = 0
+    """Windows in a row, of this stage or before a start, that led nowhere."""
+
+    found: LoopFound | None = None
+    """None: idle."""
+
+    alpha: Misregistration | None = None
+    """Found with the loop open; None: not yet."""
+
+    covariance: NDArray[np.float64] | None = None
+    """``(4, 4)`` of it, the open loop's model error included, numeric units."""
+
+    n_modes: int = 0
+    """Modes of the reconstructor that is made, sent or in use."""
+
+    max_modes: int | None = None
+    """More than so many were refused by the gate, or have slipped; None: not yet."""
+
+    command: str | None = None
+    """Id of the change of the loop that was asked for in this stage; None: none was."""
+
+    matrix: str | None = None
+    """Id of the reconstructor sent for it last; None: none was in this attempt."""
+
+    applied: str | None = None
+    """Id of the last one that was applied with the loop closed."""
+
+    sent: bool = False
+    """Whether anything was sent: the RTC's own matrix is then no longer in use."""
+
+    windows: int = 0
+    """Windows that had been accepted when the reconstructor in use was applied, or it was over."""
+
+    held_off: bool = False
+    """An operator ended it: none begins by itself until windows agree in a closed loop, an operator
+    sets the mode, or asks for one."""
+
+    interruption: Interruption | None = None
+    """How it was left by the service before this one, or at a gap in the link; None: it was not."""
+
+    cause: str = ""
+    """Id of the order or event that has begun it; empty: the service before this one did."""
+
+    @property
+    def uses_wide_capture(self) -> bool:
+        """Whether windows are of the open loop, from which α is found."""
+        return self.stage in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it is neither over nor idle."""
+        return self.stage in UNDER_WAY
+
+
+class ProbationState(StrEnum):
+    """How far the probation of a matrix is that has been applied."""
+
+    RUNNING = "running"
+    """Telemetry is being compared with that of the matrix before."""
+
+    OVERDUE = "overdue"
+    """Telemetry is late: the verdict counts when it comes, and nothing waits for it."""
+
+    PASSED = "passed"
+    """The loop is as good as before, or better."""
+
+    ROLLING_BACK = "rolling-back"
+    """It is worse: the matrix before is on its way back."""
+
+    WATCHED = "watched"
+    """It was worse; the matrix before is in use again, and the loop is looked at with it."""
+
+    ROLLED_BACK = "rolled-back"
+    """It was worse; the matrix before is in use again."""
+
+    KEPT = "kept"
+    """It is worse, and the service could not go back; the text says why."""
+
+    OPENING = "opening"
+    """The loop was lost with it, and going back was no help or no way: it is asked to open."""
+
+    OPENED = "opened"
+    """The loop opened when it was asked to."""
+
+    NOT_JUDGED = "not-judged"
+    """There was nothing to compare with; the text says why."""
+
+
+_ON_PROBATION = (ProbationState.RUNNING, ProbationState.ROLLING_BACK, ProbationState.WATCHED)
+"""Tuples: looked at hundreds of times a second, and faster than sets."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Probation:
+    """The matrix applied last, on probation: against the one before."""
+
+    id: str
+    """Of the one on probation."""
+
+    before: str
+    """Of the one that was in use before."""
+
+    reference: str
+    """Of the one whose telemetry it is compared with: the one before, or the last that was not
+    found worse."""
+
+    state: ProbationState
+    text: str
+    """What is found or done, or why nothing is."""
+
+    since_ns_utc: int
+    until_ns_utc: int
+    """The verdict comes by then, where telemetry does."""
+
+    loop: Status | None = None
+    """As it was with the matrix before; None: it was not known."""
+
+    finding: ProbationFinding | None = None
+    """The numbers that were compared; None: not yet, or there are none."""
+
+    worse: str = ""
+    """What it did to the loop, where it made that worse; empty: it did not."""
+
+    rollback: str | None = None
+    """Id under which the matrix before was sent again; None: it was not."""
+
+    opens: bool = False
+    """Whether the loop may be asked to open where it is lost and going back does not help."""
+
+    @property
+    def judges(self) -> str | None:
+        """Id of the matrix on which a verdict is waited for; None: on none."""
+        if self.state is ProbationState.WATCHED:
+            return self.rollback
+        waits = self.state in {ProbationState.RUNNING, ProbationState.OVERDUE}
+        return self.id if waits else None
+
+    def awaits(self, before: str, after: str) -> bool:
+        """Return whether a verdict on these two is waited for."""
+        return (before, after) == (self.reference, self.judges)
+
+    @property
+    def under_way(self) -> bool:
+        """Whether nothing else is to be sent meanwhile."""
+        return self.state in _ON_PROBATION
+
+
+class MeasureState(StrEnum):
+    """Where a measurement of an interaction matrix is, by the RTC alone or by random signs."""
+
+    WAITING = "waiting"
+    """The service's own dither has to end first."""
+
+    ASKED = "asked"
+    """The RTC has not answered yet."""
+
+    RUNNING = "running"
+    """The RTC measures, or the random signs play and are summed."""
+
+    FINISHING = "finishing"
+    """The random signs are over; the matrix is being fitted and archived."""
+
+    REFUSED = "refused"
+    """The RTC would not; the reason is the RTC's."""
+
+    FAILED = "failed"
+    """There is no matrix; the reason says why."""
+
+    STORED = "stored"
+    """The matrix is in the archive."""
+
+    GIVEN_UP = "given-up"
+    """An operator waits for it no longer; the RTC may go on, what it sends is ignored."""
+
+
+_MEASURING = (
+    MeasureState.RUNNING,
+    MeasureState.WAITING,
+    MeasureState.ASKED,
+    MeasureState.FINISHING,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NoisyFinding:
+    """What came of random signs on all modes: a noisy interaction matrix."""
+
+    n_slopes: int
+    n_frames: int
+    """Frames that entered it."""
+
+    n_missing: int
+    """Frames of its windows that never came."""
+
+    snr: float
+    """RMS signal of an element over its noise: about 1 on a bright star, less on a faint one."""
+
+    alpha: Misregistration | None
+    """The registration fitted to it; None: none could be."""
+
+    covariance: NDArray[np.float64] | None
+    """``(4, 4)`` of that, numeric units, from the data alone; None as above."""
+
+    optical_gain: float | None
+    """Mean gain of the modes against the model; None as above."""
+
+    misfit: float | None
+    """Residual power over what noise explains; None as above."""
+
+    cm_id: str | None
+    """The reconstructor in use at its end."""
+
+    session: str
+    created_ns_utc: int
+    """End of its last frame, the RTC's clock."""
+
+    sha256: str
+    """Of the matrix as C-ordered little-endian float32."""
+
+    @property
+    def sigma(self) -> NDArray[np.float64] | None:
+        """``(4,)`` 1 σ of the registration, numeric units, from the data alone; None as above."""
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasurementRecord(MatrixStrokes):
+    """All that is known of one measured interaction matrix but its numbers.
+
+    Nothing of it can become a reconstructor: it is a measurement to fit a model to.
+    """
+
+    state: MeasureState
+    pattern: Pattern | None
+    """None: random signs on all modes at once, loop closed, summed by the service itself."""
+
+    n_average: int | None = None
+    """Repetitions averaged; None: the pattern has none."""
+
+    window_s: float | None = None
+    """Of the windows that random signs are summed from."""
+
+    seed: int | None = None
+    """Of random signs, whose dither has the id of the matrix."""
+
+    asked_ns_utc: int | None = None
+    """When the service asked for it; None: it did not."""
+
+    start_seq: int | None = None
+    """First frame that contained a stroke; None: not known."""
+
+    closed_before: bool = False
+    """Whether the loop was closed when it was asked for."""
+
+    overdue_since_ns_utc: int | None = None
+    """Since when everything looks as if it were over, but no matrix has come."""
+
+    reason: str = ""
+    """Why there is no matrix, or what is missing."""
+
+    created_ns_utc: int | None = None
+    """When it was measured, by the RTC's clock; None: it was not, or not yet."""
+
+    n_slopes: int | None = None
+    double_pass: bool | None = None
+    """Whether the light saw the mirror twice: the matrix is then twice as large."""
+
+    session: str | None = None
+    """The RTC's session."""
+
+    basis_id: str | None = None
+    config_id: str | None = None
+    sha256: str = ""
+    """Of the matrix as it travels, 64 lower-case hex digits."""
+
+    finding: NoisyFinding | None = None
+    """What came of random signs; None: not finished, or another pattern."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order that has asked for it."""
+
+    @classmethod
+    def sent(cls, manifest: MeasuredManifest) -> MeasurementRecord:
+        """Return what is known of a matrix the RTC sends, or of why there is none."""
+        there = manifest.reason is None
+        return cls(
+            id=manifest.id,
+            state=MeasureState.STORED if there else MeasureState.FAILED,
+            pattern=manifest.pattern,
+            modes=manifest.modes,
+            amplitude_m=manifest.amplitude_m,
+            n_average=None if manifest.pattern is Pattern.SINE else manifest.n_average,
+            reason=manifest.reason or "",
+            created_ns_utc=manifest.created_ns,
+            n_slopes=manifest.layout.shape[0],
+            double_pass=manifest.double_pass,
+            session=manifest.session,
+            basis_id=manifest.basis_id,
+            config_id=manifest.config_id,
+            sha256=manifest.layout.sha256,
+        )
+
+    @property
+    def opens_loop(self) -> bool:
+        """Whether the loop is open while it is measured."""
+        return self.pattern not in {None, Pattern.SINE}
+
+    @property
+    def n_modes(self) -> int:
+        """Columns."""
+        return len(self.modes)
+
+    @property
+    def total_m(self) -> float:
+        """RMS of all modes together, metres OPD."""
+        return float(np.sqrt(np.sum(np.square(self.amplitude_m))))
+
+    @property
+    def each_m(self) -> float:
+        """RMS of each mode, metres OPD, where all have the same."""
+        return float(self.total_m / np.sqrt(max(len(self.amplitude_m), 1)))
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the service waits for the matrix, or works on it."""
+        return self.state in _MEASURING
+
+
+class CommandState(StrEnum):
+    """What has become of a command to the RTC."""
+
+    ASKED = "asked"
+    """The RTC has not answered yet."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    """The RTC would not; the reason is the RTC's."""
+
+    FAILED = "failed"
+    """No answer: whether it was carried out is unknown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopCommand:
+    """A change of the loop, or a gain ramp, asked of the RTC."""
+
+    id: str
+    text: str
+    """What was asked for."""
+
+    state: CommandState
+    asked_ns_utc: int
+    lasts_s: float = 0.0
+    """How long the RTC is busy with it, at its nominal rate; 0: it changes at once."""
+
+    until_ns_utc: int = 0
+    """Until when it is, once it has accepted; 0: not known."""
+
+    reason: str = ""
+    """Why it was refused, or has failed."""
+
+    cause: str = field(default="", compare=False)
+    """Id of the order or event that has asked for it."""

@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
 from pyrcal.offline.methods import SAME, land
+from pyrcal.offline.models import FitModels
 from service.config import load_instrument
-from service.estimation.models import FitModels
 from service.estimation.reference import Reference, Target, target_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration

@@ -6,20 +6,21 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
 from pyrcal.terminal import show_progress
 from service.archive import Archive
 from service.archive.nights import FOREVER_NS, HOUR_NS, MAX_DOWNSAMPLED
-from service.archive.retention import Item, due, items, remove, verify
+from service.archive.retention import Item, due, items, remove
 from service.archive.serialisation import to_json
 from service.config import Settings, load_settings
 from service.config.policy import keeping_of
-from service.errors import ConfigurationError, UnknownIdError, say, shown
+from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
+from service.tracking.products import MatrixState
 
 DONE, DAMAGED = 0, 1
 
@@ -189,3 +190,40 @@ def _saved(archive: Archive) -> tuple[str, ...]:
         return ()
     acquiring = None if saved.acquisition is None else saved.acquisition.matrix
     return tuple(one for one in (saved.in_use, acquiring) if one is not None)
+
+
+_IN_USE = "the RTC has it, and goes on; it could not be sent again to one that restarts"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Damage:
+    """A product that is not what was stored."""
+
+    id: str
+    kind: str
+    path: str
+    found: str
+    means: str
+    do: str
+
+
+def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]:
+    """Read every product and yield what is wrong with it, or None where it is as it was stored."""
+    of_kind = {store.noun: store for store in archive.stores}
+    for item in which:
+        store = of_kind[item.kind]
+        try:
+            store.matrix(item.id)
+        except ArchiveError as error:
+            path = str(store.path_of(item.id))
+            yield Damage(
+                id=item.id,
+                kind=item.kind,
+                path=path,
+                found=str(error).removeprefix(f"{path}: "),
+                means=_IN_USE if item.state == MatrixState.APPLIED else store.lost_with_it,
+                do="put it back from a backup; else move it aside, and have another made or "
+                "measured",
+            )
+        else:
+            yield None

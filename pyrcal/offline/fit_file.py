@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.recorded import FLUX_FRAME, Recorded, read_recorded
 from pyrcal.offline.report import FitReport
 from service.errors import MatrixError
 from service.estimation.reference import Reference
-from service.files.container import FLUX_FRAME, Recorded, read_recorded
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.sensors.registry import kind_of
 

@@ -15,11 +15,11 @@ from typing import Any
 from pyrcal.offline.figures import numbers
 from pyrcal.offline.fit_file import fit_file
 from pyrcal.offline.matrix import FitOptions
+from pyrcal.offline.recorded import check_sealed
 from pyrcal.offline.report import document
 from service.config import load_instrument, packaged_instrument
 from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files import parse_alpha, parse_modes
-from service.files.container import check_sealed
 from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, STAGES, UPLOAD, FitRequest
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.kinds import Method

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.methods import Settled, spread
+from pyrcal.offline.models import BETTER, CHEAP, FitModels, Optic, Other
 from pyrcal.offline.pupil_checks import Few, other_pupils
+from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import Uncertainty
-from service.estimation.models import BETTER, CHEAP, FitModels, Optic, Other
-from service.estimation.solver import refine
 from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]

@@ -26,9 +26,12 @@ from pyrcal.offline.methods import (
     settle,
     settle_at,
 )
+from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
 from pyrcal.offline.pupil_checks import Few, left_by_light
+from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
+from pyrcal.offline.solver import nuisances_of
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
@@ -37,10 +40,8 @@ from pyrcal.offline.uncertainty import (
 )
 from pyrcal.offline.verdict import FitFindings, judged
 from service.errors import ModelError
-from service.estimation.models import FitModels
 from service.estimation.orientation import DOUBTFUL, MIN_CORRELATION, find_orientation, overruled
-from service.estimation.reference import Reference, Target, checked, target_of
-from service.estimation.solver import nuisances_of
+from service.estimation.reference import Reference, Target, target_of
 from service.model.instrument import Instrument
 from service.model.kinds import Method, Normalisation, SlopeOrder
 from service.model.misregistration import Determination, Misregistration

@@ -30,18 +30,15 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.models import FitModels, Optic
+from pyrcal.offline.models import FitModels, Optic
+from pyrcal.offline.solver import LONGEST_OPTIC_STEP, Nuisances, Solution, refine
 from service.estimation.reference import Target
 from service.estimation.solver import (
     LIMIT,
-    LONGEST_OPTIC_STEP,
     SETTLED,
     Approach,
     Columns,
-    Nuisances,
-    Solution,
     approach,
-    refine,
     vertex,
     within_limits,
 )

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.methods import Settled, spread
-from service.estimation.models import BETTER, CHEAP, FAR_BETTER, FitModels, Other
-from service.estimation.solver import nuisances_of
+from pyrcal.offline.models import BETTER, CHEAP, FAR_BETTER, FitModels, Other
+from pyrcal.offline.solver import nuisances_of
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 

@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.instrument_checks import COUPLING_KEY
 from pyrcal.offline.light import read_light
+from pyrcal.offline.recorded import file_sha256
 from pyrcal.offline.report import (
     KnownFit,
     Provenance,
@@ -31,7 +32,6 @@ from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
-from service.files.container import file_sha256
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import Basis, Gaussian, ModalBasis, modal_basis

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.solver import Solution
 from pyrcal.offline.verdict import MOST_STRUCTURE, FitFindings, factor_of_passes
 from service.estimation.reference import Target
-from service.estimation.solver import Solution
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
 from pyrcal.offline.methods import Landing
+from pyrcal.offline.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
 from pyrcal.offline.uncertainty import Uncertainty
-from service.estimation.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 
 Array = NDArray[np.float64]

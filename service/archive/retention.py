@@ -13,15 +13,11 @@ from service.archive.archive import Archive
 from service.archive.index import AuditEntry
 from service.archive.nights import DAY_NS
 from service.archive.store import Folder
-from service.errors import ArchiveError
-from service.tracking.products import MatrixState
 
 NEWEST_KEPT = 10
 """Of each kind, whatever their age: those to go back to."""
 
 GIGABYTE = 1_000_000_000
-
-_IN_USE = "the RTC has it, and goes on; it could not be sent again to one that restarts"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,18 +55,6 @@ class Item:
 
     kept_because: str = ""
     """Why it is kept for ever; empty: it goes when it is old, or there is too much."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Damage:
-    """A product that is not what was stored."""
-
-    id: str
-    kind: str
-    path: str
-    found: str
-    means: str
-    do: str
 
 
 def items(archive: Archive, in_use: Collection[str] = ()) -> tuple[Item, ...]:
@@ -161,28 +145,6 @@ def remove(archive: Archive, item: Item, why: str) -> AuditEntry | None:
         name="archive.removed",
         text=f"{item.kind} {item.id}: numbers removed, {why}",
     )
-
-
-def verify(archive: Archive, which: Collection[Item]) -> Iterator[Damage | None]:
-    """Read every product and yield what is wrong with it, or None where it is as it was stored."""
-    of_kind = {store.noun: store for store in archive.stores}
-    for item in which:
-        store = of_kind[item.kind]
-        try:
-            store.matrix(item.id)
-        except ArchiveError as error:
-            path = str(store.path_of(item.id))
-            yield Damage(
-                id=item.id,
-                kind=item.kind,
-                path=path,
-                found=str(error).removeprefix(f"{path}: "),
-                means=_IN_USE if item.state == MatrixState.APPLIED else store.lost_with_it,
-                do="put it back from a backup; else move it aside, and have another made or "
-                "measured",
-            )
-        else:
-            yield None
 
 
 def low_on_space(directory: Path, retention: RetentionPolicy, *, low: bool) -> str | None:

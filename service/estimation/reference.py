@@ -11,22 +11,10 @@ from numpy.typing import NDArray
 from service.errors import MatrixError
 from service.estimation.solver import Columns
 from service.model.instrument import Instrument
-from service.model.misregistration import unit_like
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures
-from service.model.slopes import likely_kind, to_conventions
+from service.model.slopes import to_conventions
 
 Array = NDArray[Any]
-
-DEAD = 1e-4
-"""A column with less than this share of the median column's size is no measurement."""
-
-PLAUSIBLE = 1e-4
-"""RMS slope per metre of OPD times the wavelength is some units; outside this share of 1 to its
-reciprocal the unit is another one: nanometres and micrometres are 1e-9 and 1e-6."""
-
-
-_UNIT_DECADES = 1.5
-"""Powers of ten around a unit that are still recognised as it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,119 +47,6 @@ class Reference:
     def passes(self) -> int:
         """Number of times the light met the mirror."""
         return 2 if self.double_pass else 1
-
-
-def checked(
-    reference: Reference,
-    *,
-    n_slopes: int,
-    n_modes: int,
-    wavelength_m: float,
-    stroke_known: bool = True,
-) -> Reference:
-    """Return the usable columns of a reference for an instrument; the others are named in it.
-
-    Parameters
-    ----------
-    reference
-        As it was read.
-    n_slopes, n_modes
-        Of the instrument.
-    wavelength_m
-        Of the sensor: it sets how large slopes per metre can be.
-    stroke_known
-        Whether the size of the columns means anything.
-
-    Raises
-    ------
-    MatrixError
-        If the shape is another instrument's or transposed, if nothing usable is left, or if the
-        unit is not the metre.
-    """
-    _check_shape(reference, n_slopes, n_modes)
-    kept, left_out = _usable(reference)
-    matrix = np.asarray(reference.matrix, dtype=np.float64)[:, kept]
-    usable = replace(
-        reference,
-        matrix=matrix,
-        modes=np.asarray(reference.columns)[kept],
-        noise=None if reference.noise is None else np.asarray(reference.noise)[kept],
-        left_out=left_out,
-    )
-    if stroke_known:
-        _check_unit(matrix, wavelength_m)
-    return usable
-
-
-def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:
-    matrix, columns = reference.matrix, reference.columns
-    expected = f"({n_slopes} slopes, up to {n_modes} modes)"
-    if matrix.ndim != 2:
-        raise MatrixError(f"reference: found {matrix.ndim} axes; expected 2, {expected}")
-    if matrix.shape[0] != n_slopes:
-        turned = matrix.shape[1] == n_slopes
-        hint = ": it is transposed, or a reconstructor" if turned else ""
-        expected += likely_kind(matrix.shape[0], n_slopes)
-        raise MatrixError(f"reference: found shape {matrix.shape}{hint}; expected {expected}")
-    if columns.shape != (matrix.shape[1],):
-        raise MatrixError(
-            f"reference: found {len(columns)} mode numbers for {matrix.shape[1]} columns"
-        )
-    if len(np.unique(columns)) != len(columns):
-        raise MatrixError("reference: found a mode twice; expected every mode once")
-    if columns.size and (columns.min() < 0 or columns.max() >= n_modes):
-        raise MatrixError(
-            f"reference: found modes {columns.min()} to {columns.max()}; the instrument's basis "
-            f"has 0 to {n_modes - 1}"
-        )
-    if reference.noise is not None and reference.noise.shape != (matrix.shape[1],):
-        raise MatrixError(
-            f"reference: found noise of shape {reference.noise.shape}; expected "
-            f"({matrix.shape[1]},), one number for each column"
-        )
-
-
-def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    """Return which columns are measurements, and a sentence for each kind that is not."""
-    finite = np.isfinite(reference.matrix).all(axis=0)
-    size = np.linalg.norm(np.where(finite, reference.matrix, 0.0), axis=0)
-    typical = float(np.median(size[finite])) if finite.any() else 0.0
-    alive = size > DEAD * typical
-    left_out = []
-    if not finite.all():
-        left_out.append(f"not finite: {_listed(reference.columns[~finite])}")
-    if not alive[finite].all():
-        left_out.append(f"dead (no response): {_listed(reference.columns[finite & ~alive])}")
-    kept = finite & alive
-    if not kept.any():
-        raise MatrixError(
-            f"reference: no usable column among {len(kept)} ({'; '.join(left_out) or 'empty'}); "
-            "expected finite slopes that answer the mirror"
-        )
-    return kept, tuple(left_out)
-
-
-def _listed(modes: NDArray[np.intp]) -> str:
-    named = ", ".join(str(mode) for mode in modes[:8])
-    more = f" and {len(modes) - 8} more" if len(modes) > 8 else ""
-    return f"mode{'s' if len(modes) > 1 else ''} {named}{more}"
-
-
-def _check_unit(matrix: Array, wavelength_m: float) -> None:
-    """Refuse a matrix per nanometre or micrometre.
-
-    Tilting a wavefront by one wavelength RMS moves slopes by some units, whatever the instrument.
-    """
-    typical = float(np.median(np.sqrt(np.mean(matrix**2, axis=0)))) * wavelength_m
-    if PLAUSIBLE < typical < 1.0 / PLAUSIBLE:
-        return
-    unit = unit_like(1.0 / typical, _UNIT_DECADES).removesuffix("s")
-    hint = f": it looks like slope per {unit}" if unit else ""
-    raise MatrixError(
-        f"reference: found {typical / wavelength_m:.3g} as the typical slope per metre{hint}; "
-        f"expected about {1.0 / wavelength_m:.1g}. Multiply the matrix, or say stroke = "
-        '"unknown" in the instrument file'
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

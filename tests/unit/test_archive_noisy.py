@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.offline.recorded import read_recorded
 from service.archive import Archive
 from service.archive.products import NoisyNumbers
 from service.archive.serialisation import from_json, to_json
 from service.errors import ArchiveError, UnknownIdError, WireError
-from service.files.container import read_recorded
 from service.model.misregistration import Misregistration
 from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.wire import checksum

@@ -5,9 +5,10 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.offline.recorded import check_sealed
 from service.errors import MatrixError
 from service.files import container
-from service.files.container import check_sealed, opened
+from service.files.container import opened
 
 VALUES = np.arange(6.0).reshape(2, 3)
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.models import Optic
 from service.config.mirrors import grid
 from service.errors import ModelError
-from service.estimation.models import Optic
 from service.estimation.reference import Reference
 from service.model.described import InfluenceShape
 from service.model.instrument import Instrument, Mirror

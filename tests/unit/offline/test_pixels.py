@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal.offline.models import FitModels
+from pyrcal.offline.solver import nuisances_of
 from service.errors import MatrixError
-from service.estimation.models import FitModels
 from service.estimation.orientation import Pose, find_orientation
 from service.estimation.reference import Reference
 from service.estimation.slope_convention import of_answer
-from service.estimation.solver import nuisances_of
 from service.model.kinds import SignalKind, SlopeOrder
 from service.model.pupil import valid_subapertures
 from service.model.slopes import Orientation, SlopeRecipe, slopes_of

@@ -8,9 +8,9 @@ import pytest
 
 from pyrcal.offline.fit_file import fit_file, reference_of
 from pyrcal.offline.matrix import FitOptions
+from pyrcal.offline.recorded import Recorded, read_recorded
 from service.config import load_instrument
 from service.errors import MatrixError
-from service.files.container import Recorded, read_recorded
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.sensors.pyramid.description import FrameWindows

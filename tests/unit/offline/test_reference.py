@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from pyrcal.offline.reference import checked
 from service.errors import MatrixError
-from service.estimation.reference import Reference, checked
+from service.estimation.reference import Reference
 
 N_SLOPES, N_MODES = 24, 10
 

@@ -4,9 +4,9 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal.offline.recorded import read_recorded
 from service.archive import Archive
 from service.errors import MatrixError
-from service.files.container import read_recorded
 from service.tracking.operation_records import MeasurementRecord, MeasureState
 from service.wire import Pattern, checksum
 

@@ -1,0 +1,217 @@
+"""A measured interaction matrix in an HDF5, FITS or NumPy file, with what the file says of it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import MatrixError
+from service.files.container import DATASET, Container, StoredArray, opened
+
+Array = NDArray[np.float64]
+
+
+def check_sealed(path: Path) -> None:
+    """Refuse an HDF5 file that reaches beyond itself; any other file has no way to.
+
+    Raises
+    ------
+    MatrixError
+        If it holds a link to another file, a virtual dataset, or one whose data lie outside; or is
+        damaged.
+    """
+    if not h5py.is_hdf5(path):
+        return
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            seen = {h5py.h5o.get_info(file.id).addr}
+            groups = [file["/"]]
+            while groups:
+                groups += _sealed(groups.pop(), path, seen)
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
+
+
+def _sealed(group: h5py.Group, path: Path, seen: set[int]) -> list[h5py.Group]:
+    """Check what is in a group, following no link; return the groups not ``seen`` yet."""
+    found = []
+    for name in group:
+        link = group.get(name, getlink=True)
+        item = group[name] if isinstance(link, h5py.HardLink) else link
+        beyond = _beyond(item)
+        if beyond is not None:
+            where = f"{path}:{group.name.rstrip('/')}/{name}"
+            raise MatrixError(f"{where}: found {beyond}, expected all data in the file itself")
+        if isinstance(item, h5py.Group):
+            address = h5py.h5o.get_info(item.id).addr
+            if address not in seen:
+                seen.add(address)
+                found.append(item)
+    return found
+
+
+def _beyond(item: object) -> str | None:
+    """Return how an object, or a link, reaches beyond its file; None: it does not."""
+    if isinstance(item, h5py.ExternalLink):
+        return f"a link to another file, {item.filename}"
+    if isinstance(item, h5py.Dataset) and item.is_virtual:
+        files = sorted({source.file_name for source in item.virtual_sources()})
+        return f"a virtual dataset of other files, {', '.join(files)}"
+    if isinstance(item, h5py.Dataset) and item.external:
+        return f"data outside, in {item.external[0][0]}"
+    return None
+
+
+FLUX_FRAME = "flux_frame"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Recorded:
+    """The arrays as read; nothing is turned, scaled or left out."""
+
+    values: Array
+    """``(n_slopes, n_modes)`` in the RTC's own order, or ``(n_modes, ny, nx)`` detector frames."""
+
+    modes: NDArray[np.intp] | None
+    """``(n_modes,)`` basis index of each column; None: the file does not say."""
+
+    noise: Array | None
+    """``(n_modes,)`` 1 σ of an element of each column; None: the file does not say."""
+
+    double_pass: bool | None
+    """Whether the light saw the mirror twice; None: the file does not say."""
+
+    flux_frame: Array | None
+    """``(ny, nx)`` detector frame at rest; None: the file has none."""
+
+    where: str
+    """File and array, for messages."""
+
+    sha256: str
+    """Of the whole file, 64 lower-case hex digits."""
+
+
+def read_recorded(path: Path, dataset: str | None = None) -> Recorded:
+    """Read a measured matrix from an HDF5, FITS or NumPy file.
+
+    Beside the matrix, in the same HDF5 group or as further FITS extensions, ``modes``
+    (``(n_modes,)``, basis indices), ``noise`` (``(n_modes,)``) and ``flux_frame`` are taken where
+    they are; ``modes`` and ``double_pass`` may also be attributes of an HDF5 file, ``DBLPASS`` a
+    keyword of a FITS file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    dataset
+        Name of the array; None: ``interaction_matrix``, or the only one of a FITS or NumPy file.
+
+    Raises
+    ------
+    MatrixError
+        If the file or the array cannot be used; where the array is missing, what is there.
+    """
+    with opened(path) as container:
+        stored = _matrix(container, dataset)
+        if len(stored.shape) not in {2, 3}:
+            raise MatrixError(
+                f"{stored.where}: found shape {stored.shape}, expected (n_slopes, n_modes), or "
+                '(n_modes, ny, nx) where wfs.input = "frames"'
+            )
+        group = (dataset or DATASET).strip("/").rpartition("/")[0]
+        n_modes = stored.shape[1 if len(stored.shape) == 2 else 0]
+
+        def beside(name: str) -> StoredArray | None:
+            return container.find(f"{group}/{name}")
+
+        return Recorded(
+            values=stored.numbers(),
+            modes=_modes(container, beside("modes"), n_modes),
+            noise=_noise(beside("noise"), n_modes),
+            double_pass=_double_pass(container),
+            flux_frame=_numbers(beside(FLUX_FRAME)),
+            where=stored.where,
+            sha256=file_sha256(path),
+        )
+
+
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes as hex.
+
+    Raises
+    ------
+    MatrixError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _matrix(container: Container, dataset: str | None) -> StoredArray:
+    found = container.find(dataset or DATASET)
+    if found is None and dataset is None and container.is_fits and len(container.arrays) == 1:
+        (found,) = container.arrays.values()
+    if found is None:
+        raise MatrixError(
+            f"{container.path}: no dataset {dataset or DATASET}; it holds {container.listing()}; "
+            "name one of them with --dataset"
+        )
+    return found
+
+
+def _modes(
+    container: Container, stored: StoredArray | None, n_modes: int
+) -> NDArray[np.intp] | None:
+    given: Any = container.facts.get("modes")
+    where = f"{container.path}: modes"
+    if stored is not None and len(stored.shape) == 1:  # a cube of this name is the modes' shapes
+        given = stored.numbers()
+    if given is None:
+        return None
+    values = np.asarray(given)
+    if values.shape != (n_modes,):
+        raise MatrixError(
+            f"{where}: found shape {values.shape}, expected one for each of {n_modes}"
+        )
+    if values.dtype.kind not in "iuf" or not np.all((values >= 0) & (values == np.round(values))):
+        raise MatrixError(f"{where}: found {values}, expected 0-based indices of the basis")
+    indices = values.astype(np.intp)
+    kinds, times = np.unique(indices, return_counts=True)
+    if np.any(times > 1):
+        twice = kinds[times > 1][0]
+        raise MatrixError(f"{where}: found mode {twice} more than once, expected each once")
+    return indices
+
+
+def _noise(stored: StoredArray | None, n_modes: int) -> Array | None:
+    values = _numbers(stored)
+    if stored is None or values is None:
+        return None
+    if values.shape != (n_modes,) or not np.all(values > 0.0):
+        raise MatrixError(
+            f"{stored.where}: found shape {values.shape}, least value {np.min(values):g}; "
+            f"expected the positive 1 sigma of an element for each of {n_modes} columns"
+        )
+    return values
+
+
+def _double_pass(container: Container) -> bool | None:
+    given = container.facts.get("double_pass", container.facts.get("dblpass"))
+    if given is None:
+        return None
+    if isinstance(given, bool | np.bool_) or given in {0, 1}:
+        return bool(given)
+    raise MatrixError(f"{container.path}: double_pass: found {given!r}, expected true or false")
+
+
+def _numbers(stored: StoredArray | None) -> Array | None:
+    return None if stored is None else stored.numbers()

@@ -141,7 +141,8 @@ class DitherWatch(Detector):
             return self.begin(loop)
         if loop.dither is None or self.monitor is None:
             return self
-        return replace(self, monitor=with_expected(self.monitor, loop.dither))
+        same = loop.dither.own == self.monitor.asked.own
+        return self if same else replace(self, monitor=DitherMonitor(asked=loop.dither))
 
     @override
     def update(self, frames: FrameContext) -> DitherWatch:
@@ -172,11 +173,6 @@ def measure_block(
         monitor, new = _added(monitor, block.rows(start, end))
         start, found = end, new or found
     return monitor, found
-
-
-def with_expected(monitor: DitherMonitor, asked: ExpectedDither) -> DitherMonitor:
-    """Return the meter of the same dither whose modes have come into the loop, or left it."""
-    return monitor if asked.own == monitor.asked.own else DitherMonitor(asked=asked)
 
 
 def _enough(asked: ExpectedDither) -> int:

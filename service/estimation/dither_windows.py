@@ -34,7 +34,8 @@ class DitherWindows(Estimator):
     cutter: LockIn | RandomDither | None = None
     """None: no dither plays, none that can be read, or its end would cut the next window."""
 
-    last_ended: tuple[Window, ...] = ()
+    ended: tuple[Window, ...] = ()
+    """In the last block."""
 
     @classmethod
     @override
@@ -69,13 +70,7 @@ class DitherWindows(Estimator):
             and window is not None
             and window.first_seq + cutter.plan.n_frames > dither.stop_seq
         )
-        return DitherWindows(cutter=None if over else cutter, last_ended=tuple(ended))
-
-    @property
-    @override
-    def ended(self) -> tuple[Window, ...]:
-        """Windows that ended in the last block, or why they were refused."""
-        return self.last_ended
+        return DitherWindows(cutter=None if over else cutter, ended=tuple(ended))
 
     @property
     @override

@@ -202,10 +202,8 @@ class Estimator(Streaming):
 
     __slots__ = ()
 
-    @property
-    def ended(self) -> Sequence[Any]:
-        """Windows that ended in the last block, as the worker fits them, or why they cannot be."""
-        return ()
+    ended: Sequence[Any] = ()
+    """Windows that ended in the last block, as the worker fits them, or why they cannot be."""
 
     def close(
         self, loop: LoopContext, marks: Mark, *, has_windows: bool

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.estimate import BiasBlock
+from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,9 @@ SCATTER_LEARNING = 0.05
 class Bias:
     """What one kind of passive estimate has told of its bias, besides mean and covariance."""
 
-    block: BiasBlock
+    block: BiasBlock = PASSIVE_BIAS
+    """Which bias it is."""
+
     excess: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance of the bias beyond its floor that looks have told of, and that is in the
     covariance or has been learnt away since."""

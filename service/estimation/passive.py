@@ -202,14 +202,10 @@ class Passive(PassiveSums):
         return accumulate(self, frames.moving)
 
     @override
-    def emptied(self) -> Passive:
-        """Return them with nothing multiplied."""
-        return replace(self, sums=(), n_effective=0.0)
-
-    @override
-    def resting(self) -> Passive:
-        """Return them with nothing at all."""
-        return replace(self.emptied(), waiting=(), begun=False)
+    def emptied(self, *, rests: bool) -> Passive:
+        """Return them with nothing multiplied, nor anything that waits where they rest."""
+        anew = replace(self, sums=(), n_effective=0.0)
+        return replace(anew, waiting=(), begun=False) if rests else anew
 
     @override
     def fit(self, linearisation: Linearisation) -> PassiveEstimate | None:

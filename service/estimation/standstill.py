@@ -52,31 +52,22 @@ class Standstill(Detector):
     @override
     def marks(self) -> Mark:
         """Whether nothing can be measured with these slopes."""
-        return Mark.STANDS if self.stands else UNMARKED
+        return Mark.STANDS if self.lasts_s >= STANDS_S else UNMARKED
 
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """What is the matter if that lasts."""
-        return (self.text,)
-
-    @property
-    def stands(self) -> bool:
-        """Whether nothing can be measured with these slopes."""
-        return self.lasts_s >= STANDS_S
-
-    @property
-    def text(self) -> str | None:
         """Text of the alarm: what stands still, since when, what to do; None: nothing."""
         if self.lasts_s < ALARM_S:
-            return None
+            return (None,)
         what = "are the same in every frame" if self.slopes.any() else "are all zero"
         since = datetime.fromtimestamp(self.since_ns_utc * 1e-9, UTC)
-        return (
+        text = (
             f"the slopes {what} since frame {self.first_seq}, {since:%H:%M:%S} UTC: the camera "
             "stands, or its images do not reach the RTC; open the loop, then see to the camera: "
             "the mirror is moved by what is no measurement"
         )
+        return (text,)
 
     def follow(self, block: FrameBlock) -> Standstill:
         """Return it after one more block."""

@@ -13,19 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.estimation import estimator
 from service.estimation.description import Description, edge_watch
 from service.estimation.dither_windows import Window
-from service.estimation.estimator import (
-    NOTHING,
-    UNMARKED,
-    Change,
-    Detector,
-    Estimator,
-    FrameContext,
-    LoopContext,
-    Mark,
-    Streaming,
-)
+from service.estimation.estimator import Change, FrameContext, LoopContext, Mark, Streaming
 from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq, same_loop, same_rate
 from service.estimation.passive_sums import PassiveSums
@@ -67,7 +58,7 @@ class EstimatorBank:
     @property
     def marks(self) -> Mark:
         """What all of them say of the last block."""
-        marks = UNMARKED
+        marks = estimator.UNMARKED
         for member in self.members:
             marks |= member.marks
         return marks
@@ -81,7 +72,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
             return bank
         loop = replace(bank.loop, rtc=None, dither=None, edge=None, cm_id=None)
         return replace(_changed(bank, loop, Change.GONE), begun_with=None, dither=None)
-    changes = NOTHING if rtc is before else _changes(bank, before, rtc)
+    changes = estimator.NOTHING if rtc is before else _changes(bank, before, rtc)
     loop = replace(bank.loop, rtc=rtc)
     if changes & (Change.LOOP | Change.STATUS):
         seq = last_seq(rtc)
@@ -100,7 +91,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
 
 def _changes(bank: EstimatorBank, before: Status | None, rtc: Status) -> Change:
     """Return what a status tells to be otherwise than before."""
-    changes = NOTHING
+    changes = estimator.NOTHING
     if before is None or not same_loop(before, rtc):
         changes |= Change.STATUS
     if before is not None and before.session != rtc.session:
@@ -187,8 +178,8 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
     if rtc is None or block.session != rtc.session or not _fits(rtc, block):
         return bank, []
     closed = len(loop.in_loop) > 0
-    changes = NOTHING if closed else Change.OPEN
-    changes |= NOTHING if block.cm_id == loop.cm_id else Change.MATRIX
+    changes = estimator.NOTHING if closed else Change.OPEN
+    changes |= estimator.NOTHING if block.cm_id == loop.cm_id else Change.MATRIX
     loop = replace(loop, received_ns_utc=block.next_t_ns - block.dt_ns, cm_id=block.cm_id)
     frames = FrameContext(
         block=block,
@@ -205,7 +196,7 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
             member = member.update(frames)
         if member.marks:
             frames = _marked(frames, member.marks)
-            changes |= Change.STANDSTILL if Mark.STANDS in member.marks else NOTHING
+            changes |= Change.STANDSTILL if Mark.STANDS in member.marks else estimator.NOTHING
         members.append(member)
     return _with_windows(replace(bank, loop=loop), members)
 
@@ -223,7 +214,7 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
     """Return the bank with these members, and the windows that ended, refused where one must be."""
     ended: list[Window] = []
     for member in members:
-        if isinstance(member, Estimator):
+        if isinstance(member, estimator.Estimator):
             ended += member.ended
     if not ended:
         return replace(bank, members=tuple(members)), []
@@ -234,7 +225,7 @@ def _with_windows(bank: EstimatorBank, members: list[Streaming]) -> Fed:
             continue
         reasons: list[str] = []
         for k, member in enumerate(members):
-            if isinstance(member, Detector):
+            if isinstance(member, estimator.Detector):
                 members[k], reason = member.vet(window, bank.loop)
                 reasons += [] if reason is None else [reason]
         t_ns = window.t_end_ns_utc

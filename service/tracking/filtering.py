@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
 from service.estimation.estimate import DitheredEstimate, model_error
-from service.estimation.kalman import Bias, Drift, Joint, begin_joint, predicted
+from service.estimation.kalman import Drift, Joint, begin_joint, predicted
 from service.estimation.lockin import MAX_LAG_FRAMES
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, Why
@@ -27,6 +27,7 @@ from service.tracking.registration import (
     Purpose,
     Registration,
     Source,
+    without_previous,
 )
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
@@ -168,41 +169,25 @@ def predict(context: StepContext, registration: Registration, t_ns_utc: int) -> 
 def joint_of(registration: Registration) -> Joint:
     """Return the filter's state that a registration holds."""
     joint = begin_joint(registration.alpha.vector, registration.covariance)
-    for known in registration.biases:
-        bias = Bias(block=known.block, excess=known.excess, scatter=known.scatter)
+    for bias in registration.biases:
+        covariance = [[joint.covariance, bias.shared.T], [bias.shared, bias.covariance]]
         joint = Joint(
-            mean=np.concatenate([joint.mean, known.offset]),
-            covariance=np.block(
-                [[joint.covariance, known.shared.T], [known.shared, known.covariance]]
-            ),
+            mean=np.concatenate([joint.mean, bias.offset]),
+            covariance=np.block(covariance),
             biases=(*joint.biases, bias),
         )
     return joint
 
 
-def biases_of(joint: Joint, before: tuple[PassiveBias, ...]) -> tuple[PassiveBias, ...]:
+def biases_of(joint: Joint) -> tuple[PassiveBias, ...]:
     """Return what the filter knows of the biases; when and in which loop is as it was before."""
-    known = {bias.block.name: bias for bias in before}
     found = []
     for bias in joint.biases:
+        if not isinstance(bias, PassiveBias):  # the filter has just begun with it
+            bias = PassiveBias(block=bias.block, excess=bias.excess, scatter=bias.scatter)
         place = joint.place(bias.block)
-        now = PassiveBias(
-            block=bias.block,
-            offset=joint.mean[place],
-            covariance=joint.covariance[place, place],
-            shared=joint.covariance[place, : place.start],
-            excess=bias.excess,
-            scatter=bias.scatter,
-        )
-        was = known.get(bias.block.name, now)
-        found.append(
-            replace(
-                now,
-                looked_ns_utc=was.looked_ns_utc,
-                loop=was.loop,
-                previous_estimate=was.previous_estimate,
-            )
-        )
+        shared, own = joint.covariance[place, : place.start], joint.covariance[place, place]
+        found.append(replace(bias, offset=joint.mean[place], covariance=own, shared=shared))
     return tuple(found)
 
 
@@ -228,7 +213,7 @@ def accept(
     joint, when, previous = update.joint, measured.when, context.registration
     doubted = _still_doubted(context.state, update, when)
     anew = update.jumped or (previous is not None and previous.suspected_jump is not None)
-    known = () if previous is None else previous.biases_anew if anew else previous.biases
+    biases = biases_of(joint)
     registration = Registration(
         alpha=Misregistration.from_vector(joint.alpha),
         covariance=joint.alpha_covariance,
@@ -241,7 +226,7 @@ def accept(
         window_began_ns_utc=when.began_ns_utc,
         optical_gain=measured.optical_gain,
         optical_gains=measured.optical_gains,
-        biases=biases_of(joint, known),
+        biases=without_previous(biases) if anew else biases,
         previous_estimate=None if anew else _previous_estimate(previous, update, measured),
         jumped_ns_utc=_jumped_ns_utc(previous, update, context.now_ns),
         doubt=previous.doubt if previous is not None and doubted else "",

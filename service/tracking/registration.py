@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
 from service.estimation.estimate import PASSIVE_BIAS, BiasBlock
+from service.estimation.kalman import Bias
 from service.model.misregistration import Determination, Misregistration
 from service.wire import Pointing
 
@@ -115,35 +116,31 @@ class PreviousEstimate(PointedEstimate):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PassiveBias:
+class PassiveBias(Bias):
     """What has been learnt of how far a passive estimate is off, and how sure that is."""
 
-    block: BiasBlock = PASSIVE_BIAS
-    """Which bias it is."""
-
-    offset: Array
+    offset: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what a passive estimate reads more than α, numeric units."""
 
-    covariance: Array
+    covariance: Array = field(default_factory=lambda: np.zeros((4, 4)))
     """``(4, 4)`` of it."""
 
-    shared: Array
+    shared: Array = field(default_factory=lambda: np.zeros((4, 4)))
     """``(4, 4 + 4 k)`` covariance of it (rows) with α and the ``k`` biases before it (columns)."""
 
     looked_ns_utc: int = 0
     """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
-
-    excess: Array = field(default_factory=lambda: np.zeros(4))
-    """``(4,)`` variance beyond the least that the scatter of passive estimates has told of."""
-
-    scatter: float = 1.0
-    """How much more passive estimates scatter than they say, in variance, one beside the other."""
 
     loop: tuple[float, ...] = ()
     """``estimation.loop.loop_numbers`` of the loop it is the bias of; empty: not known."""
 
     previous_estimate: PreviousEstimate | None = None
     """α and bias together before that one; None: it was the first, or has been doubted."""
+
+
+def without_previous(biases: tuple[PassiveBias, ...]) -> tuple[PassiveBias, ...]:
+    """Return biases without what was known before their last looks: it tells nothing of now."""
+    return tuple(replace(bias, previous_estimate=None) for bias in biases)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -242,11 +239,6 @@ class Registration:
     def bias(self, block: BiasBlock) -> PassiveBias | None:
         """Return what is known of a bias; None: nothing is."""
         return next((bias for bias in self.biases if bias.block.name == block.name), None)
-
-    @property
-    def biases_anew(self) -> tuple[PassiveBias, ...]:
-        """The biases, without what was known before their last looks: it tells nothing of now."""
-        return tuple(replace(bias, previous_estimate=None) for bias in self.biases)
 
     @property
     def total_covariance(self) -> Array:

@@ -17,6 +17,7 @@ from service.tracking.operator import change_mode
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.reconstructors import prune
+from service.tracking.registration import without_previous
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.validity import age_registration, forget_registration, restore_registration
@@ -130,7 +131,7 @@ def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
     if registration is not None:
         registration = replace(
             registration,
-            biases=registration.biases_anew,
+            biases=without_previous(registration.biases),
             suspected_jump=None,
             previous_estimate=None,
         )

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.tracking.alarms import STALE
 from service.tracking.policy import SECOND_NS, Policy
-from service.tracking.registration import Purpose, Registration, Validity, ValidityState
+from service.tracking.registration import (
+    Purpose,
+    Registration,
+    Validity,
+    ValidityState,
+    without_previous,
+)
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.void_intervals import MOVING, make_valid, void_until
@@ -92,7 +98,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
             n_windows=0,
             previous_estimate=None,
             suspected_jump=None,
-            biases=registration.biases_anew,
+            biases=without_previous(registration.biases),
         ),
     )
     void_until(context, still_ns_utc, MOVING, Purpose.PASSIVE)

@@ -363,7 +363,7 @@ def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> R
     if bias is not None and bias.looked_ns_utc:
         return registration
     joint = kalman.forget(filtering.joint_of(registration), estimate.bias, estimate.bias_excess)
-    return replace(registration, biases=filtering.biases_of(joint, registration.biases))
+    return replace(registration, biases=filtering.biases_of(joint))
 
 
 def _biases_after_look(
@@ -379,7 +379,7 @@ def _biases_after_look(
         replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
         if bias.block.name == name
         else bias
-        for bias in filtering.biases_of(joint, registration.biases)
+        for bias in filtering.biases_of(joint)
     )
 
 

@@ -39,29 +39,29 @@ def after(slopes, state=None):
 @pytest.mark.parametrize(("value", "words"), [(0.0, "all zero"), (0.3, "the same in every frame")])
 def test_slopes_that_stand_for_half_a_second_are_an_alarm(value, words):
     state = after(np.concatenate([noise(200), np.full((600, N_SLOPES), value)]))
-    assert state.stands
-    assert words in state.text
-    assert "since frame 200, 00:00:00 UTC" in state.text
-    assert "open the loop" in state.text
+    assert state.marks
+    assert words in state.conditions[0]
+    assert "since frame 200, 00:00:00 UTC" in state.conditions[0]
+    assert "open the loop" in state.conditions[0]
 
 
 def test_a_tenth_of_a_second_is_no_alarm_and_no_measurement():
     state = after(np.concatenate([noise(200), np.zeros((100, N_SLOPES))]))
-    assert state.stands
-    assert state.text is None
+    assert state.marks
+    assert state.conditions[0] is None
 
 
 def test_it_is_over_with_the_first_frame_that_differs():
     state = after(np.concatenate([np.zeros((800, N_SLOPES)), noise(50)]))
-    assert not state.stands
-    assert state.text is None
+    assert not state.marks
+    assert state.conditions[0] is None
 
 
 def test_frames_sent_twice_are_no_camera_that_stands():
-    assert not after(np.repeat(noise(200), 2, axis=0)).stands
+    assert not after(np.repeat(noise(200), 2, axis=0)).marks
 
 
 def test_another_session_begins_anew():
     state = after(np.zeros((800, N_SLOPES)))
     (block,) = blocks(np.zeros((BLOCK, N_SLOPES)), first_seq=800)
-    assert not state.follow(replace(block, session="t")).stands
+    assert not state.follow(replace(block, session="t")).marks

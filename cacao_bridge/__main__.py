@@ -146,7 +146,7 @@ class Bridge:
         """Send telemetry until ``stopped`` or cut off."""
         status = status_publisher(session, keys)
         lifeline, next_status_s, next_report_s = Lifeline(time.monotonic()), 0.0, 0.0
-        said = ""
+        last_session = ""
         while not stopped.is_set():
             for header, rows in self._cacao.poll():
                 sender.offer(header, rows)
@@ -154,9 +154,9 @@ class Bridge:
             if self._cacao.has_news:
                 matrices.look()
             now_s = time.monotonic()
-            if now_s >= next_status_s or self._cacao.session != said:
+            if now_s >= next_status_s or self._cacao.session != last_session:
                 status.put(encode(self._cacao.status()))
-                said, next_status_s = self._cacao.session, now_s + _STATUS_PERIOD_S
+                last_session, next_status_s = self._cacao.session, now_s + _STATUS_PERIOD_S
                 if lifeline.cut(session, now_s):
                     _log.warning("link.cut-off", text=lifeline.text)
                     return

@@ -158,11 +158,11 @@ class Calibration:
 
     def _kept(self, name: str) -> Reconstructor:
         try:
-            told = json.loads((self._folder / f"{name}.json").read_text("utf-8"))
+            manifest = json.loads((self._folder / f"{name}.json").read_text("utf-8"))
             matrix = np.load(self._folder / f"{name}.npy", allow_pickle=False)
         except (OSError, ValueError) as error:
             raise StreamError(f"{self._folder}: matrix {name} cannot be read: {error}") from error
-        return Reconstructor(manifest=decode(Manifest, msgpack.packb(told)), matrix=matrix)
+        return Reconstructor(manifest=decode(Manifest, msgpack.packb(manifest)), matrix=matrix)
 
     def _know(self, **what: Any) -> None:  # noqa: ANN401  as JSON has them
         self._known |= what

@@ -11,10 +11,10 @@ from pyrcal.options import add, words
 from service.cli.program import OneLineParser, imported_and_run, leave
 
 _EPILOG = """
-One line for each thing that docs/rtc.md asks: what was found, what the contract says, where it
-stands. WRONG breaks the contract, seen is allowed and worth a look, skipped says why. What moves
-anything says so first and asks; where nobody can be asked it is skipped unless --yes. Exit status:
-0 nothing is wrong, 1 something is, 2 nothing could be checked.
+One line for each requirement of docs/rtc.md: the finding, the requirement, its place. WRONG breaks
+the contract, seen is allowed and worth a look, skipped says why. Checks that move anything ask
+first; without a terminal they are skipped unless --yes. Exit status: 0 nothing is wrong, 1
+something is, 2 nothing could be checked.
 """
 
 
@@ -51,7 +51,7 @@ def check_parser() -> argparse.ArgumentParser:
         words("--passive", "only listen: ask and move nothing"),
         words("--open-loop", "also what opens the loop: loop, measure"),
         words("--move-image", "also what moves the mirror's image on the sensor: offload"),
-        words("--yes", "move what is said without asking"),
+        words("--yes", "move without asking"),
         words("--json", "print one JSON object at the end"),
     )
     return check
@@ -71,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return lambda: check(options)
 
     # told to end, it first stops its dither and closes the loop again
-    heard = (signal.SIGINT, signal.SIGTERM)
-    return imported_and_run(load, own_process=arguments is None, received=heard)
+    signals = (signal.SIGINT, signal.SIGTERM)
+    return imported_and_run(load, own_process=arguments is None, received=signals)
 
 
 if __name__ == "__main__":

@@ -158,7 +158,7 @@ def _questions(client: RtcClient, status: Status) -> list[_Question]:
 
 def replies(client: RtcClient, status: Status) -> Checked:
     """Send commands that must be refused; one of them twice, with the same id."""
-    said, absent, slowest_s, first = [], [], 0.0, b""
+    problems, absent, slowest_s, first = [], [], 0.0, b""
     questions = _questions(client, status)
     for question in questions:
         answer, took_s = client.connection.ask(question.kind, question.payload)
@@ -166,16 +166,16 @@ def replies(client: RtcClient, status: Status) -> Checked:
             if question.optional and took_s < ANSWER_S / 2:
                 absent.append(question.kind.value)
             else:
-                said.append(f"no answer to {question.what}")
+                problems.append(f"no answer to {question.what}")
             continue
         slowest_s = max(slowest_s, took_s)
-        said += _wrong_reply(answer, question, took_s)
+        problems += _wrong_reply(answer, question, took_s)
         first = answer if question is questions[3] else first
     again, _ = client.connection.ask(questions[3].kind, questions[3].payload)
     if first and again != first:
-        said.append("the same id was answered otherwise when asked again")
-    if said:
-        return wrong("replies", "; ".join(said))
+        problems.append("the same id got another answer when asked again")
+    if problems:
+        return wrong("replies", "; ".join(problems))
     found = f"{len(questions) - len(absent)} refusals in their words, within {slowest_s:.2f} s"
     without = f"; it offers no {' and no '.join(absent)}" if absent else ""
     return fine("replies", f"{found}, twice the same for the same id{without}")
@@ -262,7 +262,7 @@ def dither(
         ledger = _listen_to_dither(client, status, request, reply.start_seq, matrix)
     finally:  # also where it is broken off
         ended = stopped(client)
-    told_seq = ledger.next_seq
+    ordered_seq = ledger.next_seq
     gone = client.listen(
         _STOPS_S,
         lambda: (
@@ -274,8 +274,10 @@ def dither(
     client.watch.block_takers.remove(ledger.take)
     judged = _judged(client, request, reply.start_seq, ledger)
     if not judged and not (ended.accepted and gone):
-        still_s = (ledger.last_seq - told_seq) / status.frame_rate_hz
-        judged = f"told to stop, it went on for {still_s:.1f} s, or its status does: {ended.reason}"
+        still_s = (ledger.last_seq - ordered_seq) / status.frame_rate_hz
+        judged = (
+            f"ordered to stop, it went on for {still_s:.1f} s, or its status does: {ended.reason}"
+        )
     if judged:
         return [wrong("dither", judged), _columns(ledger, modes, status)]
     found_m = ledger.findings[-1].found_m
@@ -345,9 +347,9 @@ def _judged(client: RtcClient, request: DitherRequest, start_seq: int, ledger: _
         return "less than a second of it has come"
     told = [status.dither for _, status in client.watch.statuses if status.dither_id == request.id]
     if not told or told[0] is None:
-        return "no status tells it"
+        return "no status shows it"
     if told[0].start_seq != start_seq or told[0].request != request:
-        return "the status tells it otherwise than it was asked for"
+        return "the status shows it otherwise than asked for"
     return ""
 
 

@@ -62,7 +62,7 @@ class Examination:
     """As the instrument file pins them."""
 
     consent: Callable[[tuple[str, ...]], bool] = lambda _: False
-    """Is told what would be moved, and answers whether it may be."""
+    """Shows what would be moved, and returns whether it may be."""
 
     dialect: Callable[[NDArray[np.float32]], SlopeConvention | str] = lambda _: NO_INSTRUMENT
     """Compares the matrix in use with the instrument file; a text says why it does not."""
@@ -111,7 +111,7 @@ def _listening(client: RtcClient, examination: Examination) -> Iterator[Checked]
     observer = client.watch
     if not client.listen(examination.wait_s, lambda: bool(observer.arrivals or observer.statuses)):
         raise LinkError(
-            f"nothing of an RTC of system {client.connection.keys.system} was heard within "
+            f"no RTC of system {client.connection.keys.system} was seen within "
             f"{examination.wait_s:g} s: start it, or name its system with --system"
         )
     client.listen(
@@ -207,15 +207,15 @@ def _swapping(client: RtcClient, examination: Examination) -> Iterator[Checked]:
     if in_use is None:
         yield from (skipped(name, _UNKNOWN) for name in _SWAPS)
         return
-    told, applied = commit(client, in_use)
-    yield told
+    outcome, applied = commit(client, in_use)
+    yield outcome
     if applied is None:
         yield from (skipped(name, "commit has to succeed first") for name in _SWAPS[1:])
         return
     if examination.wants("chunks"):
-        told, later = chunks(client, applied)
+        outcome, later = chunks(client, applied)
         applied = later or applied
-        yield told
+        yield outcome
     if examination.wants("rejection"):
         yield rejection(client, applied)
 

@@ -78,11 +78,11 @@ def commit(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse
         client.connection.put_chunk(name, index, part)
     began_s = client.clock()
     client.connection.put_commit(name, encode(new.manifest))
-    said = _answers(client, name, PATIENCE_S)
-    last = said[-1][1] if said else None
+    answers = _answers(client, name, PATIENCE_S)
+    last = answers[-1][1] if answers else None
     if last is None or last.state is not AckState.APPLIED:
-        return wrong("commit", _without(client, name, said)), None
-    took_s = said[-1][0] - began_s
+        return wrong("commit", _without(client, name, answers)), None
+    took_s = answers[-1][0] - began_s
     client.watch.loop.use(name, new.matrix)
     found = f"applied {took_s:.2f} s after its commit, from frame {last.frame_seq}"
     client.listen(TOLD_S, lambda: _status_names(client, name))
@@ -105,10 +105,10 @@ def chunks(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse
         if index != _LEFT_OUT:
             client.connection.put_chunk(name, index, part)
     wanted = f"{client.connection.keys.matrix(name)}?chunk={_LEFT_OUT}"
-    said = _answers(client, name, PATIENCE_S)
+    answers = _answers(client, name, PATIENCE_S)
     asked = [at_s - began_s for at_s, key in client.watch.asked if key == wanted]
-    if not said or said[-1][1].state is not AckState.APPLIED:
-        tail = _without(client, name, said)
+    if not answers or answers[-1][1].state is not AckState.APPLIED:
+        tail = _without(client, name, answers)
         when = f"it asked for it after {asked[0]:.1f} s" if asked else "it did not ask for it"
         return wrong("chunks", f"chunk {_LEFT_OUT} was left out: {when}; {tail}"), None
     client.watch.loop.use(name, new.matrix)
@@ -128,11 +128,11 @@ def rejection(client: RtcClient, in_use: MatrixInUse) -> Checked:
         for index, part in enumerate(in_use.named(name).parts):
             client.connection.put_chunk(name, index, part)
         client.connection.put_commit(name, encode(manifest))
-        said = _answers(client, name, PATIENCE_S, known)
-        if not said or said[-1][1].state is not AckState.REJECTED:
-            problems.append(f"{what}: {_without(client, name, said)}")
+        answers = _answers(client, name, PATIENCE_S, known)
+        if not answers or answers[-1][1].state is not AckState.REJECTED:
+            problems.append(f"{what}: {_without(client, name, answers)}")
         else:
-            reasons.append(f"{what} ({said[-1][1].reason:.40})")
+            reasons.append(f"{what} ({answers[-1][1].reason:.40})")
     problems += _repeated(client, in_use)
     problems += _unreadable(client)
     if problems:
@@ -157,10 +157,10 @@ def _repeated(client: RtcClient, in_use: MatrixInUse) -> list[str]:
     """Send the commit of the matrix in use again: its acknowledgement must come again."""
     name, known = in_use.manifest.id, len(client.watch.acknowledgements)
     client.connection.put_commit(name, encode(in_use.manifest))
-    said = _answers(client, name, APPLIED_S, known)
-    if said and said[-1][1].state is AckState.APPLIED:
+    answers = _answers(client, name, APPLIED_S, known)
+    if answers and answers[-1][1].state is AckState.APPLIED:
         return []
-    return [f"the same commit again: {_without(client, name, said)}"]
+    return [f"the same commit again: {_without(client, name, answers)}"]
 
 
 def _unreadable(client: RtcClient) -> list[str]:
@@ -184,12 +184,12 @@ def _answers(
 ) -> list[tuple[float, Acknowledgement]]:
     """Return the acknowledgements of a matrix until a final one or the time is over."""
 
-    def said() -> list[tuple[float, Acknowledgement]]:
+    def answers() -> list[tuple[float, Acknowledgement]]:
         every = client.watch.acknowledgements[n_known:]
         return [(at_s, one) for at_s, one in every if one.id == name]
 
-    client.listen(patience_s, lambda: any(one.state is not AckState.STAGED for _, one in said()))
-    return said()
+    client.listen(patience_s, lambda: any(one.state is not AckState.STAGED for _, one in answers()))
+    return answers()
 
 
 def _without(

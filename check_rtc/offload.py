@@ -97,9 +97,9 @@ def _moved(
     sent_seq = _next_seq(client)
     answer, took_s = client.connection.ask(CommandKind.OFFLOAD, encode(demand))
     if answer is None and took_s < ANSWER_S / 2:
-        return skipped("offload", "nobody answers on cmd/rtc/offload")
+        return skipped("offload", "no answer on cmd/rtc/offload")
     if answer is None or took_s > REPLY_S:
-        unknown = "whether the image has moved is not known: look where it is"
+        unknown = "whether the image has moved is unknown: check where it is"
         return wrong("offload", f"no answer within {REPLY_S:g} s; {unknown}")
     reply = decode(Reply, answer)
     if not reply.accepted:
@@ -126,7 +126,7 @@ def _compared(
     """Ask again by the same id, wait until the image stands still, and measure."""
     problems = []
     if client.connection.command(demand) != reply:
-        problems.append("the same id was answered otherwise when asked again")
+        problems.append("the same id got another answer when asked again")
     rate_hz = client.watch.status.frame_rate_hz if client.watch.status else 1.0
     there_seq = sent_seq + round(SETTLE_S * rate_hz)
     if reply.start_seq is not None:
@@ -149,8 +149,8 @@ def _compared(
         return wrong("offload", "; ".join([found, *problems]))
     if beside > MOST_BESIDE:
         return seen("offload", f"{found}, and elsewhere: {_as_text(way)}")
-    told = "nil" if reply.start_seq is None else f"{(there_seq - sent_seq) / rate_hz:.1f} s ahead"
-    return fine("offload", f"{found}; start_seq {told}; asked again it did not move again")
+    start = "nil" if reply.start_seq is None else f"{(there_seq - sent_seq) / rate_hz:.1f} s ahead"
+    return fine("offload", f"{found}; start_seq {start}; asked again it did not move again")
 
 
 def _why(share: float) -> str:

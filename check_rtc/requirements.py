@@ -63,7 +63,7 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
     "connection": Requirement("the token alive/rtc is there, and stays", "connection"),
     "messages": Requirement("every message is as its table says", "messages"),
     "frames": Requirement(
-        "frames come at the rate that status and dt_ns tell, 10 to 100 messages a second", "frames"
+        "frames come at the rate that status and dt_ns say, 10 to 100 messages a second", "frames"
     ),
     "sizes": Requirement(
         "slopes and modes of a frame are those of the status, and stay so", "frames"
@@ -99,7 +99,7 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         Moves.WORDS,
     ),
     "dither": Requirement(
-        "a dither begins at start_seq as asked for, is told, and stops when told to",
+        "a dither begins at start_seq as asked for, is in the status, and stops on request",
         "dither",
         Moves.MIRROR,
     ),

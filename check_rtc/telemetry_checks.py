@@ -19,7 +19,7 @@ from service.runtime.readiness import MAX_STATUSES_HZ
 from service.wire import Keys, Manifest, Status
 
 SLOWEST, FASTEST = 0.8, 1.1
-"""Frames a second by the clock here, over those told: a simulated RTC may be slower."""
+"""Frames a second by the clock here, over those stated: a simulated RTC may be slower."""
 
 MESSAGES_HZ: Final = (8.0, 120.0)
 STATUSES_HZ: Final = (0.8, 12.0)
@@ -105,7 +105,7 @@ def _frames(observer: TelemetryObserver, _: About) -> Checked:
     nominal_hz = 1e9 / last.header.dt_ns
     found = (
         f"{rate_hz:.0f} frames a second in {messages_hz:.0f} messages of up to "
-        f"{max(a.header.n for a in arrivals)}; dt_ns tells {nominal_hz:.4g} Hz"
+        f"{max(a.header.n for a in arrivals)}; dt_ns says {nominal_hz:.4g} Hz"
     )
     status = observer.status
     if status is not None and abs(status.frame_rate_hz / nominal_hz - 1.0) > 1e-3:
@@ -142,7 +142,7 @@ def _sizes(observer: TelemetryObserver, _: About) -> Checked:
     words = " and ".join(f"{slopes} slopes, {modes} modes" for slopes, modes in sizes)
     if status is not None and set(sizes) - {(status.n_slopes, status.n_modes)}:
         return wrong(
-            "sizes", f"{words}; the status tells {status.n_slopes} slopes, {status.n_modes} modes"
+            "sizes", f"{words}; the status says {status.n_slopes} slopes, {status.n_modes} modes"
         )
     if len(sizes) > 1:
         return wrong("sizes", f"{words} in turn")
@@ -150,13 +150,15 @@ def _sizes(observer: TelemetryObserver, _: About) -> Checked:
 
 
 def _numbers(observer: TelemetryObserver, _: About) -> Checked:
-    said = []
+    problems = []
     if observer.n_nonfinite:
-        said.append(f"{observer.n_nonfinite} frames with numbers that are not finite")
+        problems.append(f"{observer.n_nonfinite} frames with numbers that are not finite")
     if observer.n_frozen:
-        said.append(f"{observer.n_frozen} frames whose slopes repeat those before to the last bit")
-    if said:
-        return wrong("numbers", "; ".join(said))
+        problems.append(
+            f"{observer.n_frozen} frames whose slopes repeat those before to the last bit"
+        )
+    if problems:
+        return wrong("numbers", "; ".join(problems))
     return fine("numbers", f"all of {sum(a.header.n for a in observer.arrivals)} frames")
 
 
@@ -177,9 +179,9 @@ def _sequence(observer: TelemetryObserver, _: About) -> Checked:
         for before, after in pairwise(in_order(arrivals)):
             counts["frames are missing"] += max(after.header.seq0 - before.stop_seq, 0)
     overtaken = counts.pop("overtaken", 0)
-    said = [f"{n} {what}" for what, n in counts.items() if n] + ([over] if over else [])
-    if said:
-        return wrong("sequence", "; ".join(said))
+    problems = [f"{n} {what}" for what, n in counts.items() if n] + ([over] if over else [])
+    if problems:
+        return wrong("sequence", "; ".join(problems))
     if overtaken:
         text = f"none is missing; {overtaken} messages were overtaken on their way"
         return seen("sequence", text)
@@ -273,8 +275,8 @@ def _status(observer: TelemetryObserver, about: About) -> Checked:
     status = observer.status
     if status is None:
         return wrong("status", f"none has come in {about.span_s:.0f} s")
-    heard = [at_s for at_s, _ in observer.statuses]
-    rate_hz = (len(heard) - 1) / max(heard[-1] - heard[0], 1.0)
+    times_s = [at_s for at_s, _ in observer.statuses]
+    rate_hz = (len(times_s) - 1) / max(times_s[-1] - times_s[0], 1.0)
     found = (
         f"{rate_hz:.1f} a second; loop {status.loop}, {status.n_controlled} of {status.n_modes} "
         f"modes, "
@@ -293,9 +295,9 @@ def _status(observer: TelemetryObserver, about: About) -> Checked:
 def _disagreement(observer: TelemetryObserver, status: Status) -> str:
     """Return how the last status contradicts the frames, or itself; empty: it does not."""
     if status.loop == "closed" and not all(status.gains[: status.n_controlled]):
-        return "it tells a closed loop, and gains of 0 for modes that are controlled: partial"
+        return "it says a closed loop, and gains of 0 for modes that are controlled: partial"
     if status.loop != "open" and any(status.gains[status.n_controlled :]):
-        return "it tells gains for modes that are not controlled"
+        return "it has gains for modes that are not controlled"
     at_s = observer.statuses[-1][0]
     of_it = [a for a in of_session(observer.arrivals, status.session) if a.at_s <= at_s]
     if not of_it:
@@ -303,7 +305,7 @@ def _disagreement(observer: TelemetryObserver, status: Status) -> str:
     latest = max(arrival.stop_seq for arrival in of_it) - 1
     reach = 2.0 * status.frame_rate_hz
     if status.seq is None or abs(status.seq - latest) > reach:
-        return f"it tells seq {status.seq}, the frames are at {latest}"
+        return f"it has seq {status.seq}, the frames are at {latest}"
     if status.cm_id is not None and status.cm_id not in {a.header.cm_id for a in of_it[-20:]}:
         return f"the frames name matrix {of_it[-1].header.cm_id}"
     return ""
@@ -319,25 +321,23 @@ def _ids(observer: TelemetryObserver, about: About) -> Checked:
         return wrong("ids", words)
     pinned = about.basis_id, about.config_id
     for pair in found:
-        for name, told in zip(pair, pinned, strict=True):
-            if told not in {None, name}:
-                return wrong("ids", f"{words}; the instrument file expects {told}")
+        for name, expected in zip(pair, pinned, strict=True):
+            if expected not in {None, name}:
+                return wrong("ids", f"{words}; the instrument file expects {expected}")
     return fine("ids", words) if found else skipped("ids", "nothing has come")
 
 
 def _matrix(observer: TelemetryObserver, about: About) -> Checked:
     manifest, status = about.applied, observer.status
     if manifest is None and not about.offered:
-        why = "nobody answers on rtc/cm/applied: optional; without it ids are believed"
+        why = "no answer on rtc/cm/applied: optional; without it ids are believed"
         return skipped("matrix", why)
     if manifest is None or status is None:
         return wrong("matrix", about.not_applied or "there is no status to compare it with")
     shape = manifest.layout.shape
     found = f"{manifest.id}, {list(shape)} in {manifest.layout.n_chunks} parts, its sum is right"
     if shape[1] != status.n_slopes or (status.in_loop and shape[0] != status.n_controlled):
-        return wrong(
-            "matrix", f"{found}; the status tells {[status.n_controlled, status.n_slopes]}"
-        )
+        return wrong("matrix", f"{found}; the status says {[status.n_controlled, status.n_slopes]}")
     named = {status.cm_id for _, status in observer.statuses}
     if manifest.id not in named and named != {None}:
         return wrong("matrix", f"{found}; the status names {status.cm_id}")
@@ -359,12 +359,12 @@ def _law(observer: TelemetryObserver, about: About) -> Checked:
         return skipped("law", why)
     last = laws[-1]
     found = (
-        f"leak {last.leak:.4f}, gain {last.gain:.3g} of the one told, delay "
+        f"leak {last.leak:.4f}, gain {last.gain:.3g} of the stated one, delay "
         f"{last.delay_frames:.2f} frames"
     )
     if last.wrong and all(law.wrong for law in laws[-2:]):
         return wrong("law", last.wrong)
-    return fine("law", f"{found}; told {status.leak:.4f} and {status.delay_frames:g} frames")
+    return fine("law", f"{found}; stated {status.leak:.4f} and {status.delay_frames:g} frames")
 
 
 def _obedience(observer: TelemetryObserver, about: About) -> Checked:
@@ -399,9 +399,9 @@ def _orientation(_: TelemetryObserver, about: About) -> Checked:
     if dialect.wrong:
         return wrong("orientation", dialect.wrong)
     if dialect.found is None:
-        return skipped("orientation", "the matrix in use does not tell")
-    told = "the instrument file leaves it open" if dialect.adopted else "as told"
-    found = f"by the matrix in use {setting_written(dialect.found)}: {told}"
+        return skipped("orientation", "the matrix in use does not show it")
+    why = "the instrument file leaves it open" if dialect.adopted else "as in the file"
+    found = f"by the matrix in use {setting_written(dialect.found)}: {why}"
     return fine("orientation", found)
 
 

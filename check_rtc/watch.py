@@ -85,9 +85,9 @@ class TelemetryObserver:
         self._still = 0
         self._last_slopes: NDArray[np.float32] | None = None
 
-    def take(self, heard: list[ReceivedMessage]) -> None:
+    def take(self, messages: list[ReceivedMessage]) -> None:
         """Add new messages."""
-        for item in heard:
+        for item in messages:
             try:
                 self._take(item)
             except WireError as error:

@@ -53,8 +53,8 @@ def option(
         text += f" (default: %(default){'g' if isinstance(default, float) else 's'})"
     flags = [word for word in usage.split() if word.startswith("-")]
     metavar = usage.split()[-1] if len(usage.split()) > len(flags) else None
-    told = {"help": text, "metavar": metavar, "type": reader, "default": default, **more}
-    given = {name: value for name, value in told.items() if value is not None}
+    keywords = {"help": text, "metavar": metavar, "type": reader, "default": default, **more}
+    given = {name: value for name, value in keywords.items() if value is not None}
     metadata = {"flags": flags, "argparse": given, "absent": absent, "chapter": chapter}
     return field(metadata=metadata)
 

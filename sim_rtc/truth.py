@@ -205,7 +205,7 @@ class TruthRecorder(Background):
 
 def setup_of(options: Options) -> dict[str, Any]:
     """Return the constants of the run as JSON can hold them."""
-    told = (
+    recorded = (
         *("scene", "imperfections", "seeing", "layers", "vibrations"),
         *("flexure", "walk", "elevation"),
     )
@@ -220,7 +220,7 @@ def setup_of(options: Options) -> dict[str, Any]:
         "outer_scale_m": options.outer_scale_m,
         "drift_per_minute": asdict(options.drift),
         "jumps": _json(options.jumps),
-        **{name: _json(getattr(options, name)) for name in told},
+        **{name: _json(getattr(options, name)) for name in recorded},
     }
 
 

@@ -156,7 +156,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
         BarColumn(bar_width=20),
         TextColumn("{task.description}", markup=False),
     )
-    began_s, told = time.monotonic(), ""
+    began_s, shown_text = time.monotonic(), ""
     try:
         with Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task("", total=None)
@@ -170,9 +170,9 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
                 )
                 if not step.under_way:
                     break
-                if step.text != told and not console.is_terminal:
+                if step.text != shown_text and not console.is_terminal:
                     say(step.text)
-                told = step.text
+                shown_text = step.text
                 time.sleep(LOOK_S)
     except KeyboardInterrupt:
         say("the work goes on; pyrcal watch shows it")
@@ -195,7 +195,7 @@ def _step(document: Document, lasted_s: float) -> Step:
     too_long = state in _ON_ITS_WAY and lasted_s > SENT_WITHIN_S
     text = f"{document['id']} is {state}{why}"
     return Step(
-        f"{text}, still; pyrcal watch shows what comes of it" if too_long else text,
+        f"{text}, still; pyrcal watch shows the rest" if too_long else text,
         state in _UNDER_WAY and not too_long,
         state in _WELL,
         document.get("duration_s"),

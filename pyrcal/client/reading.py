@@ -27,11 +27,11 @@ def run_command(service: Service, request: Request, options: argparse.Namespace)
     document = service.get(path, **named(options, ("since", "until", "limit"))).document
     lines = _SCREENS["reconstructor" if one else request.name]
     with understood(service):
-        told = [] if options.json else list(lines(document))
+        text_lines = [] if options.json else list(lines(document))
         well = request.name != "status" or (document["ready"] and not document["alarms"])
     if options.json:
         print_document(document)
-    print_lines(told)
+    print_lines(text_lines)
     return DONE if well else NOT_DONE
 
 
@@ -95,7 +95,7 @@ def _alarms(state: Document) -> Iterator[str]:
         yield f"{alarm['name']} ({alarm['worst_severity']}) is over, and was not acknowledged:"
         yield f"    {alarm['text']}"
     for note in muted:
-        who, until = note["muted"]["by"] or "nobody named", clock(note["muted"]["until_utc"])
+        who, until = note["muted"]["by"] or "an unnamed operator", clock(note["muted"]["until_utc"])
         yield f"{note['name']} is muted until {until} by {who}"
     counts = ((lasting, "active"), (gone, "over, unseen"), (muted, "muted"))
     yield ", ".join(f"{len(some)} {word}" for some, word in counts if some) or "no alarm lasts"

@@ -84,8 +84,8 @@ class Request(NamedTuple):
     @property
     def body(self) -> list[str]:
         """Options that the body of an order says; ``reason`` and ``by`` are of every one."""
-        said = (one.form.partition(" ")[0].lstrip("-").replace("-", "_") for one in self.words)
-        return [name for name in said if name not in {"id", "no_wait"}]
+        forms = (one.form.partition(" ")[0].lstrip("-").replace("-", "_") for one in self.words)
+        return [name for name in forms if name not in {"id", "no_wait"}]
 
 
 def _reads(name: str, purpose: str, path: str, *every: Words, by: str = "reading") -> Request:

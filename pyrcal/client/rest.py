@@ -117,7 +117,7 @@ class Service:
                 if not again:
                     raise UnreachableError(
                         f"{error}; the order was sent and may have been carried out: "
-                        "pyrcal status and pyrcal audit tell"
+                        "see pyrcal status and pyrcal audit"
                     ) from error
                 again = False
 

@@ -105,9 +105,9 @@ def verdict(margin: Document | None) -> str:
     """Return the stability gate's verdict on a reconstructor in words."""
     if margin is None:
         return "not judged"
-    said = "accepted" if margin["accepted"] else f"REFUSED: {margin['reason']}"
+    outcome = "accepted" if margin["accepted"] else f"REFUSED: {margin['reason']}"
     radius = _number(margin["worst_pole_radius"], ".3f")
-    return f"worst pole radius {radius} of at most {margin['bound']:g}: {said}"
+    return f"worst pole radius {radius} of at most {margin['bound']:g}: {outcome}"
 
 
 def _doing(state: Document) -> list[str]:

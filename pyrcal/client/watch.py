@@ -173,15 +173,15 @@ def screen(latest: Latest, now_s: float) -> Group:
         old = f"; what is below is {span(age_s)} old" if latest.state else ""
         head = Text(shown(f"DISCONNECTED: {lost}; trying again{old}"), style="bold white on red")
     try:
-        told = [] if latest.state is None else status_lines(_aged(latest.state, age_s))
+        status = [] if latest.state is None else status_lines(_aged(latest.state, age_s))
         log = [
             (_of_log(line)[11:], _LEVELS.get(line["level"], "")) for line in reversed(latest.log)
         ]
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        told, log = [f"NOT this version of pyrcal: {error!r}"], []
+        status, log = [f"NOT this version of pyrcal: {error!r}"], []
     return Group(
         head,
-        *(Text(shown(line), style=_style(line, lost)) for line in ["", *told, ""]),
+        *(Text(shown(line), style=_style(line, lost)) for line in ["", *status, ""]),
         *(
             Text(shown(line), style="dim" if lost else style, no_wrap=True, overflow="ellipsis")
             for line, style in log

@@ -91,17 +91,17 @@ def _show(archive: Archive, every: tuple[Item, ...], product_id: str, *, as_json
     store = next(store for store in archive.stores if store.noun == item.kind)
     record = next((record for record in store.records() if record.id == product_id), None)
     damage = next(verify(archive, [item]))
-    told: dict[str, Any] = {
+    document: dict[str, Any] = {
         **asdict(item),
         "path": str(store.path_of(item.id)),
         "damage": damage and damage.found,
         "record": {} if record is None else json.loads(to_json(record)),
     }
     if as_json:
-        print(json.dumps(told, indent=2))
+        print(json.dumps(document, indent=2))
     else:
-        record_told = told.pop("record")
-        for name, value in {**told, **record_told}.items():
+        of_record = document.pop("record")
+        for name, value in {**document, **of_record}.items():
             print(shown(f"{name:18} {value if isinstance(value, str) else json.dumps(value)}"))
     return DAMAGED if damage else DONE
 
@@ -114,8 +114,12 @@ def _verify(archive: Archive, every: tuple[Item, ...], *, as_json: bool) -> int:
             wrong.append(damage)
     fault = archive.index.fault()
     if as_json:
-        told = {"n_products": len(every), "index": fault, "damaged": [asdict(one) for one in wrong]}
-        print(json.dumps(told, indent=2))
+        document = {
+            "n_products": len(every),
+            "index": fault,
+            "damaged": [asdict(one) for one in wrong],
+        }
+        print(json.dumps(document, indent=2))
     else:
         for one in wrong:
             print(shown(f"DAMAGED {one.kind} {one.id}: {one.path}: {one.found}"))

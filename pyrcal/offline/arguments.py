@@ -45,8 +45,8 @@ _OF_A_FOLDER = (
 def _describe_archive(archive: argparse.ArgumentParser) -> None:
     archive.set_defaults(module="pyrcal.offline.archive")
     archive.description = (
-        "Look through the matrices in a service's data_dir, check them, remove what is old. Reads "
-        "beside a running service; prune refuses, for the service does it by itself."
+        "List, check, export and prune the matrices in a service's data_dir. Works beside a "
+        "running service, but for prune, which the service does by itself."
     )
     archive.epilog = "Exit status: 0 done, 1 something is damaged, 2 it cannot be done."
     aot = (
@@ -78,8 +78,7 @@ _FIT_EPILOG = """
 REFERENCE holds (n_slopes, n_modes), slope per metre of OPD, in the RTC's own order and axes, as
 the array 'interaction_matrix' or the one that --dataset names. What is printed on standard output
 is the answer; progress goes to standard error. Exit status: 0 accepted, 1 fitted but refused (the
-verdict says why), 2 input that cannot be used. OOPAO's metre is (n - 1)/n of ours for a pupil of n
-points: its mirror comes out that much smaller. docs/integrate/fitting.md explains format,
+verdict says why), 2 input that cannot be used. docs/integrate/fitting.md explains format,
 orientation and verdicts.
 """
 

@@ -48,8 +48,8 @@ def fit_file(
         try:
             fit = fit_matrix(instrument, reference, options, mapper=pool.map, progress=progress)
         except MatrixError as error:
-            said = str(error).removeprefix("reference: ")
-            raise MatrixError(f"{recorded.where}: {said}") from error
+            text = str(error).removeprefix("reference: ")
+            raise MatrixError(f"{recorded.where}: {text}") from error
     return FitReport(
         fit=fit,
         method=options.method,

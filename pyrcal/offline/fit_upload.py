@@ -177,8 +177,8 @@ def fit_upload(folder: Path, request: FitRequest) -> None:
             progress=tell,
         )
     except PyrcalError as error:
-        said = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
-        raise MatrixError(said) from error
+        text = str(error).replace(f"{unpacked}/", "").replace(f"{folder}/", "")
+        raise MatrixError(text) from error
     tell(STAGES[-1])
     report = replace(report, notes=(*report.notes, *remarks))
     own = asked["instrument"] is None and upload.instrument is None and not remarks

@@ -166,9 +166,9 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
     number, sensor_key = models.sensor_number, models.sensor_key
     found = []
     for k, (optic, change) in enumerate(changes.items(), nuisances.first_optic):
-        told, value = number, number * float(np.exp(change))
+        stated, value = number, number * float(np.exp(change))
         if optic is Optic.WIDTH and models.coupling is not None:
-            told, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
+            stated, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
         known = models.exact(optic)
         found.append(
             FoundOptic(
@@ -177,7 +177,7 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
                 change=change,
                 sigma=float(sure.nuisance_sigma[k]),
                 found=value if known else None,
-                reported=told if known and optic not in nuisances.unknown else None,
+                reported=stated if known and optic not in nuisances.unknown else None,
             )
         )
     return tuple(found)

@@ -48,7 +48,7 @@ class SeenLight:
             case None:
                 return ""
             case CannotTell(reason=reason):
-                return f"; how they are turned it does not tell: {reason}"
+                return f"; their rotation is unknown: {reason}"
             case LightRotation(rotation_rad=rotation, sigma_rad=sigma):
                 return (
                     f", turned by {np.rad2deg(rotation):+.1f} ± {np.rad2deg(sigma):.1f} deg "

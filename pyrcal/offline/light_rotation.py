@@ -163,7 +163,7 @@ def _refusal(angles: Array, correlation: Array, best: int) -> str:
             "equally well; say within which range it lies"
         )
     if best in {0, len(angles) - 1}:
-        return f"the best rotation is the last one tried, {angles[best]:.0f} deg; look further"
+        return f"the best rotation is the last one tried, {angles[best]:.0f} deg; try a wider range"
     return ""
 
 

@@ -122,7 +122,7 @@ _ROWS = (
     ("shift x", "subapertures", 4),
     ("shift y", "subapertures", 4),
     ("rotation", "deg", 4),
-    ("magnification", "ratio, of the mirror as drawn over the pupil as told", 5),
+    ("magnification", "ratio, of the mirror as drawn over the pupil as described", 5),
 )
 """Name, unit and decimals of each parameter."""
 
@@ -184,9 +184,9 @@ def _basis(report: FitReport) -> Iterator[str]:
 def _extras(fit: Fit) -> Iterator[str]:
     for one in fit.optics:
         if one.found is not None:
-            told = "unknown" if one.reported is None else f"{one.reported:g}"
+            stated = "unknown" if one.reported is None else f"{one.reported:g}"
             words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
-            yield f"{one.key[:19]:20s}{words} (the instrument file says {told})"
+            yield f"{one.key[:19]:20s}{words} (the instrument file says {stated})"
     if fit.anamorphosis is not None:
         along, across = 100.0 * fit.anamorphosis
         yield f"{'anamorphosis':20s}{along:+.3f} % along x, {across:+.3f} % along 45 deg"
@@ -408,10 +408,10 @@ def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:
     """Return values that differ from the instrument file's."""
     otherwise = {}
     for key, one in found.items():
-        value, told, sigma = one["found"], one["told"], one["sigma"] or 0.0
+        value, stated, sigma = one["found"], one["told"], one["sigma"] or 0.0
         if value is None or key == _WIDTH:
             continue
-        if told is None or abs(value - told) > max(NOTABLE * told, NOTABLE_SIGMA * sigma):
+        if stated is None or abs(value - stated) > max(NOTABLE * stated, NOTABLE_SIGMA * sigma):
             otherwise[key] = value
     return otherwise
 

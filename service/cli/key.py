@@ -21,7 +21,10 @@ DATA_DIR = "var"
 
 _WITHOUT = {
     False: "on loopback none is needed: pyrcal key add NAME makes one",
-    True: "nobody may ask: pyrcal key add makes one, without the file loopback needs none",
+    True: (
+        "there is no key, so nobody may ask: pyrcal key add makes one; without the file this "
+        "machine needs none"
+    ),
 }
 """What that means, by whether there is a file."""
 

@@ -38,10 +38,10 @@ JUDGED_EVERY = 200
 """Frames between two verdicts."""
 
 VERDICTS = 2
-"""That must agree that something is otherwise than told."""
+"""Verdicts in a row that must agree on a difference."""
 
 MORE_TAPS = 4
-"""Frames looked back beyond the delay told: it may be longer, or the mirror lag."""
+"""Frames beyond the stated delay: it may be longer, or the mirror may lag."""
 
 EXPLAINED = 0.002
 """Largest share of the steps' power that a mode may leave over to be believed."""
@@ -86,7 +86,7 @@ class ControlLawCheck(Detector):
     """Up to here a verdict has been given."""
 
     errors: tuple[str, ...] = ()
-    """What the last verdicts found to be otherwise than told, without a break."""
+    """Differences that the last verdicts found, without a break."""
 
     @classmethod
     @override
@@ -119,9 +119,9 @@ class ControlLawCheck(Detector):
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Whether the loop is another than told."""
+        """Whether the loop differs from the status."""
         wrong = (
-            f"the RTC's loop is not what its status tells: {'; '.join(self.errors[-1:])}; mend "
+            f"the RTC's loop is not what its status says: {'; '.join(self.errors[-1:])}; mend "
             "its status, or its loop"
         )
         return (wrong if len(self.errors) >= VERDICTS else None,)
@@ -133,11 +133,11 @@ class IdentifiedLaw:
 
     leak: float
     gain: float
-    """Over the gain told; negative: of the other sign."""
+    """Over the stated gain; negative: of the other sign."""
 
     delay_frames: float
     wrong: str = ""
-    """What disagrees, found and told; empty: nothing does."""
+    """What differs, found and stated; empty: nothing."""
 
 
 def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> ControlLawCheck:
@@ -240,12 +240,12 @@ def _compared(fits: _Fits, clear: Array, gains: Array, loop: ClosedLoop) -> Iden
     gain, spread = float(np.median(ratios)), float(np.median(np.abs(ratios - np.median(ratios))))
     wrong = []
     if abs(leak - loop.leak) > LEAK_TOLERANCE + SIGNIFICANCE * sigma:
-        wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} told")
+        wrong.append(f"leak {leak:.3f} found, {loop.leak:.3f} in the status")
     tolerance = GAIN_TOLERANCE + SIGNIFICANCE * min(spread, abs(gain)) / np.sqrt(len(clear))
     if abs(gain - 1.0) > tolerance:
-        wrong.append(f"gain {gain:.3g} times the one told{_hint(gain)}")
+        wrong.append(f"gain {gain:.3g} times the one in the status{_hint(gain)}")
     if abs(late - loop.delay_frames) > DELAY_TOLERANCE:
-        wrong.append(f"delay {late:.2f} frames found, {loop.delay_frames:.2f} told")
+        wrong.append(f"delay {late:.2f} frames found, {loop.delay_frames:.2f} in the status")
     return IdentifiedLaw(leak=leak, gain=gain, delay_frames=late, wrong="; ".join(wrong))
 
 

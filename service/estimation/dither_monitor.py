@@ -37,7 +37,7 @@ AMPLIFIED = 3.0
 tells so up to a second later than the frames show it."""
 
 STRAY = 0.2
-"""Share of what was asked for in all that modes nobody asked for may carry together."""
+"""Share of what was asked for in all that modes not asked for may carry together."""
 
 _NAMED = 4
 
@@ -341,7 +341,7 @@ def _strays(stray: Array, wanted_m: float) -> list[str]:
     worst = worst[stray[worst] > 0.0]
     named = ", ".join(str(mode) for mode in sorted(worst[:_NAMED].tolist()))
     more = ", ..." if len(worst) > _NAMED else ""
-    return [f"modes nobody asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
+    return [f"modes not asked for ({named}{more}) carry {1e9 * together:.3g} nm"]
 
 
 def _hidden(asked: ExpectedDither, own: Array, reported_m: Array, moved: Array) -> list[str]:

@@ -45,7 +45,7 @@ RESEMBLANCE = 0.5
 """Least correlation of a dither's answer with the model under axes that are to be believed."""
 
 ADVANTAGE = 2.0
-"""Those told must do worse by this factor."""
+"""The stated ones must do worse by this factor."""
 
 _ONE_MODE = 2
 """Of more lines than this one that contradicts alone is a mode that answers otherwise: other axes
@@ -69,10 +69,10 @@ class SlopeConvention:
     """The RTC's order, signs and unit as its matrix shows them."""
 
     wrong: str = ""
-    """What was found, what was told, and what to write; empty: they are as told."""
+    """What was found, what the file says, and what to write; empty: they agree."""
 
     found: SlopeRecipe | None = None
-    """Order and orientation of the slopes where they could be told."""
+    """Order and orientation of the slopes, if they were clear."""
 
     adopted: bool = False
     """Whether the model lists its slopes like that from now on: the file says "auto"."""
@@ -138,18 +138,18 @@ def of_answer(
     reported, mask = _reported(instrument), rtc_valid_subapertures(instrument)
     model = _planes(expected, reported, mask)
     as_seen = _planes(slopes, reported, mask)
-    as_told = _resemblance(as_seen, model)
+    as_stated = _resemblance(as_seen, model)
     lagging = max(_resemblance(as_seen * np.exp(1j * turns_rad * lag), model) for lag in LAGS)
     ratio = float(np.median(np.linalg.norm(slopes, axis=1) / np.linalg.norm(expected, axis=1)))
     unit = ""
-    if as_told >= RESEMBLANCE and not LIKELY[0] < ratio < LIKELY[1]:
+    if as_stated >= RESEMBLANCE and not LIKELY[0] < ratio < LIKELY[1]:
         unit = f"slopes answer commands {ratio:.2g} times as the model does: {_unit_named(ratio)}"
     every = {
         setting: _resemblance(_planes(slopes, setting, mask), model)
         for setting in settings_of(reported, reported.kind.orders)
     }
     best = max(every.values())
-    if best < RESEMBLANCE or as_told * ADVANTAGE > best or lagging > best:
+    if best < RESEMBLANCE or as_stated * ADVANTAGE > best or lagging > best:
         return SlopeConvention(wrong=unit)
     if len(slopes) > _ONE_MODE and np.sum(_of_lines(as_seen, model) < RESEMBLANCE) == 1:
         return SlopeConvention(wrong=unit)
@@ -182,7 +182,7 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Slop
         )
         return SlopeConvention(
             wrong=f"by the RTC's own matrix the mirror is turned by {turned_deg:.0f} deg, "
-            f"{np.rad2deg(start_rad):.0f} deg were told: write [mirror] nominal_rotation_deg"
+            f"{np.rad2deg(start_rad):.0f} deg are in the file: write [mirror] nominal_rotation_deg"
         )
     found = min(settings, key=lambda setting: _n_changes(setting, reported))
     if not stated:
@@ -196,25 +196,25 @@ def _reported(instrument: Instrument) -> SlopeRecipe:
 
 def _n_changes(setting: SlopeRecipe, reported: SlopeRecipe) -> int:
     """Return how many stated keys a setting contradicts."""
-    axes, told_axes = setting.assumed_orientation, reported.assumed_orientation
+    axes, stated_axes = setting.assumed_orientation, reported.assumed_orientation
     names = (*FLIPS, "sign_x", "sign_y")
-    changed = sum(bool(getattr(axes, name) != getattr(told_axes, name)) for name in names)
-    both_signs = axes.sign_x != told_axes.sign_x and axes.sign_y != told_axes.sign_y
+    changed = sum(bool(getattr(axes, name) != getattr(stated_axes, name)) for name in names)
+    both_signs = axes.sign_x != stated_axes.sign_x and axes.sign_y != stated_axes.sign_y
     # light counted the other way round turns both signs: one thing
     return changed - both_signs + (setting.order != reported.order)
 
 
 def _axes_named(witness: str, found: SlopeRecipe, reported: SlopeRecipe) -> str:
     """Return which axes, signs and orders differ from the file, and what to write."""
-    axes, told_axes = found.assumed_orientation, reported.assumed_orientation
+    axes, stated_axes = found.assumed_orientation, reported.assumed_orientation
     differ = []
     if found.order != reported.order:
-        differ.append(f'slopes.order = "{found.order}" ("{reported.order}" told)')
-    flips = [name for name in FLIPS if getattr(axes, name) != getattr(told_axes, name)]
+        differ.append(f'slopes.order = "{found.order}" ("{reported.order}" in the file)')
+    flips = [name for name in FLIPS if getattr(axes, name) != getattr(stated_axes, name)]
     differ += [f"orientation.{name} = {str(getattr(axes, name)).lower()}" for name in flips]
-    if (axes.sign_x, axes.sign_y) != (told_axes.sign_x, told_axes.sign_y):
-        differ.append(f"orientation.{sign_written(axes)} ({sign_written(told_axes)} told)")
-    turned = replace(told_axes, sign_x=-told_axes.sign_x, sign_y=-told_axes.sign_y)
+    if (axes.sign_x, axes.sign_y) != (stated_axes.sign_x, stated_axes.sign_y):
+        differ.append(f"orientation.{sign_written(axes)} ({sign_written(stated_axes)} in the file)")
+    turned = replace(stated_axes, sign_x=-stated_axes.sign_x, sign_y=-stated_axes.sign_y)
     only_the_sign = found == replace(reported, orientation=turned)
     other = "slopes have the other sign" if only_the_sign else "slopes lie otherwise"
     return (

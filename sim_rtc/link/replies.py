@@ -108,8 +108,8 @@ def answer_commands(
         def answer(query: zenoh.Query) -> None:
             with query:
                 data = b"" if query.payload is None else query.payload.to_bytes()
-                said = encode(reply(kind, data))
-                query.reply(keys.command(kind), said, encoding=Encodings.REPLY)
+                reply_bytes = encode(reply(kind, data))
+                query.reply(keys.command(kind), reply_bytes, encoding=Encodings.REPLY)
 
         return answer
 

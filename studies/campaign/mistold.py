@@ -87,11 +87,11 @@ CASES = (
     Case(name="micrometres", words="micrometres", unit=1e6),
     Case(name="millimetres", words="millimetres", unit=1e3),
     Case(name="surface", words="surface", unit=0.5),
-    Case(name="leak 0.9", words="leak 0.900 found, 0.990 told", leak=0.9),
-    Case(name="leak 0.97", words="leak 0.970 found, 0.990 told", leak=0.97),
-    Case(name="delay 3", words="delay 3.00 frames found, 2.00 told", delay_frames=3),
-    Case(name="delay 1", words="delay 1.00 frames found, 2.00 told", delay_frames=1),
-    Case(name="gain half", words="gain 0.5 times the one told", gain=0.5),
+    Case(name="leak 0.9", words="leak 0.900 found, 0.990 in the status", leak=0.9),
+    Case(name="leak 0.97", words="leak 0.970 found, 0.990 in the status", leak=0.97),
+    Case(name="delay 3", words="delay 3.00 frames found, 2.00 in the status", delay_frames=3),
+    Case(name="delay 1", words="delay 1.00 frames found, 2.00 in the status", delay_frames=1),
+    Case(name="gain half", words="gain 0.5 times the one in the status", gain=0.5),
 )
 TOLD_LEAK, TOLD_DELAY = 0.99, 2
 

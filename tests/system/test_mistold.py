@@ -68,7 +68,7 @@ def test_another_leak_than_told_is_named_and_no_matrix_is_sent(night):
     with Stranger(night.zenoh, response, variance_m2, assumed=assumed, leak=0.9) as rtc:
         rtc.told["leak"] = 0.99
         text = wait_for(lambda: wrong(night).get("loop-law"), 20.0, "an alarm")
-        assert "leak 0.900 found, 0.990 told" in text
+        assert "leak 0.900 found, 0.990 in the status" in text
         time.sleep(5.0)
         assert not rtc.applied
 

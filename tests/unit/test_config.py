@@ -740,7 +740,7 @@ def test_a_separation_that_is_not_told_is_that_of_no_other_telescope_and_is_said
     assert load_instrument(write(ABOUT + APART + MIRROR + MODES)).remarks == ()
     bench = load_instrument(write(ABOUT + WFS + MIRROR + MODES))
     assert bench.wfs.pupil_separation_subap == 24.0
-    assert "pupil_separation_subap: not told, taken as 24 (1.2 pupil diam" in bench.remarks[0]
+    assert "pupil_separation_subap: not given, taken as 24 (1.2 pupil diam" in bench.remarks[0]
 
 
 def test_what_is_unknown_is_where_a_fit_begins_and_is_said(write):

@@ -29,7 +29,7 @@ def flagged(checks):
 def test_a_healthy_rtc_is_told_so_in_every_line():
     checks = checked(Pretend())
     assert flagged(checks) == set()
-    assert "leak 0.9900, gain 1 of the one told, delay 2.00 frames" in checks["law"].found
+    assert "leak 0.9900, gain 1 of the stated one, delay 2.00 frames" in checks["law"].found
     assert "1000 frames a second in 20 messages of up to 50" in checks["frames"].found
     assert checks["obedience"].outcome is Outcome.OK
 
@@ -233,7 +233,7 @@ def test_an_rtc_that_is_not_there_is_no_check_but_an_error():
     rtc = Pretend()
     rtc.away = True
     rtc.take()
-    with pytest.raises(LinkError, match="nothing of an RTC of system bench was heard within 5 s"):
+    with pytest.raises(LinkError, match="no RTC of system bench was seen within 5 s"):
         checked(rtc, wait_s=5.0)
 
 

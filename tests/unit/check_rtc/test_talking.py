@@ -66,7 +66,7 @@ def test_the_same_id_answered_otherwise_is_named():
     rtc.twists["reply"] = lambda _, reply: (
         replace(reply, reason=f"{reply.reason} {next(answers)}") if reply.reason else reply
     )
-    wrong(asked(rtc, "replies")["replies"], "the same id was answered otherwise")
+    wrong(asked(rtc, "replies")["replies"], "the same id got another answer")
 
 
 # --- the dither
@@ -78,10 +78,10 @@ def test_the_same_id_answered_otherwise_is_named():
         ({"late_dither": 10**9}, "the frames hold none of it"),
         ({"late_dither": 300}, "301 after the one announced"),
         ({"dither": {"amplitude_m": (8e-9, 4e-9, 4e-9)}}, "mode 4 carries"),
-        ({"dither": {"modes": (4, 5, 19)}}, "modes nobody asked for (19) carry"),
+        ({"dither": {"modes": (4, 5, 19)}}, "modes not asked for (19) carry"),
         ({"dither": {"frequency_hz": (80.0, 150.0, 239.0)}}, "mode 5 moves at another frequency"),
-        ({"never_stops": True}, "told to stop, it went on"),
-        ({"status": {"dither": None}}, "no status tells it"),
+        ({"never_stops": True}, "ordered to stop, it went on"),
+        ({"status": {"dither": None}}, "no status shows it"),
         ({"no_command": ("dither",)}, "no answer"),
         ({"status": {"max_dither_m": 1e-7}, "dither": {}}, ""),
     ],
@@ -157,7 +157,7 @@ def test_who_has_no_stage_and_who_does_not_answer_is_left_alone():
 
 def test_a_stage_that_answers_late_is_named_and_not_moved_blindly():
     rtc, check = moved(stage=1.0, reply_s=1.5)
-    wrong(check, "no answer within 1 s; whether the image has moved is not known")
+    wrong(check, "no answer within 1 s; whether the image has moved is unknown")
     assert [type(one).__name__ for one in rtc.commands].count("OffloadRequest") == 1
 
 

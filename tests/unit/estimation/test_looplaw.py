@@ -29,19 +29,19 @@ def test_a_loop_that_does_what_it_says_is_found_to_the_third_digit(delay):
 @pytest.mark.parametrize("told", [0.9, 0.98, 0.9999])
 def test_another_leak_than_told_is_named_with_both(told):
     law = found(closed_loop(), replace(terms(), leak=told))
-    assert law.wrong == f"leak 0.995 found, {told:.3f} told"
+    assert law.wrong == f"leak 0.995 found, {told:.3f} in the status"
 
 
 @pytest.mark.parametrize("told", [1.0, 3.0, 4.0])
 def test_another_delay_than_told_is_named_with_both(told):
     law = found(closed_loop(), terms(told))
-    assert law.wrong == f"delay 2.00 frames found, {told:.2f} told"
+    assert law.wrong == f"delay 2.00 frames found, {told:.2f} in the status"
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.25, 2.0])
 def test_another_gain_than_told_is_named(factor):
     law = found(closed_loop(), terms(gains=GAINS / np.float32(factor)))
-    assert law.wrong == f"gain {factor:.3g} times the one told"
+    assert law.wrong == f"gain {factor:.3g} times the one in the status"
 
 
 def test_slopes_that_are_sent_with_the_other_sign_are_named():

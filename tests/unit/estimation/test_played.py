@@ -88,7 +88,7 @@ def test_a_tenth_more_or_a_third_less_is_a_mirror_that_clips_and_no_news():
 
 def test_other_modes_are_named():
     (found,) = played(lambda s, n: columns(s, n, modes=(0, 1, 2, 3)))
-    assert "modes nobody asked for (0, 1, 2, 3) carry 8 nm" in found.text
+    assert "modes not asked for (0, 1, 2, 3) carry 8 nm" in found.text
     assert "mode 8 carries 0 nm instead of 4 nm" in found.text
 
 

@@ -143,7 +143,7 @@ class TestTurn:
         anywhere = replace(telescope, mirror=replace(telescope.mirror, nominal_rotation_rad=None))
         counts = counts_of(telescope, SHIFT, shaded(TRIPOD, 50.3))
         path = self.stored(tmp_path / "flux.h5", counts)
-        assert "it does not tell: ambiguous" in read_light(path, anywhere, arms(TRIPOD)).note
+        assert "rotation is unknown: ambiguous" in read_light(path, anywhere, arms(TRIPOD)).note
 
     def test_uneven_light_tells_it_against_another_day(self, telescope, tmp_path):
         before = self.stored(tmp_path / "before.h5", counts_of(telescope, light=beam(gaussian)))

@@ -595,11 +595,11 @@ class TestLaw:
         telemetry = loops.closed_loop(n_frames=1500)
         for moving in ({}, {"moving": True}):
             found = self.after(telemetry, replace(self.TOLD, leak=0.9), **moving)
-            assert "leak 0.995 found, 0.900 told" in found["loop-law"]
+            assert "leak 0.995 found, 0.900 in the status" in found["loop-law"]
 
     def test_another_delay_is_named(self):
         found = self.after(loops.closed_loop(), replace(self.TOLD, delay_frames=3.0))
-        assert "delay 2.00 frames found, 3.00 told" in found["loop-law"]
+        assert "delay 2.00 frames found, 3.00 in the status" in found["loop-law"]
 
     def test_a_status_that_tells_the_truth_at_last_ends_it(self):
         telemetry = loops.closed_loop()

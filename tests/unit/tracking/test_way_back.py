@@ -15,7 +15,7 @@ from service.wire import Loop, LoopRequest
 from tests.unit.tracking.situations import POLICY, Story, foreign, loop_answered, rtc
 
 OWN_SUM, OUR_SUM = "a" * 64, "b" * 64
-LAW = "gain 3 times the one told"
+LAW = "gain 3 times the one in the status"
 
 
 def found(before="initial", after="cm-1", *, verdict=Verdict.WORSE, lost=True):

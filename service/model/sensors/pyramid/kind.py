@@ -74,7 +74,7 @@ class PyramidKind(SensorKind):
         if "pupil_separation_subap" not in given and not told:
             yield (
                 "pupil_separation_subap",
-                f"not told, taken as {table.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil "
+                f"not given, taken as {table.image_separation_subap:g} ({USUAL_SEPARATION:g} pupil "
                 "diameters)",
             )
 

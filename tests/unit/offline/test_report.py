@@ -110,7 +110,7 @@ def test_the_four_parameters_are_there_with_unit_and_uncertainty():
     assert line(text, "rotation").split() == ["rotation", "65.0800", "0.0100", "0.0040", "deg"]
     numbers, words = line(text, "magnification").split()[1:4], "the mirror as drawn over the pupil"
     assert numbers == ["0.98000", "0.00100", "0.00010"]
-    assert f"ratio, of {words} as told" in line(text, "magnification")
+    assert f"ratio, of {words} as described" in line(text, "magnification")
 
 
 def test_what_was_left_out_is_named():

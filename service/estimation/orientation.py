@@ -244,10 +244,10 @@ class _Turned:
         def at(angle: int) -> Array:
             return lowest.shapes.render(points @ rotation(ANGLES_RAD[angle]))
 
-        turned = np.hstack(list(mapper(at, range(len(ANGLES_RAD)))))
-        seen = np.asarray(model.seen(Misregistration(), turned), dtype=np.float64)
-        by_angle = seen.T.reshape(len(ANGLES_RAD), -1, len(seen))
-        columns = np.ascontiguousarray(by_angle.swapaxes(0, 1))
+        seen = [
+            model.seen(Misregistration(), shapes) for shapes in mapper(at, range(len(ANGLES_RAD)))
+        ]
+        columns = np.ascontiguousarray(np.array(seen).transpose(2, 0, 1), dtype=np.float64)
         return cls(lowest=lowest, columns=columns, valid=model.valid)
 
     def pose(self, target: Target, slopes: SlopeRecipe) -> Pose:

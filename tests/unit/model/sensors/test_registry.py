@@ -99,7 +99,7 @@ def test_what_may_be_unknown_of_it_is(write):
 @pytest.mark.parametrize(
     ("wfs", "more", "said"),
     [
-        (WFS.replace("curvature", "shear"), "", "'shear', expected 'pyramid' or 'curvature'"),
+        (WFS.replace("curvature", "shear"), "", "wfs.kind: found 'shear', expected 'pyramid' or"),
         (WFS.replace("extra_m", "extra"), "", "wfs.extra: unknown key, did you mean extra_m?"),
         (WFS + "modulation_lambda_over_d = 3.0\n", "", "modulation_lambda_over_d: unknown key"),
         (WFS, '[slopes]\nkind = "intensity"\n', "found intensity of a curvature, expected xy"),

@@ -18,8 +18,8 @@ from service.tracking import (
     mode_proof,
     offload,
     operator,
+    passive_processing,
     reconstructors,
-    refusals,
     resume,
     rtc,
     validity,
@@ -97,7 +97,7 @@ def _react(context: StepContext, event: Event) -> None:
     reaction = REACTIONS.get(type(event))
     if reaction is not None:
         reaction(context, event)
-    refusals.reset_run(context)
+    window_processing.reset_run(context)
     probation.advance(context, event)
     note_declined(context, rejected=isinstance(event, cmd.Reject))
 
@@ -218,8 +218,8 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     ev.LogEvent: _on_log_event,
     ev.WindowFitted: _on_window,
     ev.WindowLost: window_processing.on_lost,
-    ev.PassiveFitted: window_processing.process_passive,
-    ev.PassiveUnavailable: window_processing.on_passive_unavailable,
+    ev.PassiveFitted: passive_processing.process_passive,
+    ev.PassiveUnavailable: passive_processing.on_passive_unavailable,
     ev.MatrixMade: _on_made,
     ev.MatrixFetched: reconstructors.on_fetched,
     ev.ModesRecognised: mode_proof.note_recognised,

@@ -22,9 +22,9 @@ from service.tracking import (
     dither,
     dither_plan,
     mode_proof,
-    refusals,
     validity,
     void_intervals,
+    window_processing,
 )
 from service.tracking import commands as cmd
 from service.tracking.alarms import ALARMS, RULE_PREFIX, AlarmDefinition, Severity
@@ -166,7 +166,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.SUSPECTED: _jump_suspected,
     alarms.STALE: validity.stale_text,
     # the last: windows may be refused for what another alarm says
-    alarms.WINDOWS_REFUSED: refusals.refused_text,
+    alarms.WINDOWS_REFUSED: window_processing.refused_text,
 }
 """The text of each alarm by state, policy and time; None: there is nothing to see.
 

@@ -107,6 +107,12 @@ def restore_intervals(context: StepContext, intervals: Iterable[VoidInterval]) -
     _set(context, intervals)
 
 
+def cast_doubt(context: StepContext, since_ns_utc: int) -> None:
+    """Let no window settle the doubt that began before what has cast it, or has done so before."""
+    until_ns = max(end_of(context.state, BEFORE_DOUBT), since_ns_utc)
+    void_until(context, until_ns, BEFORE_DOUBT, Purpose.SETTLE)
+
+
 def invalidate_telemetry(context: StepContext, because: str, t_ns_utc: int = 0) -> None:
     """Note that nothing taken until now is a measurement any more.
 

@@ -1,4 +1,4 @@
-"""Windows, and looks at ordinary telemetry, become the registration, or a reason why not.
+"""Dithered windows become the registration, or a reason why not; how many were refused in a row.
 
 One window far out may be a jump or a mistake. It is held, nothing is made from α meanwhile, and
 the next window decides: one that agrees with it makes it a jump, one that agrees with all before
@@ -15,37 +15,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.estimation import kalman
-from service.estimation.estimate import PassiveEstimate
 from service.estimation.kalman import Joint
-from service.estimation.loop import loop_numbers, same_numbers
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind
-from service.model.misregistration import Misregistration, step_text
-from service.tracking import alarms, filtering, jumps, refusals, validity, void_intervals
+from service.model.misregistration import step_text
+from service.tracking import alarms, filtering, jumps, validity, void_intervals
 from service.tracking import events as ev
+from service.tracking.alarms import Interlock
 from service.tracking.dither import note_found
-from service.tracking.dither_plan import why_no_dither
 from service.tracking.filtering import FilterUpdate, WindowEstimate
 from service.tracking.jumps import Innovation
 from service.tracking.operations.acquisition_stages import count_miss
+from service.tracking.operations.running import running_ramp
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import (
-    HistoryEntry,
-    PassiveBias,
-    PassiveState,
-    PointedEstimate,
-    PreviousEstimate,
     Purpose,
     Registration,
     Source,
     SuspectedJump,
     TimedEstimate,
 )
-from service.tracking.state import Level, TrackerState
-from service.tracking.step_context import StepContext
-from service.tracking.void_intervals import BEFORE_DOUBT, BOTH_SIDES, TelemetrySpan
+from service.tracking.state import Level
+from service.tracking.step_context import StepContext, same_but_for_numbers
+from service.tracking.void_intervals import BOTH_SIDES
 
 Array = NDArray[Any]
+
+IN_A_ROW = 3
+"""Windows refused one after the other that are no chance, and windows used that end it."""
+
+
+NONE_FOR_S = 60.0
+"""Of a running dither without a window that could be used. A simulated RTC may be ten times slower
+than its timestamps: a window then takes 20 s."""
+
+
+AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
+"""Kinds of refusals that are no fault, and say nothing of the windows before and after."""
 
 
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
@@ -57,7 +63,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         kind, reason = why
         reject_window(context, reason, kind)
         return
-    refusals.note_used(context)
+    context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
     if void_intervals.is_since_alarm(context.state, alarms.DITHER_LOST, when):
         note_found(context)
     random = isinstance(estimate, RandomEstimate)
@@ -101,12 +107,14 @@ def reject_window(context: StepContext, reason: str, kind: RefusalKind = Refusal
         context.raise_alarm(alarms.WRONG_ANSWER, reason)
     level = Level.INFO if kind is RefusalKind.CUT_SHORT else Level.WARNING
     _note_refusal(context, reason, level)
-    refusals.note_refused(context, reason, kind)
+    if kind not in AS_EXPECTED:
+        run = min(context.windows.run, 0) - 1
+        context.windows = replace(context.windows, run=run, refused_because=reason)
 
 
 def _note_refusal(context: StepContext, reason: str, level: Level = Level.INFO) -> None:
-    line = context.log("window.refused", reason, level)
-    context.windows = replace(context.windows, refusal=line)
+    line, n_refused = context.log("window.refused", reason, level), context.windows.refused + 1
+    context.windows = replace(context.windows, refusal=line, refused=n_refused)
 
 
 def process_window(context: StepContext, measured: WindowEstimate) -> None:
@@ -127,7 +135,6 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     far = jumps.window_innovation(registration, measured, context.policy)
     too_early = void_intervals.why_void(context.state, measured.when, Purpose.SETTLE)
     if too_early is not None and not far.is_outlier:
-        refusals.count_refused(context)
         _note_refusal(context, too_early)
         return
     if registration.suspected_jump is not None:
@@ -184,7 +191,7 @@ def _suspect_jump(
     validity.store_registration(
         context, replace(registration, doubt=doubt, doubt_voids=True, suspected_jump=candidate)
     )
-    _cast_doubt(context, measured.t_ns_utc)
+    void_intervals.cast_doubt(context, measured.t_ns_utc)
     filtering.add_history(
         context, filtering.history_entry(measured, registration, innovation, entered=False)
     )
@@ -228,12 +235,6 @@ def _jump(
     )
 
 
-def _cast_doubt(context: StepContext, since_ns_utc: int) -> None:
-    """Let no window settle the doubt that began before what has cast it, or has done so before."""
-    until_ns = max(void_intervals.end_of(context.state, BEFORE_DOUBT), since_ns_utc)
-    void_intervals.void_until(context, until_ns, BEFORE_DOUBT, Purpose.SETTLE)
-
-
 def _innovation(prior: Joint, measured: WindowEstimate) -> float:
     return kalman.innovation(prior, measured.alpha.vector, measured.covariance)
 
@@ -242,247 +243,51 @@ def _distance_text(window: TimedEstimate, registration: Registration) -> str:
     return step_text(window.alpha.vector - registration.alpha.vector)
 
 
-def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
-    """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
-    reason = _why_passive_unusable(context.state, event) or _why_known_already(context.state, event)
-    if reason is not None:
-        _note_unavailable(context, f"a look was not used: {reason}")
-        return
-    registration, estimate = context.registration, event.estimate
-    if registration is None:
-        _show_passive_alone(context, event)
-        return
-    block = estimate.bias
-    registration = _with_first_bias(registration, estimate)
-    forward = filtering.predict(context, registration, event.t_ns_utc)
-    prior = kalman.allowing(forward, block, estimate.bias_excess)
-    mixed = _why_of_two_places(context.state, registration, event)
-    if mixed is not None:
-        looked = _biases_after_look(
-            context.state, registration, filtering.joint_of(registration), event
-        )
-        validity.store_registration(context, replace(registration, biases=looked))
-        sigma = _passive_sigma(estimate, prior)
-        _show_passive(context, event, sigma, prior.bias(block), f"not used: {mixed}")
-        return
-    measured = estimate.alpha.vector
-    window = PointedEstimate(
-        alpha=estimate.alpha,
-        covariance=prior.bias_of(block).scatter * estimate.covariance,
-        t_ns_utc=event.t_ns_utc,
-        pointing=validity.pointing_at(context.state, event.t_ns_utc),
-    )
-    far = jumps.passive_innovation(
-        registration, filtering.joint_of(registration), block, window, context.policy
-    )
-    if far > jumps.PASSIVE_LIMIT:
-        _ask_for_window(context, registration, event, prior, far)
-        return
-    joint = kalman.corrected(prior, measured, estimate.covariance, block)
-    joint = kalman.scattered(joint, block, far)
-    registration = _registration_after_passive(context, registration, joint, event)
-    validity.store_registration(context, registration)
-    validity.age_registration(context)
-    sigma = _passive_sigma(estimate, prior)
-    entry = HistoryEntry(
-        t_ns_utc=event.t_ns_utc,
-        measured=Misregistration.from_vector(measured - joint.bias(block)),
-        measured_sigma=sigma,
-        filtered=registration.alpha,
-        filtered_sigma=registration.sigma,
-        innovation=kalman.innovation(prior, measured, estimate.covariance, block),
-        misfit=estimate.misfit,
-        source=Source.PASSIVE,
-    )
-    filtering.add_history(context, entry)
-    text = "agrees with α and with what is known of its own bias"
-    _show_passive(context, event, sigma, joint.bias(block), text)
+def reset_run(context: StepContext) -> None:
+    """Begin to count anew where no window is expected any more."""
+    if context.windows.run < 0 and _is_excused(context):
+        context.windows = replace(context.windows, run=0)
 
 
-def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
-    """Note why ordinary telemetry says nothing of α now."""
-    _note_unavailable(context, event.text)
+def refused_text(context: StepContext) -> str | None:
+    """Return why windows are refused one after the other, or none comes; None: they are not.
 
-
-def _note_unavailable(context: StepContext, why: str) -> None:
-    context.alpha = replace(context.alpha, passive_unavailable_reason=why)
-
-
-def fit_begins_at(state: TrackerState) -> Misregistration | None:
-    """Return about what a look is to be fitted: α, or the last look; None: the nominal rotation."""
-    if state.alpha.registration is not None:
-        return state.alpha.registration.alpha
-    last = state.alpha.passive
-    return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
-
-
-def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return why a look says nothing of the telescope as it is, or None."""
-    of_loop = loop_numbers(state.loop.rtc)
-    if event.loop and of_loop and not same_numbers(event.loop, of_loop):
-        return "the loop has changed since"
-    return filtering.why_no_measurement(
-        state, void_intervals.telemetry_span(event.began_ns_utc, event.t_ns_utc)
-    )
-
-
-def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return which later telemetry has told more than a look that was long under way, or None."""
-    registration = state.alpha.registration
-    if registration is None or not registration.window_began_ns_utc:
-        return None
-    since = void_intervals.telemetry_span(
-        registration.window_began_ns_utc, registration.window_began_ns_utc
-    )
-    if void_intervals.precedes(state, since, event.t_ns_utc):
-        return None
-    return "a dithered window taken since has been fitted before it"
-
-
-def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
-    """Show a look while α is not known: it is all there is, and no more than it says it is."""
-    step = event.estimate.alpha.vector - context.policy.start.vector
-    if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
-        text = (
-            f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
-            "begins, the nominal rotation; let the service acquire, or dither"
-        )
-        _show_passive(context, event, np.full(4, np.inf), np.zeros(4), text)
-        return
-    text = "no dithered estimate to compare with: nothing is made from this reading alone"
-    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text)
-
-
-def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> Registration:
-    """Return what is known with the bias as large as the first look at it says that it may be.
-
-    A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
-    told with less patience.
+    As many in a row as raise the alarm end it. One that is expected and does not come is as good as
+    refused.
     """
-    bias = registration.bias(estimate.bias)
-    if bias is not None and bias.looked_ns_utc:
-        return registration
-    joint = kalman.forget(filtering.joint_of(registration), estimate.bias, estimate.bias_excess)
-    return replace(registration, biases=filtering.biases_of(joint))
+    raised, run = context.alarm_text(alarms.WINDOWS_REFUSED), context.windows.run
+    if run <= -IN_A_ROW:
+        because = context.windows.refused_because
+        text = f"windows are refused one after the other: {because}; α is not measured meanwhile"
+        if raised is not None and same_but_for_numbers(raised, text):
+            text = raised  # one cause is one text: of each window the log tells the numbers
+    elif raised is not None:
+        text = raised if run < IN_A_ROW else ""
+    else:
+        text = _missing_text(context)
+    return None if not text or _is_excused(context) else text
 
 
-def _biases_after_look(
-    state: TrackerState,
-    registration: Registration,
-    joint: Joint,
-    event: ev.PassiveFitted,
-    previous: PreviousEstimate | None = None,
-) -> tuple[PassiveBias, ...]:
-    """Return the biases after a look, as the filter has them; ``previous``: what it saw it from."""
-    name, loop = event.estimate.bias.name, _loop(state, registration, event)
-    return tuple(
-        replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
-        if bias.block.name == name
-        else bias
-        for bias in filtering.biases_of(joint)
+def _missing_text(context: StepContext) -> str:
+    registration, dither = context.registration, context.dither
+    if dither is None or dither.start_seq is None:
+        return ""
+    since_ns = max(registration.window_ns_utc if registration else 0, dither.asked_ns_utc)
+    patience_s = max(NONE_FOR_S, 3.0 * (dither.window_s or 0.0))
+    if context.now_ns - since_ns < patience_s * SECOND_NS:
+        return ""
+    return f"no window was accepted for {patience_s:.0f} s although a dither runs"
+
+
+def _is_excused(context: StepContext) -> bool:
+    """Return whether windows are refused for what is known already, or none is wanted."""
+    state, rtc = context.state, context.rtc
+    if rtc is None or not rtc.in_loop or state.dithers.stopped or state.operator.stopped_because:
+        return True
+    if context.acquisition.under_way or state.measuring is not None:
+        return True
+    return (
+        running_ramp(state, context.now_ns) is not None
+        or context.blocking_alarm(Interlock.MEASURE) is not None
+        or context.blocking_alarm(Interlock.ASK) is not None
     )
-
-
-def _loop(
-    state: TrackerState, registration: Registration, event: ev.PassiveFitted
-) -> tuple[float, ...]:
-    """Return the loop that is looked at; while no RTC is there, the one of the last look."""
-    if state.loop.rtc is not None:
-        return loop_numbers(state.loop.rtc)
-    bias = registration.bias(event.estimate.bias)
-    return () if bias is None else bias.loop
-
-
-def _why_of_two_places(
-    state: TrackerState, registration: Registration, event: ev.PassiveFitted
-) -> str | None:
-    """Return why a passive estimate may be of telemetry from before a jump and after it, or None.
-
-    It began no earlier than the one before it ended.
-    """
-    if registration.suspected_jump is not None:
-        return BOTH_SIDES
-    bias = registration.bias(event.estimate.bias)
-    began_ns = 0 if bias is None else bias.looked_ns_utc
-    span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
-    return void_intervals.why_void(state, span, Purpose.PASSIVE)
-
-
-def _ask_for_window(
-    context: StepContext,
-    registration: Registration,
-    event: ev.PassiveFitted,
-    prior: Joint,
-    far: float,
-) -> None:
-    """Forget the bias and want a dithered window: the wind has changed or the mirror has moved.
-
-    A look alone is no match for windows: α stays valid, and nothing is made or sent until a window
-    taken since has told. It is an alarm where none can, or none has when a second look disagrees.
-    """
-    text = (
-        "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
-        "dithered window must tell which"
-    )
-    registration = context.registration or registration
-    waits, void = bool(registration.doubt), bool(registration.doubt) and registration.doubt_voids
-    why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
-    gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
-    after = _registration_after_passive(context, registration, gone, event)
-    biases = _biases_after_look(context.state, registration, gone, event)
-    doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
-    validity.store_registration(context, doubted)
-    _cast_doubt(context, event.t_ns_utc)
-    context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
-    validity.request_window(context, text)
-    if why_none is not None or waits:
-        cannot = "none has since the last look that did" if why_none is None else why_none
-        context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
-    validity.age_registration(context)
-    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
-
-
-def _registration_after_passive(
-    context: StepContext, registration: Registration, joint: Joint, event: ev.PassiveFitted
-) -> Registration:
-    """Return the registration as the filter has it after a look."""
-    block, was = event.estimate.bias, None
-    if registration.bias(block) is not None:
-        was = jumps.sum_of(registration, filtering.joint_of(registration), block)
-    return replace(
-        registration,
-        alpha=Misregistration.from_vector(joint.alpha),
-        covariance=joint.alpha_covariance,
-        t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
-        arrived_ns_utc=context.now_ns,
-        biases=_biases_after_look(context.state, registration, joint, event, was),
-        pointing=validity.pointing_at(context.state, event.t_ns_utc),
-    )
-
-
-def _passive_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
-    """Return ``(4,)`` 1 σ of the estimate as a reading of α: its scatter, and that of its bias."""
-    place = prior.place(estimate.bias)
-    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[place])
-
-
-def _show_passive(
-    context: StepContext,
-    event: ev.PassiveFitted,
-    sigma: Array,
-    bias: Array,
-    text: str,
-    *,
-    consistent: bool = True,
-) -> None:
-    watchdog = PassiveState(
-        alpha=event.estimate.alpha,
-        sigma=sigma,
-        misfit=event.estimate.misfit,
-        t_ns_utc=event.t_ns_utc,
-        consistent=consistent,
-        text=text,
-        bias=bias,
-        estimator=event.estimate.bias.name,
-    )
-    context.alpha = replace(context.alpha, passive=watchdog, passive_unavailable_reason="")

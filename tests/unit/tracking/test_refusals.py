@@ -9,8 +9,8 @@ from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarms import WINDOWS_REFUSED
 from service.tracking.operations.running import ServiceState, operating
-from service.tracking.refusals import IN_A_ROW
 from service.tracking.state import Mode
+from service.tracking.window_processing import IN_A_ROW
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
 
 MISSING = "150 of 2000 frames missing, more than 5%: check the link to the RTC"

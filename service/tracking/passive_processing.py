@@ -1,0 +1,282 @@
+"""Passive estimates become the registration, its bias allowed for, or doubt it.
+
+A passive estimate alone is no match for dithered windows: where it disagrees it asks for one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.estimation import kalman
+from service.estimation.estimate import PassiveEstimate
+from service.estimation.kalman import Joint
+from service.estimation.loop import loop_numbers, same_numbers
+from service.model.misregistration import Misregistration
+from service.tracking import alarms, filtering, jumps, validity, void_intervals
+from service.tracking import events as ev
+from service.tracking.dither_plan import why_no_dither
+from service.tracking.registration import (
+    HistoryEntry,
+    PassiveBias,
+    PassiveState,
+    PointedEstimate,
+    PreviousEstimate,
+    Purpose,
+    Registration,
+    Source,
+)
+from service.tracking.state import TrackerState
+from service.tracking.step_context import StepContext
+from service.tracking.void_intervals import BOTH_SIDES, TelemetrySpan
+
+Array = NDArray[Any]
+
+
+def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
+    """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
+    reason = _why_passive_unusable(context.state, event) or _why_known_already(context.state, event)
+    if reason is not None:
+        _note_unavailable(context, f"a look was not used: {reason}")
+        return
+    registration, estimate = context.registration, event.estimate
+    if registration is None:
+        _show_passive_alone(context, event)
+        return
+    block = estimate.bias
+    registration = _with_first_bias(registration, estimate)
+    forward = filtering.predict(context, registration, event.t_ns_utc)
+    prior = kalman.allowing(forward, block, estimate.bias_excess)
+    mixed = _why_of_two_places(context.state, registration, event)
+    if mixed is not None:
+        looked = _biases_after_look(
+            context.state, registration, filtering.joint_of(registration), event
+        )
+        validity.store_registration(context, replace(registration, biases=looked))
+        sigma = _passive_sigma(estimate, prior)
+        _show_passive(context, event, sigma, prior.bias(block), f"not used: {mixed}")
+        return
+    measured = estimate.alpha.vector
+    window = PointedEstimate(
+        alpha=estimate.alpha,
+        covariance=prior.bias_of(block).scatter * estimate.covariance,
+        t_ns_utc=event.t_ns_utc,
+        pointing=validity.pointing_at(context.state, event.t_ns_utc),
+    )
+    far = jumps.passive_innovation(
+        registration, filtering.joint_of(registration), block, window, context.policy
+    )
+    if far > jumps.PASSIVE_LIMIT:
+        _ask_for_window(context, registration, event, prior, far)
+        return
+    joint = kalman.corrected(prior, measured, estimate.covariance, block)
+    joint = kalman.scattered(joint, block, far)
+    registration = _registration_after_passive(context, registration, joint, event)
+    validity.store_registration(context, registration)
+    validity.age_registration(context)
+    sigma = _passive_sigma(estimate, prior)
+    entry = HistoryEntry(
+        t_ns_utc=event.t_ns_utc,
+        measured=Misregistration.from_vector(measured - joint.bias(block)),
+        measured_sigma=sigma,
+        filtered=registration.alpha,
+        filtered_sigma=registration.sigma,
+        innovation=kalman.innovation(prior, measured, estimate.covariance, block),
+        misfit=estimate.misfit,
+        source=Source.PASSIVE,
+    )
+    filtering.add_history(context, entry)
+    text = "agrees with α and with what is known of its own bias"
+    _show_passive(context, event, sigma, joint.bias(block), text)
+
+
+def on_passive_unavailable(context: StepContext, event: ev.PassiveUnavailable) -> None:
+    """Note why ordinary telemetry says nothing of α now."""
+    _note_unavailable(context, event.text)
+
+
+def _note_unavailable(context: StepContext, why: str) -> None:
+    context.alpha = replace(context.alpha, passive_unavailable_reason=why)
+
+
+def fit_begins_at(state: TrackerState) -> Misregistration | None:
+    """Return about what a look is to be fitted: α, or the last look; None: the nominal rotation."""
+    if state.alpha.registration is not None:
+        return state.alpha.registration.alpha
+    last = state.alpha.passive
+    return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
+
+
+def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str | None:
+    """Return why a look says nothing of the telescope as it is, or None."""
+    of_loop = loop_numbers(state.loop.rtc)
+    if event.loop and of_loop and not same_numbers(event.loop, of_loop):
+        return "the loop has changed since"
+    return filtering.why_no_measurement(
+        state, void_intervals.telemetry_span(event.began_ns_utc, event.t_ns_utc)
+    )
+
+
+def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
+    """Return which later telemetry has told more than a look that was long under way, or None."""
+    registration = state.alpha.registration
+    if registration is None or not registration.window_began_ns_utc:
+        return None
+    since = void_intervals.telemetry_span(
+        registration.window_began_ns_utc, registration.window_began_ns_utc
+    )
+    if void_intervals.precedes(state, since, event.t_ns_utc):
+        return None
+    return "a dithered window taken since has been fitted before it"
+
+
+def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
+    """Show a look while α is not known: it is all there is, and no more than it says it is."""
+    step = event.estimate.alpha.vector - context.policy.start.vector
+    if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
+        text = (
+            f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
+            "begins, the nominal rotation; let the service acquire, or dither"
+        )
+        _show_passive(context, event, np.full(4, np.inf), np.zeros(4), text)
+        return
+    text = "no dithered estimate to compare with: nothing is made from this reading alone"
+    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text)
+
+
+def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> Registration:
+    """Return what is known with the bias as large as the first look at it says that it may be.
+
+    A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
+    told with less patience.
+    """
+    bias = registration.bias(estimate.bias)
+    if bias is not None and bias.looked_ns_utc:
+        return registration
+    joint = kalman.forget(filtering.joint_of(registration), estimate.bias, estimate.bias_excess)
+    return replace(registration, biases=filtering.biases_of(joint))
+
+
+def _biases_after_look(
+    state: TrackerState,
+    registration: Registration,
+    joint: Joint,
+    event: ev.PassiveFitted,
+    previous: PreviousEstimate | None = None,
+) -> tuple[PassiveBias, ...]:
+    """Return the biases after a look, as the filter has them; ``previous``: what it saw it from."""
+    name, loop = event.estimate.bias.name, _loop(state, registration, event)
+    return tuple(
+        replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
+        if bias.block.name == name
+        else bias
+        for bias in filtering.biases_of(joint)
+    )
+
+
+def _loop(
+    state: TrackerState, registration: Registration, event: ev.PassiveFitted
+) -> tuple[float, ...]:
+    """Return the loop that is looked at; while no RTC is there, the one of the last look."""
+    if state.loop.rtc is not None:
+        return loop_numbers(state.loop.rtc)
+    bias = registration.bias(event.estimate.bias)
+    return () if bias is None else bias.loop
+
+
+def _why_of_two_places(
+    state: TrackerState, registration: Registration, event: ev.PassiveFitted
+) -> str | None:
+    """Return why a passive estimate may be of telemetry from before a jump and after it, or None.
+
+    It began no earlier than the one before it ended.
+    """
+    if registration.suspected_jump is not None:
+        return BOTH_SIDES
+    bias = registration.bias(event.estimate.bias)
+    began_ns = 0 if bias is None else bias.looked_ns_utc
+    span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
+    return void_intervals.why_void(state, span, Purpose.PASSIVE)
+
+
+def _ask_for_window(
+    context: StepContext,
+    registration: Registration,
+    event: ev.PassiveFitted,
+    prior: Joint,
+    far: float,
+) -> None:
+    """Forget the bias and want a dithered window: the wind has changed or the mirror has moved.
+
+    A look alone is no match for windows: α stays valid, and nothing is made or sent until a window
+    taken since has told. It is an alarm where none can, or none has when a second look disagrees.
+    """
+    text = (
+        "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
+        "dithered window must tell which"
+    )
+    registration = context.registration or registration
+    waits, void = bool(registration.doubt), bool(registration.doubt) and registration.doubt_voids
+    why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
+    gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
+    after = _registration_after_passive(context, registration, gone, event)
+    biases = _biases_after_look(context.state, registration, gone, event)
+    doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
+    validity.store_registration(context, doubted)
+    void_intervals.cast_doubt(context, event.t_ns_utc)
+    context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
+    validity.request_window(context, text)
+    if why_none is not None or waits:
+        cannot = "none has since the last look that did" if why_none is None else why_none
+        context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
+    validity.age_registration(context)
+    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)
+
+
+def _registration_after_passive(
+    context: StepContext, registration: Registration, joint: Joint, event: ev.PassiveFitted
+) -> Registration:
+    """Return the registration as the filter has it after a look."""
+    block, was = event.estimate.bias, None
+    if registration.bias(block) is not None:
+        was = jumps.sum_of(registration, filtering.joint_of(registration), block)
+    return replace(
+        registration,
+        alpha=Misregistration.from_vector(joint.alpha),
+        covariance=joint.alpha_covariance,
+        t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
+        arrived_ns_utc=context.now_ns,
+        biases=_biases_after_look(context.state, registration, joint, event, was),
+        pointing=validity.pointing_at(context.state, event.t_ns_utc),
+    )
+
+
+def _passive_sigma(estimate: PassiveEstimate, prior: Joint) -> Array:
+    """Return ``(4,)`` 1 σ of the estimate as a reading of α: its scatter, and that of its bias."""
+    place = prior.place(estimate.bias)
+    return np.sqrt(np.diag(estimate.covariance) + np.diag(prior.covariance)[place])
+
+
+def _show_passive(
+    context: StepContext,
+    event: ev.PassiveFitted,
+    sigma: Array,
+    bias: Array,
+    text: str,
+    *,
+    consistent: bool = True,
+) -> None:
+    watchdog = PassiveState(
+        alpha=event.estimate.alpha,
+        sigma=sigma,
+        misfit=event.estimate.misfit,
+        t_ns_utc=event.t_ns_utc,
+        consistent=consistent,
+        text=text,
+        bias=bias,
+        estimator=event.estimate.bias.name,
+    )
+    context.alpha = replace(context.alpha, passive=watchdog, passive_unavailable_reason="")

@@ -222,7 +222,7 @@ def test_an_operators_dither_is_not_cut_short(story):
 
 def test_an_open_loop_has_no_noisy_matrix():
     story = Story(policy=STILL).meet(loop="open")
-    with pytest.raises(CommandError, match="loop closed"):
+    with pytest.raises(CommandError, match="close it first"):
         story.tell(ASK)
 
 

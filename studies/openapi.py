@@ -21,7 +21,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from fastapi import FastAPI
 from fastapi.routing import APIRoute, iter_route_contexts
-from pydantic import TypeAdapter
+from pydantic import BaseModel, ConfigDict, TypeAdapter
+from pydantic.json_schema import models_json_schema
 
 from service.api import create_app
 from service.model.misregistration import PARAMETERS, Misregistration
@@ -44,6 +45,11 @@ def document() -> dict[str, Any]:
     found = app.openapi()
     known = found["components"]["schemas"]
     known |= {"Problem": problems.Problem.model_json_schema()} | _views()
+    _, of_fits = models_json_schema(
+        [(kind, "serialization") for kind in (FitDocument, FitFigures)],
+        ref_template=f"{SCHEMAS}{{model}}",
+    )
+    known |= of_fits["$defs"]
     _put_beside_the_four(known["FitDocument"])
     _tell_bodies(app, found)
     found["components"]["securitySchemes"] = SCHEMES
@@ -261,3 +267,91 @@ def _for_readers(text: str) -> str:
     """Return a record's description as it is true of JSON: null, four names, boundary units."""
     text = re.sub(r"\b(None|NaN)\b", "null", text.partition("\n\n")[0])
     return re.sub(r"``\(4,\)`` |,? ?numeric units( \([^)]*\))?", "", text)
+
+
+# --- what a fit of a file answers: it is pyrcal/offline's, and the service hands it on
+
+
+class FitDocument(BaseModel):
+    """What a fit has found: the object that ``pyrcal fit --json`` prints."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    sigma: dict[str, float | None]
+    """1 σ of the four, by name; noise, disagreement of subsets and model error together."""
+
+    covariance: list[list[float | None]]
+    """4 x 4, in the units of the names."""
+
+    gains: list[float | None]
+    """Measured column over the model's, one for each mode used, passes divided out."""
+
+    residual_fraction: float | None
+    """RMS of what is left over RMS of the measurement."""
+
+    condition_number: float | None
+    """Of the synthetic matrix, modes used."""
+
+    n_modes_used: int
+    orientation: dict[str, Any]
+    """Of the slopes, as the instrument file would say it."""
+
+    subset_scatter: dict[str, float | None]
+    """1 σ scatter of disjoint sets of modes, by name."""
+
+    converged: bool
+    verdict: str
+    """Begins with "accepted" or "refused"; names what was left out."""
+
+    anamorphosis: list[float] | None = None
+    """Half the stretch along x over that along y, and along 45 deg over 135 deg; null: not
+    asked for."""
+
+    instrument_found: dict[str, dict[str, float | None]] = {}
+    """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
+
+    notes: list[str]
+    """What was decided on the way, or overruled, and should be known."""
+
+    seconds: float | None
+
+
+class FitMap(BaseModel):
+    """The signals of one mode: rows from the lowest y on, Sx beside Sy; null: not valid.
+
+    Of pixels the four images, as they lie on the detector.
+    """
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    mode: int
+    measured: list[list[int | None]]
+    """Percent of three times the RMS of what was measured, cut there."""
+
+    synthetic: list[list[int | None]]
+    """The model's, gain applied, in the same unit."""
+
+
+class FitFigures(BaseModel):
+    """What the figures of a fit are drawn from."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    own_instrument: bool
+    """Whether it is a fit of the service's own instrument, whose α it may be held against."""
+
+    modes: list[int]
+    """Basis indices of the modes used; ``gains`` of the fit are of these."""
+
+    residual_by_mode: list[float | None]
+    """RMS of what is left over RMS of the measurement, of each."""
+
+    singular_values: dict[str, list[float | None]]
+    """"measured" and "synthetic", each over its largest."""
+
+    residual_map: list[list[int | None]]
+    """What is left in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
+    beside Sy; null: not valid."""
+
+    maps: list[FitMap]
+    """Of a few modes, the paper's where they were used."""

@@ -109,50 +109,6 @@ class FitParameters(BaseModel):
         return self.model_dump(mode="json", exclude={"name", "measurement"})
 
 
-class FitDocument(BaseModel):
-    """What a fit has found: the object that ``pyrcal fit --json`` prints."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    sigma: dict[str, float | None]
-    """1 σ of the four, by name; noise, disagreement of subsets and model error together."""
-
-    covariance: list[list[float | None]]
-    """4 x 4, in the units of the names."""
-
-    gains: list[float | None]
-    """Measured column over the model's, one for each mode used, passes divided out."""
-
-    residual_fraction: float | None
-    """RMS of what is left over RMS of the measurement."""
-
-    condition_number: float | None
-    """Of the synthetic matrix, modes used."""
-
-    n_modes_used: int
-    orientation: dict[str, Any]
-    """Of the slopes, as the instrument file would say it."""
-
-    subset_scatter: dict[str, float | None]
-    """1 σ scatter of disjoint sets of modes, by name."""
-
-    converged: bool
-    verdict: str
-    """Begins with "accepted" or "refused"; names what was left out."""
-
-    anamorphosis: list[float] | None = None
-    """Half the stretch along x over that along y, and along 45 deg over 135 deg; null: not
-    asked for."""
-
-    instrument_found: dict[str, dict[str, float | None]] = {}
-    """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
-
-    notes: list[str]
-    """What was decided on the way, or overruled, and should be known."""
-
-    seconds: float | None
-
-
 class FitAcceptedView(BaseModel):
     """A fit in the queue."""
 
@@ -218,14 +174,12 @@ async def fits_known(fits: FitsDep) -> Response:
     return views.answer(FitJobs(fits=tuple(fits.jobs())))
 
 
-_FOUND = {
-    "anyOf": [{"$ref": f"{views.SCHEMAS}FitDocument"}, {"$ref": f"{views.SCHEMAS}{FIT_JOB.name}"}]
-}
+_FOUND = {"anyOf": [{"$ref": f"{views.SCHEMAS}{one}"} for one in ("FitDocument", FIT_JOB.name)]}
+_DRAWN = {"$ref": f"{views.SCHEMAS}FitFigures"}
 
 
 @router.get(
     "/fits/{id}",
-    response_model=FitDocument,
     responses={
         200: {
             "description": "What was found; of a fit that failed or was given up the job itself: "
@@ -249,48 +203,16 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
     return JSONResponse(views.to_json(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
 
 
-class FitMap(BaseModel):
-    """The signals of one mode: rows from the lowest y on, Sx beside Sy; null: not valid.
-
-    Of pixels the four images, as they lie on the detector.
-    """
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    mode: int
-    measured: list[list[int | None]]
-    """Percent of three times the RMS of what was measured, cut there."""
-
-    synthetic: list[list[int | None]]
-    """The model's, gain applied, in the same unit."""
-
-
-class FitFigures(BaseModel):
-    """What the figures of a fit are drawn from."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    own_instrument: bool
-    """Whether it is a fit of the service's own instrument, whose α it may be held against."""
-
-    modes: list[int]
-    """Basis indices of the modes used; ``gains`` of the fit are of these."""
-
-    residual_by_mode: list[float | None]
-    """RMS of what is left over RMS of the measurement, of each."""
-
-    singular_values: dict[str, list[float | None]]
-    """"measured" and "synthetic", each over its largest."""
-
-    residual_map: list[list[int | None]]
-    """What is left in each subaperture, percent of the measured RMS: rows from the lowest y on, Sx
-    beside Sy; null: not valid."""
-
-    maps: list[FitMap]
-    """Of a few modes, the paper's where they were used."""
-
-
-@router.get("/fits/{id}/figures", response_model=FitFigures, responses={**UNKNOWN})
+@router.get(
+    "/fits/{id}/figures",
+    responses={
+        200: {
+            "description": "What the figures of a fit are drawn from.",
+            "content": {"application/json": {"schema": _DRAWN}},
+        },
+        **UNKNOWN,
+    },
+)
 async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
     """Return what the figures of a finished fit are drawn from; 404 while there are none."""
     job = fits.job(fit_id)

@@ -56,6 +56,16 @@ def test_what_rounds_to_nothing_has_no_sign():
     assert shown == ["0.0", "-0.1", "0.0 nm", "0", "0", "-3", "+3", "1.000"]
 
 
+def test_a_search_finds_lines_by_any_of_their_texts_and_what_has_led_to_them():
+    line = '"mode", "mode is hold", "Rollback-20261125T023559.123456"'
+    searches = ["", "  ", "HOLD mode", "rollback-20261125t02", "hold auto", "rollback-2027"]
+    found = told(f"""
+      const searches = {json.dumps(searches)};
+      console.log(JSON.stringify(searches.map((search) => words.holds(search, {line}))));
+    """)
+    assert found == [True, True, True, True, False, False]
+
+
 def sample(t_s, telemetry=True):
     ns = t_s * 1_000_000_000
     return {"t_ns_utc": ns, "telemetry_ns_utc": ns if telemetry else None}

@@ -1,7 +1,7 @@
 // What happened: alarms stay on top for as long as they last, the log below them, newest first.
 
 import { runbookOf, unseen, worstFirst } from "./alarms.js";
-import { SYMBOLS, ago, clock, day, make, milliseconds, put, toneOf } from "./words.js";
+import { SYMBOLS, ago, clock, day, holds, make, milliseconds, put, toneOf } from "./words.js";
 
 const MOST = 500;
 function about(order, name, text) {
@@ -61,19 +61,16 @@ export class Events {
   }
 
   #show() {
-    const words = this.filter.value.toLowerCase().split(/\s+/).filter(Boolean);
     const levels = { all: ["info", "warning", "alarm"], warning: ["warning", "alarm"], alarm: ["alarm"] }[this.level.value];
-    const shown = [...this.#lines.values()].reverse().filter((line) => {
-      const text = `${line.name} ${line.text}`.toLowerCase();
-      return levels.includes(line.level) && words.every((word) => text.includes(word));
-    });
+    const shown = [...this.#lines.values()].reverse().filter((line) =>
+      levels.includes(line.level) && holds(this.filter.value, line.name, line.text, line.cause));
     const rows = shown.slice(0, 200).map((line) => {
       const ms = milliseconds(line.t_ns_utc);
       const text = line.n_times > 1 ? `${line.text} (${line.n_times} times)` : line.text;
       return make("tr", { className: line.level },
         make("td", {}, make("time", { datetime: new Date(ms).toISOString(), title: day(ms), text: clock(ms) })),
         make("td", { text: `${SYMBOLS[line.level]} ${line.level}` }),
-        make("td", { text: line.name }),
+        make("td", { text: line.name, title: line.cause }),
         make("td", { text }));
     });
     this.root.querySelector("tbody").replaceChildren(...rows);

@@ -5,7 +5,7 @@ import { Charts } from "./charts.js";
 import { Compare } from "./compare.js";
 import { HISTORY_ORDERS } from "./history_orders.js";
 import { Against, Trends } from "./trends.js";
-import { DASH, SYMBOLS, clock, day, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
+import { DASH, SYMBOLS, clock, day, holds, make, milliseconds, number, put, registrationOf, span, verdict } from "./words.js";
 
 const LINES = 500; // of the audit trail that are read at once
 const HOUR_MS = 3_600_000;
@@ -216,18 +216,15 @@ export class History {
   }
 
   #showLines() {
-    const words = this.root.querySelector("input[type=search]").value.toLowerCase().split(/\s+/).filter(Boolean);
-    const shown = this.#lines.filter((line) => {
-      const text = `${line.who} ${line.name} ${line.text} ${line.why} ${line.answer}`.toLowerCase();
-      return words.every((word) => text.includes(word));
-    });
+    const search = this.root.querySelector("input[type=search]").value;
+    const shown = this.#lines.filter((line) => holds(search, line.who, line.name, line.text, line.why, line.answer, line.cause));
     put(this.root.querySelector(".count"), `${number(shown.length, 0)} of ${this.#lines.length} lines read`);
     this.root.querySelector("#trail tbody").replaceChildren(...shown.slice(0, 2 * LINES).map((line) => {
       const ms = milliseconds(line.t_ns_utc);
       return make("tr", {},
         make("td", {}, make("time", { datetime: new Date(ms).toISOString(), title: day(ms), text: clock(ms) })),
         make("td", { text: `${line.who}${line.channel && `, ${line.channel}`}`, title: line.address }),
-        make("td", { text: `${line.name}: ${line.text}` }),
+        make("td", { text: `${line.name}: ${line.text}`, title: line.cause }),
         make("td", { text: line.why || DASH }), make("td", { text: line.answer || DASH }));
     }));
   }

@@ -138,6 +138,12 @@ export function shortly(four, sigma) {
 }
 
 // Text into an element only where it differs: screen readers and layout are left in peace.
+// Whether every word of a search is in one of these texts.
+export function holds(search, ...texts) {
+  const text = texts.join(" ").toLowerCase();
+  return search.toLowerCase().split(/\s+/).every((word) => text.includes(word));
+}
+
 export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }

@@ -94,8 +94,8 @@ def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
         raise CommandError(
             f"{record.name} has been {worst_yet}, and {seen} was seen of it: look again"
         )
-    known = replace(record, acknowledged=_operator_note(context, command))
-    notes[record.name] = known if record.over_ns_utc is None else _blank(record)
+    acknowledged = replace(record, acknowledged=_operator_note(context, command))
+    notes[record.name] = acknowledged if record.over_ns_utc is None else _blank(record)
     _store(context, notes)
     context.log("alarm.acknowledged", f"{record.name} {command.signed}")
 

@@ -290,8 +290,8 @@ def set_value(context: StepContext, command: cmd.SetValue) -> None:
     asked = {rule.about: rule for rule in context.policy.rules if rule.about not in FIELDS}
     if command.name not in asked:
         near = get_close_matches(command.name, asked, n=1)
-        known = ", ".join(sorted(asked)) or "none"
-        hint = f", did you mean {near[0]}?" if near else f"; asked for: {known}"
+        names = ", ".join(sorted(asked)) or "none"
+        hint = f", did you mean {near[0]}?" if near else f"; asked for: {names}"
         raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
     rule = asked[command.name]
     if kind_of(command.value) != kind_of(rule.than):

@@ -222,7 +222,7 @@ def note_found(context: StepContext) -> None:
 
 def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstimate) -> None:
     """Take over from an accepted window what it says of the precision of windows."""
-    rtc, known = context.rtc, context.dither_policy.precision
+    rtc, before = context.rtc, context.dither_policy.precision
     accepted = context.windows.accepted > context.before.windows.accepted
     if isinstance(estimate, RandomEstimate) or not accepted or rtc is None:
         return
@@ -232,8 +232,8 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
         ratio = measured_ratio(
             estimate.covariance, estimate.dither_m, estimate.window_s, rtc.magnitude
         )
-        n_windows = 0 if known is None else known.n_windows
-        mean = forgetting_mean(None if known is None else known.ratio, n_windows, ratio)
+        n_windows = 0 if before is None else before.n_windows
+        mean = forgetting_mean(None if before is None else before.ratio, n_windows, ratio)
         precision = Precision(ratio=mean, n_windows=n_windows + 1)
         _set_policy(context, replace(context.dither_policy, precision=precision))
 
@@ -352,8 +352,8 @@ def _ask(context: StepContext, rtc: Status, wanted: WantedDither) -> None:
 def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: WantedDither) -> None:
     """Stop a dither that has done its work, or is no longer the one to ask for."""
     left_s = dither.request.duration_s - (context.now_ns - dither.asked_ns_utc) / SECOND_NS
-    deaf = dither.id == context.dither_policy.stopped_id
-    if dither.start_seq is None or left_s < SOON_OVER_S or deaf:
+    was_stopped = dither.id == context.dither_policy.stopped_id
+    if dither.start_seq is None or left_s < SOON_OVER_S or was_stopped:
         return
     registration = context.registration
     seen = registration is not None and registration.window_ns_utc > dither.asked_ns_utc
@@ -443,13 +443,13 @@ def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) 
     running = replace(asked, request=shown.request, start_seq=shown.start_seq)
     if running == asked:
         return
-    plays, meant = running.request, asked.request
-    if total_m(plays) > dither_plan.ROUNDING * max(total_m(meant), context.dither_policy.budget_m):
+    plays, wanted = running.request, asked.request
+    if total_m(plays) > dither_plan.ROUNDING * max(total_m(wanted), context.dither_policy.budget_m):
         _set_policy(context, replace(context.dither_policy, loud_id=running.id, loud_text=""))
     text = (
         f"{asked.id}: the RTC plays modes {plays.modes}, {running.frequency_hz} Hz, "
         f"{plays.amplitude_m} m from frame {running.start_seq}; asked for were modes "
-        f"{meant.modes}, {asked.frequency_hz} Hz, {meant.amplitude_m} m from {asked.start_seq}"
+        f"{wanted.modes}, {asked.frequency_hz} Hz, {wanted.amplitude_m} m from {asked.start_seq}"
     )
     _set_dither(context, running)
     context.warn("dither.other", text)

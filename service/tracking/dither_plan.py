@@ -237,8 +237,8 @@ def _plan(
 
 def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
     """Return κ ``(4,)`` of ``σ = κ / (A sqrt(T))`` as far as it has been learnt."""
-    table, known = tabulated(rtc.magnitude), state.dithers.policy.precision
-    return table if known is None else table * known.ratio
+    table, learnt = tabulated(rtc.magnitude), state.dithers.policy.precision
+    return table if learnt is None else table * learnt.ratio
 
 
 def budget_m(rtc: Status, policy: Policy) -> float:

@@ -167,10 +167,10 @@ class ConditionChanged:
         cls, state: TrackerState, name: str, text: str | None, over: str, t_ns_utc: int = 0
     ) -> list[ConditionChanged]:
         """Return the trouble that has come or gone, if it has; no text: there is none now."""
-        known = state.alarm(name) is not None
-        if bool(text) is known:
+        raised = state.alarm(name) is not None
+        if bool(text) is raised:
             return []
-        return [cls(name=name, text=text or over, over=known, t_ns_utc=t_ns_utc)]
+        return [cls(name=name, text=text or over, over=raised, t_ns_utc=t_ns_utc)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -167,9 +167,9 @@ def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) ->
     Where somebody knows how the modes answer that the loop controls: others are free.
     """
     state = context.state
-    known = state.matrices.in_use is not None and not unknown_loop(state, rtc)
+    proven = state.matrices.in_use is not None and not unknown_loop(state, rtc)
     chosen = context.policy.mode_information is not None and state.operator.mode is not Mode.HOLD
-    if not known or not chosen or not awaits_proof(context, rtc):
+    if not proven or not chosen or not awaits_proof(context, rtc):
         return []
     free = (mode for mode in _missing_modes(context, rtc) if mode >= rtc.n_controlled)
     return [mode for mode in free if mode not in telling][:MAX_BESIDE]
@@ -263,9 +263,9 @@ def learn_modes(context: StepContext, estimate: LockInEstimate | RandomEstimate)
         doubtful=doubtful,
     )
     if proof.shown and proof.shown <= frozenset(estimate.modes):
-        told = (good | bad) & (proof.shown - before.proven)
-        told |= compared.keys() & {one.mode for one in before.doubtful}
-        proof = replace(proof, n_tries=0) if told else _after_miss(proof)
+        shown = (good | bad) & (proof.shown - before.proven)
+        shown |= compared.keys() & {one.mode for one in before.doubtful}
+        proof = replace(proof, n_tries=0) if shown else _after_miss(proof)
         proof = replace(proof, shown=frozenset())
     if proof == before:
         return
@@ -324,11 +324,11 @@ def proof_to_keep(state: TrackerState) -> ModeProof | None:
     Whom the matrix in use disproves is accused no more: the next service does not know that matrix
     at first.
     """
-    proof, known = state.matrices.mode_proof, proven_modes(state)
+    proof, proven = state.matrices.mode_proof, proven_modes(state)
     kept = replace(
         proof,
         contrary=shunned_modes(state),
-        suspected=proof.suspected - known,
+        suspected=proof.suspected - proven,
         shown=frozenset(),
         shown_ns_utc=0,
         n_tries=0,
@@ -402,18 +402,18 @@ def _contrary_in_the_way(context: StepContext, rtc: Status) -> list[int]:
 def _in_words(proof: ModeProof, modes: list[int]) -> str:
     """Return how modes have answered, in brackets."""
     answers = {answer.mode: answer for answer in proof.answers}
-    told = [answers[mode] for mode in modes[:_NAMED] if mode in answers]
-    said = []
-    for answer in told:
+    listed = [answers[mode] for mode in modes[:_NAMED] if mode in answers]
+    parts = []
+    for answer in listed:
         other = answers.get(answer.like)
         if answer.like == answer.mode:
-            said.append(f"{answer.gain:+.2f}")
+            parts.append(f"{answer.gain:+.2f}")
         elif other is None or other.like != answer.mode:
-            said.append(f"{answer.mode} is in the place of {answer.like}")
-        elif answer.mode < other.mode or other not in told:
-            said.append(f"{answer.mode} and {answer.like} are exchanged")
-    times = " times the model" if any(answer.like == answer.mode for answer in told) else ""
-    return f" ({', '.join(said)}{times})" if said else ""
+            parts.append(f"{answer.mode} is in the place of {answer.like}")
+        elif answer.mode < other.mode or other not in listed:
+            parts.append(f"{answer.mode} and {answer.like} are exchanged")
+    times = " times the model" if any(answer.like == answer.mode for answer in listed) else ""
+    return f" ({', '.join(parts)}{times})" if parts else ""
 
 
 def uneven_text(context: StepContext) -> str | None:
@@ -461,8 +461,8 @@ def _missing_modes(context: StepContext, rtc: Status) -> list[int]:
     proof, wanted = context.matrices.mode_proof, _wanted_modes(context, rtc)
     doubted = {one.mode for one in proof.doubtful} - _controlled(context.state)
     accused = {mode for mode in proof.suspected | doubted if wanted <= mode < rtc.n_modes}
-    known = proven_modes(context.state) - doubted
-    return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in known]
+    proven = proven_modes(context.state) - doubted
+    return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
 
 
 def _wanted_modes(context: StepContext, rtc: Status) -> int:
@@ -494,6 +494,6 @@ def _as_list(modes: Iterable[int]) -> str:
             runs[-1] = [runs[-1][0], mode]
         else:
             runs.append([mode])
-    said = [" to ".join(map(str, run)) for run in runs]
-    more = f" and {len(said) - _NAMED} more" if len(said) > _NAMED else ""
-    return ", ".join(said[:_NAMED]) + more
+    parts = [" to ".join(map(str, run)) for run in runs]
+    more = f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else ""
+    return ", ".join(parts[:_NAMED]) + more

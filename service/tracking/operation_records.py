@@ -242,8 +242,8 @@ class Probation:
         """Id of the matrix on which a verdict is waited for; None: on none."""
         if self.state is ProbationState.WATCHED:
             return self.rollback
-        waits = self.state in {ProbationState.RUNNING, ProbationState.OVERDUE}
-        return self.id if waits else None
+        awaited = self.state in {ProbationState.RUNNING, ProbationState.OVERDUE}
+        return self.id if awaited else None
 
     def awaits(self, before: str, after: str) -> bool:
         """Return whether a verdict on these two is waited for."""

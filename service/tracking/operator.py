@@ -329,15 +329,15 @@ def _ranges(groups: tuple[ModeGroup, ...], n_modes: int) -> tuple[tuple[int, int
 
 
 def _request_text(command: cmd.SetLoop) -> str:
-    said = {"closed": ["close"], "open": ["open"], None: []}[command.loop]
-    said += [f"gain {g.gain:g} on modes {g.first} to {g.last}" for g in command.gains or ()]
+    parts = {"closed": ["close"], "open": ["open"], None: []}[command.loop]
+    parts += [f"gain {g.gain:g} on modes {g.first} to {g.last}" for g in command.gains or ()]
     if command.effective_gain is not None:
-        said.append(f"gain {command.effective_gain:g} in effect on every mode, by the gain table")
+        parts.append(f"gain {command.effective_gain:g} in effect on every mode, by the gain table")
     if command.leak is not None:
-        said.append(f"leak {command.leak:g}")
+        parts.append(f"leak {command.leak:g}")
     if command.n_controlled is not None:
-        said.append(f"{command.n_controlled} modes from the next reconstructor on")
-    return ", ".join(said)
+        parts.append(f"{command.n_controlled} modes from the next reconstructor on")
+    return ", ".join(parts)
 
 
 def _ask_loop(

@@ -40,7 +40,7 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     """Fold the passive estimate in, its bias allowed for, or doubt α where it does not fit."""
     reason = _why_passive_unusable(context.state, event) or _why_known_already(context.state, event)
     if reason is not None:
-        _note_unavailable(context, f"a look was not used: {reason}")
+        _note_unavailable(context, f"the passive estimate was not used: {reason}")
         return
     registration, estimate = context.registration, event.estimate
     if registration is None:
@@ -52,10 +52,10 @@ def process_passive(context: StepContext, event: ev.PassiveFitted) -> None:
     prior = kalman.allowing(forward, block, estimate.bias_excess)
     mixed = _why_of_two_places(context.state, registration, event)
     if mixed is not None:
-        looked = _biases_after_look(
+        biases = _biases_after_look(
             context.state, registration, filtering.joint_of(registration), event
         )
-        validity.store_registration(context, replace(registration, biases=looked))
+        validity.store_registration(context, replace(registration, biases=biases))
         sigma = _passive_sigma(estimate, prior)
         _show_passive(context, event, sigma, prior.bias(block), f"not used: {mixed}")
         return
@@ -103,7 +103,7 @@ def _note_unavailable(context: StepContext, why: str) -> None:
 
 
 def fit_begins_at(state: TrackerState) -> Misregistration | None:
-    """Return about what a look is to be fitted: α, or the last look; None: the nominal rotation."""
+    """Return where the next passive fit begins: α, or the last such estimate; None: nominal."""
     if state.alpha.registration is not None:
         return state.alpha.registration.alpha
     last = state.alpha.passive
@@ -111,7 +111,7 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
 
 
 def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return why a look says nothing of the telescope as it is, or None."""
+    """Return why a passive estimate says nothing of the telescope as it is, or None."""
     of_loop = loop_numbers(state.loop.rtc)
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
@@ -121,7 +121,7 @@ def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str |
 
 
 def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return which later telemetry has told more than a look that was long under way, or None."""
+    """Return which later telemetry tells more than an estimate that was long under way, or None."""
     registration = state.alpha.registration
     if registration is None or not registration.window_began_ns_utc:
         return None
@@ -134,7 +134,7 @@ def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | No
 
 
 def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
-    """Show a look while α is not known: it is all there is, and no more than it says it is."""
+    """Show a passive estimate while α is not known: nothing is made from it alone."""
     step = event.estimate.alpha.vector - context.policy.start.vector
     if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
         text = (
@@ -150,7 +150,7 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
 def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> Registration:
     """Return what is known with the bias as large as the first look at it says that it may be.
 
-    A later look that says more is allowed for by the filter alone: whether the mirror has jumped is
+    A later estimate that says more is allowed for by the filter alone: whether the mirror has jumped is
     told with less patience.
     """
     bias = registration.bias(estimate.bias)
@@ -167,7 +167,7 @@ def _biases_after_look(
     event: ev.PassiveFitted,
     previous: PreviousEstimate | None = None,
 ) -> tuple[PassiveBias, ...]:
-    """Return the biases after a look, as the filter has them; ``previous``: what it saw it from."""
+    """Return the biases after a passive estimate; ``previous``: what the filter saw it from."""
     name, loop = event.estimate.bias.name, _loop(state, registration, event)
     return tuple(
         replace(bias, looked_ns_utc=event.t_ns_utc, loop=loop, previous_estimate=previous)
@@ -180,7 +180,7 @@ def _biases_after_look(
 def _loop(
     state: TrackerState, registration: Registration, event: ev.PassiveFitted
 ) -> tuple[float, ...]:
-    """Return the loop that is looked at; while no RTC is there, the one of the last look."""
+    """Return the loop the telemetry is of; while no RTC is there, that of the last estimate."""
     if state.loop.rtc is not None:
         return loop_numbers(state.loop.rtc)
     bias = registration.bias(event.estimate.bias)
@@ -211,15 +211,18 @@ def _ask_for_window(
 ) -> None:
     """Forget the bias and want a dithered window: the wind has changed or the mirror has moved.
 
-    A look alone is no match for windows: α stays valid, and nothing is made or sent until a window
-    taken since has told. It is an alarm where none can, or none has when a second look disagrees.
+    α stays valid, and nothing is made or sent until a window taken since has decided. It is an
+    alarm where none can, or none has when a second passive estimate disagrees.
     """
     text = (
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
         "dithered window must tell which"
     )
     registration = context.registration or registration
-    waits, void = bool(registration.doubt), bool(registration.doubt) and registration.doubt_voids
+    was_doubted, void = (
+        bool(registration.doubt),
+        bool(registration.doubt) and registration.doubt_voids,
+    )
     why_none = None if context.rtc is None else why_no_dither(context, context.rtc)
     gone = kalman.forget(prior, event.estimate.bias, event.estimate.bias_excess)
     after = _registration_after_passive(context, registration, gone, event)
@@ -229,7 +232,7 @@ def _ask_for_window(
     void_intervals.cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     validity.request_window(context, text)
-    if why_none is not None or waits:
+    if why_none is not None or was_doubted:
         cannot = "none has since the last look that did" if why_none is None else why_none
         context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
     validity.age_registration(context)
@@ -239,7 +242,7 @@ def _ask_for_window(
 def _registration_after_passive(
     context: StepContext, registration: Registration, joint: Joint, event: ev.PassiveFitted
 ) -> Registration:
-    """Return the registration as the filter has it after a look."""
+    """Return the registration as the filter has it after a passive estimate."""
     block, was = event.estimate.bias, None
     if registration.bias(block) is not None:
         was = jumps.sum_of(registration, filtering.joint_of(registration), block)

@@ -328,14 +328,14 @@ def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
     """
     note_not_fetched(context, "")
     record = fetched.record
-    known = context.state.reconstructor(record.id)
-    if known is not None and known.sha256 not in {"", record.sha256}:
-        _distrust(context, known, MatrixState.APPLIED, record.sha256)
+    before = context.state.reconstructor(record.id)
+    if before is not None and before.sha256 not in {"", record.sha256}:
+        _distrust(context, before, MatrixState.APPLIED, record.sha256)
         return
     _trust(context, record.id)
     if context.matrices.in_use == record.id:
         return
-    if known is None:
+    if before is None:
         store_reconstructor(context, record)
     context.log("reconstructor.adopted", f"the RTC uses {record.id}, {record.n_modes} modes")
     apply_named(context, record.id)

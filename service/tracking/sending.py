@@ -26,20 +26,20 @@ def why_unsendable(
     """
     if state.loop.rtc is None:
         return NO_RTC
-    known, registration = _was_in_use(state, record), state.alpha.registration
-    if registration is not None and not known:  # one must be able to go back
+    was_used, registration = _was_in_use(state, record), state.alpha.registration
+    if registration is not None and not was_used:  # one must be able to go back
         if registration.suspected_jump is not None:
             return "a jump is suspected: the next window of telemetry decides"
         if registration.doubt:
             now = "invalid" if registration.doubt_voids else "in question"
             return f"α is {now} ({registration.doubt})"
-    interlock = Interlock.SEND_KNOWN if known else Interlock.SEND_NEW
+    interlock = Interlock.SEND_KNOWN if was_used else Interlock.SEND_NEW
     before = state.alarms.active if swapped_ns_utc is None else _not_of_swap(state, swapped_ns_utc)
     alarm = next((alarm for alarm in before if alarm_blocks(alarm, interlock)), None)
     if alarm is not None:
         return alarm.text
     unread = why_unread(state, state.loop.rtc.cm_id)
-    return unread if unread or known else why_unproven(state, record)
+    return unread if unread or was_used else why_unproven(state, record)
 
 
 def why_refused(

@@ -311,12 +311,12 @@ def _ranges(text: str) -> tuple[tuple[str, str], ...]:
 
 
 def _widened(
-    known: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]
+    before: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
     """Return the ranges of both; of a line of another make the first ones stand."""
-    if len(known) != len(new):
-        return known
-    pairs = zip(known, new, strict=True)
+    if len(before) != len(new):
+        return before
+    pairs = zip(before, new, strict=True)
     return tuple(
         (min(low, one, key=float), max(high, one, key=float)) for (low, high), (one, _) in pairs
     )
@@ -347,19 +347,19 @@ def log_bursts(context: StepContext) -> None:
     """
     for entry in context.state.log:
         if entry.times > 1 and context.now_ns - entry.t_ns_utc >= BURST_NS:
-            told = replace(
+            line = replace(
                 entry, t_ns_utc=entry.last_ns_utc, text=_burst_text(entry), times=1, ranges=()
             )
             log = (replace(e, times=1, ranges=()) if e is entry else e for e in context.state.log)
-            context.state = replace(context.state, log=(*log, told)[-LOG_LENGTH:])
+            context.state = replace(context.state, log=(*log, line)[-LOG_LENGTH:])
 
 
 def new_lines(before: TrackerState, after: TrackerState) -> list[LogEntry]:
     """Return the lines that were added; one that was only counted is not among them."""
     if after.log is before.log:
         return []
-    known = {entry.line for entry in before.log}
-    return [entry for entry in after.log if entry.line not in known]
+    earlier = {entry.line for entry in before.log}
+    return [entry for entry in after.log if entry.line not in earlier]
 
 
 def present(rtc: Status | None) -> Status:

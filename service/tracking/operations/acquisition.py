@@ -420,10 +420,10 @@ def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
 
 def _note_closed(context: StepContext, rtc: Status) -> None:
     """End it after somebody, or the acquisition itself, has closed the loop."""
-    matrix, told = rtc.cm_id or "an unknown matrix", "which it has not judged"
+    matrix, judged = rtc.cm_id or "an unknown matrix", "which it has not judged"
     if rtc.cm_id is not None and rtc.cm_id == context.acquisition.matrix:
-        told = "which had passed the gate: the registration is followed from there"
-    text = f"{_cause_text(context.acquisition)}; the loop is closed on {matrix}, {told}"
+        judged = "which had passed the gate: the registration is followed from there"
+    text = f"{_cause_text(context.acquisition)}; the loop is closed on {matrix}, {judged}"
     stages.enter_stage(context, AcquisitionStage.ABORTED, text)
 
 

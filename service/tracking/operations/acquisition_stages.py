@@ -216,8 +216,8 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
 
 def missed_enough(state: TrackerState) -> bool:
     """Return whether so many windows in a row found no registration that it is no chance."""
-    known = state.alpha.registration is not None and state.alpha.registration.usable
-    return state.operations.acquisition.misses >= (MISSES_DESPITE if known else MISSES_BEFORE)
+    is_known = state.alpha.registration is not None and state.alpha.registration.usable
+    return state.operations.acquisition.misses >= (MISSES_DESPITE if is_known else MISSES_BEFORE)
 
 
 def count_miss(context: StepContext, kind: RefusalKind) -> None:

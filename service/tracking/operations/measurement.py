@@ -122,26 +122,26 @@ def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> No
 
 def on_measured(context: StepContext, event: ev.MatrixMeasured) -> None:
     """Take over how far a measurement is, from whoever makes its matrix."""
-    known = context.state.measurement(event.record.id)
-    with context.because_of("" if known is None else known.cause):
+    before = context.state.measurement(event.record.id)
+    with context.because_of("" if before is None else before.cause):
         _update(context, event.record)
 
 
 def _update(context: StepContext, record: MeasurementRecord) -> None:
     """Take over how far a measurement is; one that is over does not begin again."""
-    known = context.state.measurement(record.id)
-    if known is not None:
-        given_up = known.state is MeasureState.GIVEN_UP
-        if given_up or (record.under_way and not known.under_way):
+    before = context.state.measurement(record.id)
+    if before is not None:
+        given_up = before.state is MeasureState.GIVEN_UP
+        if given_up or (record.under_way and not before.under_way):
             return
         record = replace(
             record,
-            frequency_hz=known.frequency_hz,
-            duration_s=known.duration_s,
-            asked_ns_utc=known.asked_ns_utc,
-            closed_before=known.closed_before,
-            cause=known.cause,
-            start_seq=known.start_seq if record.start_seq is None else record.start_seq,
+            frequency_hz=before.frequency_hz,
+            duration_s=before.duration_s,
+            asked_ns_utc=before.asked_ns_utc,
+            closed_before=before.closed_before,
+            cause=before.cause,
+            start_seq=before.start_seq if record.start_seq is None else record.start_seq,
         )
     if record.state is MeasureState.FAILED:
         fail_measurement(context, record, record.reason)
@@ -165,8 +165,8 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
 
 def fail_measurement(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
     """Note why there is no matrix, unless nobody waits for it any more."""
-    known = None if record is None else context.state.measurement(record.id)
-    if record is not None and (known is None or known.state is not MeasureState.GIVEN_UP):
+    before = None if record is None else context.state.measurement(record.id)
+    if record is not None and (before is None or before.state is not MeasureState.GIVEN_UP):
         store_measurement(context, replace(record, state=MeasureState.FAILED, reason=text))
         with context.because_of(record.cause):
             context.warn(f"{_kind(record)}.failed", f"{record.id}: {text}")

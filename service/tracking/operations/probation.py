@@ -75,9 +75,9 @@ def advance(context: StepContext, event: Event) -> None:
     trial = context.operations.probation
     if trial is None:
         return
-    told = _alarm_of_swap(context, trial)
-    if told:
-        _begin_rollback(context, trial, told)
+    alarm_text = _alarm_of_swap(context, trial)
+    if alarm_text:
+        _begin_rollback(context, trial, alarm_text)
     else:
         _go_on(context, trial, event)
 

@@ -89,10 +89,10 @@ def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
 
 def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
     """Yield the dither that plays, followed or not; one that was told to stop does no more."""
-    known = None if state.dithers.dither is None else state.dithers.dither.id
-    told = now_ns - state.dithers.policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
-    seen = None if state.loop.rtc is None or told else state.loop.rtc.dither_id
-    playing = known or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
+    followed = None if state.dithers.dither is None else state.dithers.dither.id
+    stopping = now_ns - state.dithers.policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
+    seen = None if state.loop.rtc is None or stopping else state.loop.rtc.dither_id
+    playing = followed or (None if seen is None or seen.startswith(OUR_DITHERS) else seen)
     if playing is not None:
         own = playing.startswith(OWN_DITHER)
         activity = OperationKind.OWN_DITHER if own else OperationKind.OTHER_DITHER

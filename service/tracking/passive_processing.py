@@ -148,10 +148,10 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
 
 
 def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> Registration:
-    """Return what is known with the bias as large as the first look at it says that it may be.
+    """Return what is known with the bias as large as the first estimate says that it may be.
 
-    A later estimate that says more is allowed for by the filter alone: whether the mirror has jumped is
-    told with less patience.
+    A later estimate that says more is allowed for by the filter alone: a jump of the mirror is then
+    found with less patience.
     """
     bias = registration.bias(estimate.bias)
     if bias is not None and bias.looked_ns_utc:

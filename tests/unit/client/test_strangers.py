@@ -99,7 +99,8 @@ def test_an_order_whose_answer_is_lost_is_sent_again_as_the_same(capsys):
 def test_an_order_without_any_answer_may_have_been_carried_out(capsys):
     with saying(b"", b"") as (url, _):
         assert main(["stop", "--url", url]) == 3
-    assert "may have been carried out: see pyrcal status and pyrcal audit" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "may have been carried out: see pyrcal status and pyrcal audit" in told
 
 
 def test_an_answer_of_another_version_is_no_success(capsys):

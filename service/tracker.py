@@ -1,4 +1,4 @@
-"""How one event changes what the service knows, and what is then to be done.
+"""``step``: how one event changes the state, and which effects follow.
 
 ``step`` is a function of state, event and time alone: no clock, no files, no link. A recorded
 night therefore replays exactly, and every reaction of the service can be tested as a value.

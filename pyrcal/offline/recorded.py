@@ -1,4 +1,4 @@
-"""A measured interaction matrix in an HDF5, FITS or NumPy file, with what the file says of it."""
+"""A measured interaction matrix in an HDF5, FITS or NumPy file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The last steps of a fit: every mode on the fine grid, and small unknowns beside the registration.
+"""The last steps of a fit, on the fine grid.
 
 They are linear, and held back by what is usual: each is one more derivative in the projection, with
 a prior of its own. A turn of the slope axes is always among them: a pyramid whose edges are turned

@@ -1,4 +1,4 @@
-"""How a program of ``pyrcal`` ends, logs and reports errors; the arguments of ``run`` and ``key``.
+"""How a program of ``pyrcal`` ends and logs; the arguments of ``run`` and ``key``.
 
 Quick to import. What the program calls modes and scopes stands here as text; a test compares it.
 """

@@ -1,4 +1,4 @@
-"""What the model says of the telescope that telemetry is held against: modes, actuators, ring."""
+"""The model's view of the telescope: modes, actuators, ring."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Windows of whatever dither plays: demodulated at its lines, or correlated with its signs."""
+"""Windows of any dither."""
 
 from __future__ import annotations
 

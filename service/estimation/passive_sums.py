@@ -1,4 +1,4 @@
-"""Sums of ordinary telemetry: begun with a loop, closed every few seconds, resting beside a dither.
+"""Sums of ordinary telemetry, closed every few seconds.
 
 What an estimator sums, and how α is fitted to it, is its own; when it is asked is the same for all.
 """

@@ -116,13 +116,13 @@ class LinkStatistics:
 
     frames_duplicate: int
     frames_late: int
-    """Frames that came when their place had been passed; they stay among the lost."""
+    """Frames that came too late; they stay among the lost."""
 
     frames_nonfinite: int
     """Frames dropped because a slope or a command was not finite."""
 
     frames_overwritten: int
-    """Frames nobody drained in time, or that a new session made void."""
+    """Frames not drained in time, or void by a new session."""
 
     frames_refused: Mapping[str, int]
     """Frames of batches not used, by reason: session, basis, config, shape, leap, sequence."""

@@ -1,1 +1,1 @@
-"""The running service: what is heard becomes events, what is decided becomes actions."""
+"""The running service: tasks, actions, processes."""

@@ -1,4 +1,4 @@
-"""Carrying out what the tracker has decided; every action ends in an event, failures too."""
+"""Carry out effects; every action ends in an event, failures too."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MATRICES_KEPT = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Publishing:
-    """What publication needs to know besides the state."""
+    """Context of a publication besides the state."""
 
     system: str
     chunk_bytes: int
@@ -114,7 +114,7 @@ class Actions:
         return kept if kept is not None else self._archive.reconstructors.matrix(matrix_id)
 
     def offer(self, state: TrackerState) -> None:
-        """Let an RTC ask for the matrix in use, whoever made it.
+        """Let an RTC ask for the matrix in use.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Actions:
         self._bridge.set_current(record.id)
 
     async def keep_measured(self, received: MeasuredMatrix) -> Event:
-        """Archive an interaction matrix the RTC has measured, whoever asked for it.
+        """Archive an interaction matrix that the RTC has measured.
 
         Raises
         ------
@@ -188,7 +188,7 @@ class Actions:
             gate = await self._verdict(matrix, gains, state)
             judged = judged_now(state, gains)
         else:
-            unknown = "α is unknown" if registration is None else "an open loop tells no gains"
+            unknown = "α is unknown" if registration is None else "an open loop shows no gains"
             why = f"{why}; the gate could not judge it: {unknown}"
         refused = gate is not None and not gate.accepted
         if gate is not None and refused and effect.anyway:
@@ -298,7 +298,7 @@ class Actions:
         return None
 
     async def _command_modes(self, effect: ev.SendMatrix) -> None:
-        """Tell the RTC how many modes the next matrix commands, and with which gains."""
+        """Command the number of modes and the gains of the next matrix."""
         reply = await self._bridge.command(
             wire.LoopRequest(
                 id=f"modes-{self._clock_ns()}", gains=effect.gains, n_controlled=effect.n_modes
@@ -332,7 +332,7 @@ class Actions:
         registration: Registration | None,
         why: str,
     ) -> None:
-        """Archive before anybody hears of it, so that what was sent can always be found."""
+        """Archive before sending, so that every sent matrix can be found."""
         self._remember(record.id, matrix)
         covariance = None if registration is None else registration.total_covariance
         provenance = {

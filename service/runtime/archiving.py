@@ -1,4 +1,4 @@
-"""The archive kept in step with the state, and its disk in order.
+"""Keep the archive in step with the state, and its disk in order.
 
 What counts is written before it does, and waits until it is; what is old goes, a little at a time,
 and a disk that is almost full is told.
@@ -136,7 +136,7 @@ class ArchiveWriter:
         await self.flush()
 
     def answered(self, order: GivenCommand, actor: Actor, answer: str) -> None:
-        """Take down what an order has led to, as its giver was told."""
+        """Record the answer to an order."""
         self._order(order, actor, ".answered", answer)
 
     def refused(self, order: GivenCommand, actor: Actor, error: Exception) -> None:
@@ -243,7 +243,7 @@ class ArchiveWriter:
         return state
 
     async def keep_house(self, retention: RetentionPolicy) -> None:
-        """Look after the disk until cancelled, as the user has decided; in threads."""
+        """Prune and watch the disk until cancelled; in threads."""
         next_s = time.monotonic() + LOOK_S
         while True:
             low = self._state().alarm(DISK_LOW) is not None
@@ -409,7 +409,7 @@ def is_unsaved(before: TrackerState, after: TrackerState) -> bool:
 
 
 def is_urgent(before: TrackerState, after: TrackerState) -> bool:
-    """Return whether what is not saved yet cannot wait: whose the RTC's open loop is, and orders.
+    """Return whether unsaved state cannot wait: an opened loop, an order.
 
     A service killed a second later would leave its own loop open to one that cannot know, or one
     that undoes what an operator has ordered; or would not know where the mirror's image was moved,
@@ -431,7 +431,7 @@ def _course(state: TrackerState) -> tuple[object, ...]:
 
 
 def needed(state: TrackerState) -> frozenset[str]:
-    """Return the ids of matrices that somebody may ask for at any moment."""
+    """Return the ids of matrices that may be asked for at any moment."""
     ids = (
         state.matrices.in_use,
         state.previous,

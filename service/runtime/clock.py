@@ -1,4 +1,4 @@
-"""The time by which the service waits: UTC that never leaps, whatever the machine's clock does."""
+"""UTC by elapsed time: it never leaps with the machine's clock."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class ServiceClock:
             return ""
         return (
             f"this machine's clock has leapt by {ahead_ns / 1e9:+.0f} s: the service goes on by "
-            "the time that has passed, and tells log and estimates by that; if the new time is "
-            "right, restart the service when it may be"
+            "elapsed time, in its log and estimates too; if the new time is "
+            "right, restart the service when convenient"
         )
 
     def _ahead_ns(self) -> int:

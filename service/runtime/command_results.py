@@ -1,4 +1,4 @@
-"""What an order has led to, in one sentence: read from what the state holds of its id."""
+"""The result of an order in one sentence, read from the state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ON_ITS_WAY = {
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """What there is to tell."""
+    """Text and id of an order's result."""
 
     text: str
     final: bool = True
@@ -63,14 +63,14 @@ class GivenCommand:
 
 
 def _sent(command: cmd.Approve, _: str, now: TrackerState) -> CommandResult:
-    """Tell how far the reconstructor is on its way to the RTC that was approved."""
+    """Report the approved reconstructor's way to the RTC."""
     return _of_matrix(now, command.id)
 
 
 def _republished(
     command: cmd.Publish | cmd.Rollback, cause: str, now: TrackerState
 ) -> CommandResult:
-    """Tell of the reconstructor that goes out again, under an id of its own."""
+    """Report the reconstructor that goes out again, under an id of its own."""
     copies = [each for each in now.matrices.reconstructors if each.cause == cause]
     if not copies:
         source = command.id if isinstance(command, cmd.Publish) else now.previous
@@ -163,16 +163,16 @@ def _stopped(_: cmd.StopEverything, __: str, now: TrackerState) -> CommandResult
     text = f"{now.operator.stopped_because}; nothing is dithered, made or sent until it is released"
     if playing is None:
         return CommandResult(text)
-    shows = f"the RTC's status still shows {playing}, it was told to stop it"
+    shows = f"the RTC's status still shows {playing}, it was asked to stop it"
     return CommandResult(f"{text}; {shows}", final=False)
 
 
 def _no_dither(_: cmd.StopDither, __: str, now: TrackerState) -> CommandResult:
     playing = None if now.loop.rtc is None else now.loop.rtc.dither_id
-    off = "no dither is started until one is asked for"
+    off = "no dither starts until one is ordered"
     if playing is None:
         return CommandResult(f"no dither plays; {off}")
-    asked = f"the RTC was told to stop {playing}, its status still shows it"
+    asked = f"the RTC was asked to stop {playing}, its status still shows it"
     return CommandResult(f"{asked}; {off}", final=False)
 
 
@@ -194,12 +194,12 @@ _TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]
 def _done(  # noqa: C901 - one line for each command
     command: Command, _: str, now: TrackerState
 ) -> CommandResult:
-    """Tell what the state is after a command that the service carries out by itself."""
+    """Report the state after a command that the service carries out by itself."""
     match command:
         case cmd.SetMode():
             text = f"mode is {now.operator.mode}"
         case cmd.Resume():
-            off = "; no dither is started until one is asked for" if now.dithers.stopped else ""
+            off = "; no dither starts until one is ordered" if now.dithers.stopped else ""
             text = f"released: mode is {now.operator.mode}{off}"
         case cmd.Refit():
             text = f"a reconstructor is being computed; mode is {now.operator.mode}"
@@ -214,7 +214,7 @@ def _done(  # noqa: C901 - one line for each command
             why = "" if record is None else record.reason.removeprefix("given up ")
             text = f"{name} is given up {why}"
         case cmd.SetPointing(elevation_deg=up, azimuth_deg=round_):
-            text = f"the telescope looks at elevation {up:g} deg, azimuth {round_:g} deg"
+            text = f"the telescope points at elevation {up:g} deg, azimuth {round_:g} deg"
         case cmd.SetValue(name=name, value=value, for_s=for_s):
             text = f"{name} is {as_text(value)} for {for_s:g} s"
         case cmd.UnmuteAlarm(name=name):
@@ -227,7 +227,7 @@ def _done(  # noqa: C901 - one line for each command
 
 
 def _alarm(now: TrackerState, name: str) -> str:
-    """Tell what is kept of an alarm that was acknowledged or muted."""
+    """Report an alarm that was acknowledged or muted."""
     record = next(
         (record for record in now.alarms.records if record.name == name), AlarmRecord(name=name)
     )

@@ -1,4 +1,4 @@
-"""The service without clock, task or network: what an event or a block of telemetry changes.
+"""The service without clock, task or network.
 
 The running service and a simulated night drive the same engine; they differ in what they wait for.
 """
@@ -48,7 +48,7 @@ Step = Callable[[TrackerState, Event, Policy, int, str], tuple[TrackerState, tup
 
 
 class Driver(Protocol):
-    """What the engine leaves to whoever drives it, because it takes time."""
+    """What takes time, and is left to the engine's driver."""
 
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
@@ -63,11 +63,11 @@ class Driver(Protocol):
         """Take a window of telemetry that is to be fitted."""
 
     def swapped(self, in_use: str | None) -> None:
-        """Hear that the RTC uses another reconstructor, None: nobody knows which."""
+        """Note that the RTC uses another reconstructor, or an unknown one."""
 
 
 class Engine:
-    """What the service knows, and the streaming estimators that follow the RTC it knows of.
+    """State and streaming estimators, driven by events and blocks.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ class Engine:
             self.checkin(bank, windows)
 
     def checkout(self) -> EstimatorBank | None:
-        """Return the estimators, to look at frames elsewhere; None: the model is being prepared.
+        """Return the estimators for another thread; None: the model is being prepared.
 
         Until they are given back they follow nothing, and nobody may have sums of them, or teach
         them a matrix. A look that fails gives them back as they were.

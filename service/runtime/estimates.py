@@ -1,4 +1,4 @@
-"""Having the worker look at telemetry: a window to be fitted, the watchdog's sums."""
+"""Have the worker fit windows and passive sums."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ async def _outcome(
 def _reconstructor(
     spectra: lockin.Spectra, state: TrackerState, matrix_of: MatrixOf
 ) -> NDArray[np.float32]:
-    """Return the matrix that made the commands; one that nobody has tells nothing of the loop.
+    """Return the matrix that made the commands, if the service has it.
 
     The fit takes the dither alone for its instrument then, which costs precision and no truth.
     """
@@ -187,7 +187,7 @@ async def read_own_matrix(
     state: TrackerState,
     workers: WorkerPort,
 ) -> list[Event]:
-    """Return what the matrix in use tells of the RTC's slopes, commands and modes.
+    """Return slopes, commands and modes as the matrix in use shows them.
 
     One that the service has made and judged says nothing that it did not know, but for the first
     that it meets: what the RTC's own said in another run went into it.
@@ -214,7 +214,7 @@ async def read_own_matrix(
         workers.first = partial(run_job, OpticsWorker.adopt, slopes, response)
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
-        text = f"{record.id}: {wrong}" if wrong else f"{record.id} is as told"
+        text = f"{record.id}: {wrong}" if wrong else f"{record.id} agrees with the instrument file"
         events.append(ev.ConditionChanged(name=alarms.WRONG_MATRIX, text=text, over=not wrong))
     if own is not None:
         strange = tuple(own.columns[~own.known].tolist())

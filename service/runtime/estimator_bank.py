@@ -1,4 +1,4 @@
-"""The bank of streaming estimators: fed with every block of telemetry, begun anew as each declares.
+"""The bank of streaming estimators.
 
 It knows none of them by name: ``service.runtime.registry`` lists them.
 """
@@ -33,7 +33,7 @@ Member = TypeVar("Member", bound=Streaming)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EstimatorBank:
-    """All streaming estimators, and what they are told of the loop."""
+    """All streaming estimators and their view of the loop."""
 
     loop: LoopContext
     members: tuple[Streaming, ...]
@@ -47,7 +47,7 @@ class EstimatorBank:
 
     @classmethod
     def of(cls, description: Description) -> EstimatorBank:
-        """Return estimators that have heard of no RTC."""
+        """Return estimators before any RTC."""
         loop = LoopContext(description=description)
         return cls(loop=loop, members=tuple(entry.kind.begin(loop) for entry in REGISTRY))
 
@@ -57,7 +57,7 @@ class EstimatorBank:
 
     @property
     def marks(self) -> Mark:
-        """What all of them say of the last block."""
+        """Findings of all estimators in the last block."""
         marks = estimator.UNMARKED
         for member in self.members:
             marks |= member.marks
@@ -90,7 +90,7 @@ def with_rtc(bank: EstimatorBank, rtc: Status | None) -> EstimatorBank:
 
 
 def _changes(bank: EstimatorBank, before: Status | None, rtc: Status) -> Change:
-    """Return what a status tells to be otherwise than before."""
+    """Return what a status changes."""
     changes = estimator.NOTHING
     if before is None or not same_loop(before, rtc):
         changes |= Change.STATUS
@@ -104,7 +104,7 @@ def _changes(bank: EstimatorBank, before: Status | None, rtc: Status) -> Change:
 
 
 def _of_modes(loop: LoopContext, rtc: Status) -> LoopContext:
-    """Return a loop of the modes that a status tells of, its edge watched on those that move."""
+    """Return a loop of the status's modes, its edge watched on those that move."""
     known, dither = loop.description, loop.dither
     in_loop = np.array(rtc.in_loop, dtype=np.intp)
     # an RTC of another instrument may have more

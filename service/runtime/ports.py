@@ -1,4 +1,4 @@
-"""What the service's actions need of RTC, worker and archive; a simulated night has others."""
+"""Interfaces of RTC, worker and archive; simulated nights have others."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class RtcPort(Protocol):
 
 
 class WorkerPort(Protocol):
-    """Whoever computes; :class:`service.runtime.workers.WorkerPool` is the real one."""
+    """Interface of the worker; :class:`service.runtime.workers.WorkerPool` is the real one."""
 
     first: Callable[[], Done[None]] | None
     """What every new worker does before anything else; None: nothing."""
@@ -52,14 +52,14 @@ class WorkerPort(Protocol):
 
 
 class MeasuredPort(Protocol[Numbers]):
-    """Where measured interaction matrices of one kind are kept."""
+    """Store of measured interaction matrices of one kind."""
 
     def store(self, record: MeasurementRecord, numbers: Numbers, name: str, /) -> None:
         """Keep one of the instrument of that name."""
 
 
 class ReconstructorPort(Protocol):
-    """Where reconstructors are kept."""
+    """Store of reconstructors."""
 
     def store(
         self,
@@ -76,7 +76,7 @@ class ReconstructorPort(Protocol):
 
 
 class StorePort(Protocol):
-    """Where matrices are kept; :class:`service.archive.Archive` is the real one."""
+    """Stores of matrices; :class:`service.archive.Archive` is the real one."""
 
     @property
     def reconstructors(self) -> ReconstructorPort:

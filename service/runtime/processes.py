@@ -1,4 +1,4 @@
-"""Processes of their own for what takes long: nice'd, and ended at any moment.
+"""A job in a process of its own, killed at any moment.
 
 Whoever waits for one waits in a thread, on a pipe: a process that is killed, even one that is
 stopped, closes the pipe, and the wait is over. An executor of the standard library waits for its
@@ -89,7 +89,7 @@ class JobProcess:
         return cast(R, answer)
 
     def kill(self) -> None:
-        """End the process at once, whatever it is at; whoever waits for it waits no longer."""
+        """Kill the process at once; whoever waits for it goes on."""
         self._ended.set()
         process = self._process
         if process is not None:
@@ -132,7 +132,7 @@ class Worker(JobProcess):
         return self
 
     def begun(self, enter: Callable[[], None]) -> Worker:
-        """Tell it what to do before its first job, and return it; one that runs does it now."""
+        """Give it its setup before the first job, and return it."""
         self._enter = enter
         if self._line is not None:
             with contextlib.suppress(OSError):  # the first job finds out

@@ -1,4 +1,4 @@
-"""What the link complains of and what the service waits for: derived from what is, never set."""
+"""Alarms of the link, and what the service waits for."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _unused(link: LinkStatistics) -> str:
     details = "; ".join(f"{f.n} {f.outcome} ({f.text})" for f in lost[:3])
     return (
         f"the RTC's frames are not used ({reasons}): {details}; of {came} in the last "
-        f"{RECENT_S:.0f} s {used} were used: look at the RTC's telemetry"
+        f"{RECENT_S:.0f} s {used} were used: check the RTC's telemetry"
     )
 
 
@@ -144,7 +144,7 @@ def _flood(link: LinkStatistics) -> str:
 
 
 class Losses:
-    """How many frames of the last seconds were lost: the counters, as they were each second."""
+    """Counters of lost frames, second by second."""
 
     __slots__ = ("_counts", "_raised")
 
@@ -178,13 +178,13 @@ class Losses:
             for n, how in (
                 (never_came, "never came"),
                 (not_finite, "are not finite"),
-                (overwritten, "were not looked at in time"),
+                (overwritten, "were not read in time"),
             )
             if n
         ]
         return (
             f"frames are lost: of {n_frames} in the last {now_s - since_s:.0f} s {', '.join(found)}"
-            f" ({100.0 * share:.1f} %): look at the network, the RTC's publisher, and what else "
+            f" ({100.0 * share:.1f} %): check the network, the RTC's publisher, and what else "
             "this machine does"
         )
 
@@ -408,7 +408,7 @@ _LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] =
 
 
 class Revival:
-    """When the link is opened anew: the RTC's token is there, and nothing comes.
+    """Opens the link anew when the RTC's token is there and nothing arrives.
 
     After a standstill of both ends zenoh can leave a connection over under the RTC's name. It
     carries the token and nothing else, and the router lets no second one of that name in: the RTC
@@ -466,7 +466,7 @@ class ReadinessLog:
 def state_message(
     state: TrackerState, now_ns: int, waiting: tuple[Prerequisite, ...] = ()
 ) -> StateMessage:
-    """Return the short account of the state for whoever listens on the network."""
+    """Return the short state that is published on the network."""
     registration = state.alpha.registration
     hindered = "; ".join(wait.text for wait in waiting if wait.blocks)
     return StateMessage(

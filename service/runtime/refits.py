@@ -1,4 +1,4 @@
-"""Refits that operators have ordered: each a job with an id, and what came of it."""
+"""Ordered refits: jobs with an id."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REFITS_KEPT = 100
 
 
 class RefitState(StrEnum):
-    """How far a refit is."""
+    """States of a refit."""
 
     RUNNING = "running"
     """The reconstructor is being computed and judged."""

@@ -1,4 +1,4 @@
-"""Which estimators and detectors there are, one line each, and what the tracker hears of them.
+"""The registry of estimators and detectors, one line each.
 
 The order is that in which they are fed: what one marks in a block, those after it see.
 """
@@ -48,7 +48,7 @@ def _dither(
 def _other_dither(
     dither_id: str, measurement: DitherMeasurement, state: TrackerState
 ) -> list[Event]:
-    """Return what the frames hold of the dither, where it is told for the first time or is over."""
+    """Return a finding on the dither when it is new or over."""
     told = state.dithers.policy
     raised = state.alarm(alarms.NOT_AS_ASKED) or state.alarm(alarms.OVER_BUDGET)
     louder = measurement.found_m > LOUDER * told.amiss_m
@@ -128,7 +128,7 @@ REGISTRY: Final = (
     Entry(DitherWatch, events=_dither),
     Entry(VibrationMonitor, events=_vibrations),
     Entry(LoopHealth, {alarms.WRONG_UNIT: _IN_METRES, alarms.DIVERGING: "the high modes are calm"}),
-    Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop is as told again"}),
+    Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop follows its status again"}),
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
     Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
     Entry(Rejection, events=_held),

@@ -1,4 +1,4 @@
-"""Everything a reader may want to know of the service at one moment: what REST shows."""
+"""A snapshot of the service for REST, metrics and page."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from service.wire import Status
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLoad:
-    """What the work of the last minute cost, and whether it keeps up."""
+    """Processor time of the last minute, and whether the worker keeps up."""
 
     worker_per_s: float | None = None
     """Processor time of the worker for each second of telemetry; None: there was none."""
@@ -91,7 +91,7 @@ class Snapshot:
 
     @property
     def operating(self) -> Operating:
-        """What the service is in, as a control room has it."""
+        """State and operation of the service, in a control room's terms."""
         hindered = "; ".join(wait.text for wait in self.waiting_for if wait.blocks)
         return operating(self.tracker, hindered, self.now_ns)
 
@@ -116,7 +116,7 @@ class Snapshot:
 
     @property
     def stale_alarms(self) -> tuple[AlarmStatus, ...]:
-        """Those that have gone and nobody has acknowledged."""
+        """Alarms that ended and were not acknowledged."""
         return tuple(AlarmStatus(record=record) for record in stale_records(self.tracker))
 
     @property
@@ -126,7 +126,7 @@ class Snapshot:
 
     @property
     def worst_severity(self) -> Severity | None:
-        """Of all that last, or went unseen; null: there is nothing."""
+        """Of all alarms that last or ended unseen; null: none."""
         return worst_severity(self.tracker)
 
     @property
@@ -142,7 +142,7 @@ class Snapshot:
 
     @property
     def rtc(self) -> Rtc | None:
-        """Null: no RTC has been heard, or it has vanished."""
+        """Null: no RTC has been seen, or it has vanished."""
         known = self.tracker.loop.rtc
         return None if known is None else Rtc(status=known)
 
@@ -162,12 +162,12 @@ class AlarmStatus:
 
     @property
     def cause(self) -> str:
-        """What an alarm of this name means."""
+        """Meaning of an alarm of this name."""
         return self._known.means if self._known else ""
 
     @property
     def do(self) -> str:
-        """What an operator does about it."""
+        """Remedy for an alarm of this name."""
         return self._known.do if self._known else ""
 
     @property
@@ -206,7 +206,7 @@ class Alpha:
 
     @property
     def suspected(self) -> Misregistration | None:
-        """Where the last window saw it, too far away to be believed before another one has.
+        """Place in the last window, too far away to be believed before another confirms it.
 
         Null: no jump is suspected.
         """
@@ -218,7 +218,7 @@ class Alpha:
 
     @property
     def passive_bias(self) -> NDArray[np.float64] | None:
-        """What the passive estimate reads more than α, as far as learnt; null: nothing is known."""
+        """Bias of the passive estimate, as far as learnt; null: unknown."""
         biases = self.registration.biases
         return biases[0].offset if biases else None
 
@@ -237,7 +237,7 @@ class Rtc:
 
     @property
     def gains(self) -> tuple[GainGroup, ...]:
-        """Of all modes of the basis, 0 where uncontrolled: neighbours with the same gain."""
+        """Gains of all modes of the basis, 0 where uncontrolled: neighbours with the same gain."""
         groups, first = [], 0
         for gain, run in groupby(self.status.gains):
             last = first + sum(1 for _ in run) - 1

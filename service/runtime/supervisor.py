@@ -1,4 +1,4 @@
-"""The one task that owns the state: it hears, lets the tracker decide, and sees it done."""
+"""The task that owns the state."""
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ class Supervisor:
 
     @property
     def description(self) -> Description | None:
-        """What the model expects of telemetry; None: it is being prepared."""
+        """The model's expectation of telemetry; None: being prepared."""
         return None if self._engine.bank is None else self._engine.bank.loop.description
 
     async def _described(self) -> Description:
@@ -254,7 +254,7 @@ class Supervisor:
         return await self._workers.call(worker.OpticsWorker.describe)
 
     async def _listen(self) -> None:
-        """Take in what the link has: frames, then what was told after them."""
+        """Take what the link has: frames, then the events after them."""
         rung = asyncio.Event()
         loop = asyncio.get_running_loop()
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set), for_frames=False)
@@ -299,7 +299,7 @@ class Supervisor:
 
     @contextlib.contextmanager
     def _surviving(self, what: str) -> Iterator[None]:
-        """Go on after a fault that nobody foresaw: it is on record, and costs what was gathered.
+        """Go on after an unforeseen fault: log it, begin the estimators anew.
 
         The estimators begin anew before anything is posted: each event leads them on.
         """

@@ -1,4 +1,4 @@
-"""What is kept of telemetry: recordings on request, and a sample of every moment for the charts."""
+"""Record telemetry on request."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RecordingChoice(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnnotationChoice(Instruction):
-    """What somebody notes about a moment."""
+    """An operator's note about a moment."""
 
     note: Annotated[str, MinLen(1), MaxLen(2000)]
     """What is to be kept."""
@@ -250,7 +250,7 @@ class TelemetryRecorder:
                 await self.end("the service was ended")
 
     def _full(self) -> str | None:
-        """Return what to tell of a disk with little room, None where there is enough."""
+        """Return a warning if the disk has little room, else None."""
         try:
             return low_on_space(self._archive.directory, self._retention, low=False)
         except OSError as error:

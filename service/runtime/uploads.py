@@ -1,4 +1,4 @@
-"""The desk where fits of uploaded matrices are asked for: it keeps, queues, and remembers them."""
+"""The queue of fits of uploaded matrices."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _BEGINS = (b"\x89HDF\r\n\x1a\n", b"SIMPLE  =", b"\x1f\x8b", files.NUMPY_BEGINS, 
 
 
 class FitState(StrEnum):
-    """How far a fit is."""
+    """States of a fit."""
 
     RECEIVING = "receiving"
     """The upload is on its way."""
@@ -102,7 +102,7 @@ class FitJob:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitLimits:
-    """What fits of uploads may take."""
+    """Limits of fits of uploads."""
 
     max_bytes: int
     """Of one upload."""
@@ -219,7 +219,7 @@ class FitQueue:
         n_bytes: int | None,
         name: str = "",
     ) -> FitJob:
-        """Keep an upload and put its fit in the queue, under a ``name`` for whoever looks there.
+        """Keep an upload and queue its fit, under a ``name``.
 
         Raises
         ------
@@ -412,5 +412,5 @@ async def run_program(words: Sequence[str], *, limit_s: float) -> None:
         raise errors.WorkerError("the process of the job died; out of memory?")
     if status > 0:
         lines = said.decode(errors="replace").split("\n")
-        last = next((line for line in reversed(lines) if line.strip()), "it said nothing")
+        last = next((line for line in reversed(lines) if line.strip()), "without a message")
         raise errors.WorkerError(last)

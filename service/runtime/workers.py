@@ -1,4 +1,4 @@
-"""The worker as the event loop sees it: one job at a time, replaced when it dies or hangs."""
+"""The worker as the event loop uses it: one job at a time."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ JOB = "job "
 
 
 class WorkerLoadMeter:
-    """Counts what the work costs; ``look`` at it once a second."""
+    """Meters the cost of work; ``look`` at it once a second."""
 
     def __init__(self, workers: WorkerPool) -> None:
         self._workers = workers
@@ -255,7 +255,7 @@ class WorkerLoadMeter:
 
     @property
     def worker_load(self) -> WorkerLoad:
-        """What the work of the last minute cost."""
+        """Cost of the work of the last minute."""
         spent = self._spent()
         lasted_s, telemetry_s = max(spent["clock_s"], 1e-9), spent["telemetry_s"]
         fitted = spent["fitted"]

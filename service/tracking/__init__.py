@@ -1,1 +1,1 @@
-"""What the service knows, what happens to it, and what it makes of it: the parts of ``step``."""
+"""The tracker: state, events, and the functions that ``step`` is made of."""

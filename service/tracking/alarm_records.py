@@ -1,4 +1,4 @@
-"""What operators have seen of alarms: acknowledged, muted, gone unseen.
+"""Acknowledge, mute and remember alarms.
 
 As LSST's ts_watcher has it: an alarm is acknowledged, not dismissed; one that goes unseen stays
 as stale; the worst it has been is kept; an acknowledgement holds until the alarm is over, or worse
@@ -79,7 +79,7 @@ def worst_severity(state: TrackerState) -> Severity | None:
 
 
 def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
-    """Note that somebody knows of an alarm; one that is over is done with.
+    """Acknowledge an alarm; one that is over goes.
 
     Raises
     ------
@@ -91,9 +91,7 @@ def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
     notes, record = _with_record(context, command.name)
     seen, worst_yet = command.severity, record.worst
     if seen is not None and worst_yet is not None and worst_yet.above(seen):
-        raise CommandError(
-            f"{record.name} has been {worst_yet}, and {seen} was seen of it: look again"
-        )
+        raise CommandError(f"{record.name} has been {worst_yet}, and {seen} was seen: look again")
     acknowledged = replace(record, acknowledged=_operator_note(context, command))
     notes[record.name] = acknowledged if record.over_ns_utc is None else _blank(record)
     _store(context, notes)
@@ -101,7 +99,7 @@ def acknowledge(context: StepContext, command: cmd.AcknowledgeAlarm) -> None:
 
 
 def mute(context: StepContext, command: cmd.MuteAlarm) -> None:
-    """Keep an alarm from being shown and told for a time; all it forbids, it goes on to forbid.
+    """Hide an alarm for a time; what it forbids stays forbidden.
 
     Raises
     ------
@@ -118,7 +116,7 @@ def mute(context: StepContext, command: cmd.MuteAlarm) -> None:
 
 
 def unmute(context: StepContext, command: cmd.UnmuteAlarm) -> None:
-    """Show and tell an alarm again.
+    """Show an alarm again.
 
     Raises
     ------

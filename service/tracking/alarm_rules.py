@@ -1,4 +1,4 @@
-"""Alarms that follow from the state: one table of rules, worked out at one place of a step.
+"""Alarms that follow from the state: one table of rules.
 
 Where an alarm comes from stands in alarms.toml (``origin``). One that can be read from the state
 has its rule here; one that an event tells is raised where that event is taken in, and ends by its
@@ -124,7 +124,7 @@ def _not_found(context: StepContext) -> str | None:
         return context.alarm_text(alarms.NOT_FOUND)
     return (
         "window after window finds no registration, though the loop holds well: modes or slopes "
-        "are probably in another order, or of another sign, than the instrument file tells; "
+        "are probably in another order, or of another sign, than the instrument file says; "
         "compare both with it, or measure an interaction matrix; the loop is left closed (acquire "
         "opens it to look from afar)"
     )

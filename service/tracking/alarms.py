@@ -1,4 +1,4 @@
-"""The alarms by name: how much each matters, what it forbids, and what operators did about it.
+"""Names and definitions of alarms, and operators' notes on them.
 
 The one table of them is alarms.toml; docs/operate/runbook.md shows it. What operators do about them
 is as LSST's ts_watcher has it (doc/displaying_alarms.rst there).
@@ -67,16 +67,16 @@ RULE_PREFIX = "rule."
 
 
 class Interlock(StrEnum):
-    """What an alarm may forbid."""
+    """Things that an alarm may forbid."""
 
     MEASURE = auto()
-    """Take a window, or a look at ordinary telemetry, for a measurement."""
+    """Take a window or ordinary telemetry for a measurement."""
 
     DECIDE = auto()
     """Make, send or dither without being asked: mode auto does nothing."""
 
     HOLD = auto()
-    """Count on the loop as it is: after some seconds of this the service acquires by itself."""
+    """Rely on the loop: after some seconds the service acquires by itself."""
 
     SEND_NEW = auto()
     """Send a matrix that was never in use, whoever approves of it; acquisitions need that."""
@@ -85,11 +85,11 @@ class Interlock(StrEnum):
     """Send one that has been in use before: a rollback."""
 
     ASK = auto()
-    """Ask anything of the RTC, or follow its telemetry: nobody knows whose it is."""
+    """Ask anything of the RTC, or use its telemetry."""
 
 
 class Severity(StrEnum):
-    """How much an alarm matters, least first."""
+    """Severity of an alarm, lowest first."""
 
     WARNING = auto()
     """Somebody should know; the service does its work."""
@@ -98,7 +98,7 @@ class Severity(StrEnum):
     """The service does less than it should until it is over."""
 
     CRITICAL = auto()
-    """The loop is in danger, or what is heard of it cannot be relied on."""
+    """The loop is in danger, or its telemetry cannot be relied on."""
 
     def above(self, other: Severity | None) -> bool:
         """Return whether it matters more than another; None: than nothing."""
@@ -107,7 +107,7 @@ class Severity(StrEnum):
 
 
 class Responsible(StrEnum):
-    """Whom the service waits for."""
+    """Party that can end a wait."""
 
     RTC = "rtc"
     OPERATOR = "operator"
@@ -137,7 +137,7 @@ class Prerequisite:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmDefinition:
-    """What there is to know of an alarm, whenever it is raised."""
+    """Definition of an alarm: severity, meaning, remedy, interlocks."""
 
     severity: Severity
     means: str
@@ -179,27 +179,27 @@ class Alarm:
 
     @property
     def definition(self) -> AlarmDefinition:
-        """What there is to know of it; of a name that is in no table, nothing."""
+        """Its definition; an unknown name has an empty one."""
         listed = self.own or ALARMS.get(self.name)
         return listed or AlarmDefinition(severity=Severity.WARNING, means="", do="")
 
 
 class AlarmState(StrEnum):
-    """How far an alarm has come with operators."""
+    """State of an alarm with operators."""
 
     ACTIVE = "active"
-    """It lasts, and nobody has said that they know."""
+    """It lasts and is not acknowledged."""
 
     ACKNOWLEDGED = "acknowledged"
-    """It lasts, and somebody knows: once it is over, it is forgotten."""
+    """It lasts and is acknowledged; it goes when it is over."""
 
     STALE = "stale"
-    """It is over, and nobody has seen it: it stays until somebody acknowledges it."""
+    """It ended unseen; it stays until acknowledged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorNote:
-    """What an operator has said of an alarm."""
+    """An operator's note on an alarm."""
 
     by: str
     reason: str
@@ -210,7 +210,7 @@ class OperatorNote:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmRecord:
-    """What is kept of an alarm besides whether it lasts: what it has been, who has seen it."""
+    """History of an alarm: times, worst severity, acknowledgement, mute."""
 
     name: str
     worst: Severity | None = None
@@ -228,7 +228,7 @@ class AlarmRecord:
 
     @property
     def alarm_state(self) -> AlarmState | None:
-        """How far it has come with operators; None: it was not raised."""
+        """Its state with operators; None: it was never raised."""
         if self.worst is None:
             return None
         if self.acknowledged is not None:

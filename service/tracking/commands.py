@@ -1,4 +1,4 @@
-"""What operators can ask, and the observatory tell: each command once, with what it may hold.
+"""Commands of operators and the observatory, with their limits.
 
 REST reads JSON straight into these. What no state of the service could make sense of is refused
 when a command is made; what needs something of the present state, where it is carried out.
@@ -39,7 +39,7 @@ Lines = Annotated[tuple[Positive, ...], Len(1, MAX_MODES)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instruction:
-    """What may be said with every command."""
+    """Fields that every command may have."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = {
         "extra": "forbid",
@@ -79,7 +79,7 @@ class Instruction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetMode(Instruction):
-    """Choose how much the service may do by itself."""
+    """Set the mode: how much the service may do by itself."""
 
     mode: Mode
     """"auto", "propose" or "hold"."""
@@ -95,7 +95,7 @@ class Refit(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomSigns(Instruction):
-    """What random signs on many modes at once may cost."""
+    """Amplitude and duration of random signs on many modes at once."""
 
     total_amplitude_m: Positive | None = None
     """RMS of all modes of random signs together, metres OPD."""
@@ -142,14 +142,14 @@ class StartDither(RandomSigns):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StopDither(Instruction):
-    """Stop the dither and do not start another until told to."""
+    """Stop the dither and start no other until ordered to."""
 
     action: Literal["stop"] = "stop"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OfMatrix(Instruction):
-    """What is said of one matrix."""
+    """The matrix that an order is about."""
 
     id: str
     """Of the matrix; one to come was never used before."""
@@ -167,7 +167,7 @@ class Reject(OfMatrix):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Publish(OfMatrix):
-    """Send a known reconstructor again, under a new id, unless the gate refuses it now."""
+    """Send a known reconstructor again, under a new id, if the gate accepts it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,7 +180,7 @@ class Rollback(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasureChoice(Instruction):
-    """How the RTC is to measure an interaction matrix; what is left out, the service chooses.
+    """Parameters of a measurement by the RTC; the service chooses those left out.
 
     All patterns but "sine" open the loop meanwhile.
     """
@@ -231,7 +231,7 @@ class GiveUp(OfMatrix):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoisyChoice(RandomSigns):
-    """How a noisy interaction matrix is to be measured; what is left out, the service chooses.
+    """Parameters of a noisy matrix; the service chooses those left out.
 
     The loop stays closed: random signs on all its modes at once, a few nanometres altogether.
     """
@@ -258,7 +258,7 @@ class MeasureNoisy(NoisyChoice):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetPointing(Instruction):
-    """Say where the telescope looks."""
+    """Report where the telescope points."""
 
     elevation_deg: Annotated[float, Ge(-90.0), Le(90.0)]
     """Above the horizon, degrees."""
@@ -274,7 +274,7 @@ class SetPointing(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReportedValue(Instruction):
-    """What the observatory tells of something that operators' own rules ask for."""
+    """A value of the observatory for operators' own rules."""
 
     value: Value
     """A number, a text, or true or false, as the rule compares it."""
@@ -291,7 +291,7 @@ class ReportedValue(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SetValue(ReportedValue):
-    """Tell a value."""
+    """Report a value for operators' own rules."""
 
     name: str
     """As the rules have it."""
@@ -381,7 +381,7 @@ class Ramp(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acquire(Instruction):
-    """Find the registration from nothing: open the loop, look, and close it step by step.
+    """Find the registration from nothing: open the loop, dither, close it step by step.
 
     Its reconstructors need no further approval, in any mode.
     """
@@ -402,17 +402,17 @@ class AbortAcquisition(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StopEverything(Instruction):
-    """Stop everything: whatever runs is ended, no dither, nothing made or sent until released."""
+    """Stop everything: end what runs, dither, make and send nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resume(Instruction):
-    """Release what was stopped: mode and dither are as they were ordered before."""
+    """End the stop: mode and dither are as ordered before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenAlarm(Instruction):
-    """What may be said of an alarm that is acknowledged."""
+    """Fields of an acknowledgement."""
 
     severity: Severity | None = None
     """The worst that was seen of it: refused where it has been worse; None: however bad it was."""
@@ -436,7 +436,7 @@ class MuteTime(Instruction):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MuteAlarm(MuteTime):
-    """Show and tell an alarm no more for a time; it is counted."""
+    """Hide an alarm for a time; it is still counted."""
 
     name: str
     """Of the alarm."""
@@ -444,7 +444,7 @@ class MuteAlarm(MuteTime):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnmuteAlarm(Instruction):
-    """Show and tell an alarm again."""
+    """Show an alarm again."""
 
     name: str
     """Of the alarm."""

@@ -1,4 +1,4 @@
-"""The dither: asked for when it is due, adopted, playing, ended, lost, unwanted or too strong.
+"""Start, follow and stop the dither.
 
 A dither that runs already, from before a restart of the service or in a replayed night, is as good
 as a new one, and the RTC plays no second one beside it.
@@ -130,7 +130,7 @@ def allow_dither(context: StepContext, *, allowed: bool = True) -> None:
 
 
 def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
-    """Stop the dither, and start none until told to."""
+    """Stop the dither, and start none until ordered to."""
     forget_dither(context)
     allow_dither(context, allowed=False)
     note_found(context)
@@ -253,7 +253,7 @@ def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None
     most_m = dither_plan.budget_m(rtc, context.policy)
     if event.found_m > MEASURED * max(event.asked_m, most_m):
         return f"{event.text}; the budget is {1e9 * most_m:.3g} nm"
-    context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; look at the RTC's dither")
+    context.raise_alarm(alarms.NOT_AS_ASKED, f"{event.text}; check the RTC's dither")
     return None
 
 
@@ -290,7 +290,7 @@ def stop_unwanted(context: StepContext, rtc: Status) -> None:
 
 
 def forget_unwanted(context: StepContext) -> None:
-    """Note that no unwanted dither plays, or nobody knows of one."""
+    """Note that no unwanted dither plays."""
     if context.dither_policy.unwanted_id is not None:
         _set_policy(context, replace(context.dither_policy, unwanted_id=None))
 
@@ -398,7 +398,7 @@ def _adopt(context: StepContext, rtc: Status) -> bool:
 
 
 def _level(request: DitherRequest) -> Level:
-    """Return how loudly a dither is told of: the service's own come and go all night."""
+    """Return the log level of a dither: the service's own come and go all night."""
     return Level.DEBUG if request.id.startswith(OWN_DITHER) else Level.INFO
 
 
@@ -490,7 +490,7 @@ def _note_unwanted(context: StepContext, running: str) -> None:
 
 def _raise_over_budget(context: StepContext, running: str, loud: str) -> None:
     text = (
-        f"{loud}: it was told to stop {running}, and another is tried after {CALM_S:.0f} s; look "
+        f"{loud}: it was asked to stop {running}, and another is tried after {CALM_S:.0f} s; look "
         "at the RTC's dither, or stop the dither to do without"
     )
     _set_policy(context, replace(context.dither_policy, loud_ns_utc=context.now_ns))

@@ -1,4 +1,4 @@
-"""Which modes the service dithers by itself, and what the loop makes of one that it controls."""
+"""Choose the modes to dither."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MANY_LINES = np.linspace(*PROVING_RANGE, 100)
 def chosen_modes(
     rtc: Status, policy: Policy, shunned: frozenset[int] = frozenset()
 ) -> tuple[int, ...]:
-    """Return the modes to dither: those of the settings, or the ones that tell most.
+    """Return the modes to dither: the settings' own, or the best for α.
 
     These are four above the controlled modes. Where fewer are left they are four of the highest
     ``SPAN``, in the loop or not: the last of a basis tell little of a rotation, and answer least as
@@ -107,7 +107,7 @@ def _without_choice(
 
 @lru_cache(maxsize=4)  # of one policy; asked for with every status
 def _telling(policy: Policy, first: int, stop: int, shunned: frozenset[int]) -> tuple[int, ...]:
-    """Return which of these modes tell most of α."""
+    """Return the modes with most information on α."""
     if policy.mode_information is None:
         return ()
     among = [mode for mode in range(first, stop) if mode not in shunned]

@@ -1,4 +1,4 @@
-"""Which dither is wanted and when: how strong, with which windows and pauses; which must go."""
+"""Decide which dither is wanted now: strength, windows, pauses."""
 
 from __future__ import annotations
 
@@ -267,7 +267,9 @@ def why_moved(dither: Dither, rtc: Status, policy: Policy, shunned: frozenset[in
         return ""
     odd = shunned.intersection(dither.request.modes)
     if odd and not odd.intersection(chosen_modes(rtc, policy, shunned)):
-        return f"mode {min(odd)} has not answered as the instrument file says: others tell of α"
+        return (
+            f"mode {min(odd)} has not answered as the instrument file says: others are used for α"
+        )
     elsewhere = why_elsewhere(dither.request, rtc, policy)
     if elsewhere or not controlled(dither.request.modes, rtc):
         return elsewhere
@@ -350,7 +352,7 @@ def _pace_with_passive(
         return DitherPhase.SPARSE, "ordinary telemetry keeps σ between windows", longest_ns
     if registration.arrived_ns_utc > registration.window_ns_utc:
         return DitherPhase.SPARSE, "ordinary telemetry alone keeps σ no longer", now_ns
-    return DitherPhase.FOLLOW, "a window alone does not bring σ to what is asked", now_ns
+    return DitherPhase.FOLLOW, "one window does not bring σ to its target", now_ns
 
 
 def _pace_without_passive(
@@ -361,7 +363,7 @@ def _pace_without_passive(
     on_s = SETTLING_S + requirement.window_s + SPARE_S
     pause_s = float(np.min(room / requirement.drift_rate**2)) - on_s
     if pause_s < SHORTEST_PAUSE_S:
-        text = "α walks too fast for a pause, or no window brings σ to what is asked"
+        text = "α walks too fast for a pause, or no window brings σ to its target"
         return DitherPhase.FOLLOW, text, registration.arrived_ns_utc
     due_ns = registration.arrived_ns_utc + round(min(pause_s, 1e6) * SECOND_NS)
     return (

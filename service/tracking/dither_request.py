@@ -1,4 +1,4 @@
-"""A dither: what is asked of the RTC, how it is read, what the service makes of its own."""
+"""A dither as requested, planned and adopted."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Dither:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherParameters:
-    """What a dither is to be like, besides what settings or an operator fix."""
+    """Parameters of a dither beside those of settings or an operator."""
 
     total_m: float
     """RMS of all lines together, metres OPD."""
@@ -104,7 +104,7 @@ class DitherParameters:
 
 
 def why_unusable(dither: Dither, rtc: Status, policy: Policy) -> str | None:
-    """Return why the lines of a dither cannot be told apart in its windows, or None."""
+    """Return why the lines of a dither cannot be separated in its windows, or None."""
     kind = dither.request.kind
     if kind is not DitherKind.SINE:
         return f"{dither.id} is {kind}, not a sine"
@@ -126,7 +126,7 @@ def plan_dither(
     frequency_hz: tuple[float, ...] | None = None,
     duration_s: float | None = None,
 ) -> Dither:
-    """Return the dither to ask for: what is not given is the policy's own choice.
+    """Return the dither to ask for; the policy chooses what is not given.
 
     Lines have whole periods in a window. The loop leaves the modes alone, if there are such.
     """
@@ -375,7 +375,7 @@ def _modes(asked: tuple[int, ...] | ModeSet, rtc: Status) -> tuple[int, ...]:
 
 
 class DitherPhase(StrEnum):
-    """How the service dithers."""
+    """Phases of the dither policy."""
 
     OFF = "off"
     """None is wanted, or none can be had."""
@@ -398,7 +398,7 @@ class DitherPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Precision:
-    """How precise windows are, learnt from those accepted; kept from star to star."""
+    """Precision of windows, learnt from accepted ones and kept from star to star."""
 
     ratio: NDArray[np.float64]
     """``(4,)`` measured κ of ``σ = κ / (A sqrt(T))`` over that of the table for the magnitude."""

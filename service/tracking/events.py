@@ -1,4 +1,4 @@
-"""What can happen to the service, what is to be done about it, and the ids of both."""
+"""Events, effects, and their ids."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from service.wire import Command as Request
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Caused:
-    """What is done because of something."""
+    """An effect with the id of its cause."""
 
     cause: str = field(default="", compare=False)
     """Id of the command or event that has led to it; ``StepContext.ask`` says so."""
@@ -78,7 +78,7 @@ class JudgeProposal(Caused):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SendMatrix(Caused):
-    """Publish a reconstructor; first tell the RTC how many modes it commands."""
+    """Publish a reconstructor, after the number of modes it commands."""
 
     id: str
     n_modes: int
@@ -265,7 +265,7 @@ class MatrixFetched:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModesRecognised:
-    """Held against the model, the matrix in use has told which modes it controls."""
+    """The model has recognised the modes of the matrix in use."""
 
     id: str
     strange: tuple[int, ...]
@@ -327,7 +327,7 @@ class DitherSilent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherMeasured:
-    """What the frames hold of a dither is otherwise than it was asked for, or is so no more."""
+    """The dither in the frames differs from the request, or no longer does."""
 
     id: str
     found_m: float

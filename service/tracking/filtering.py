@@ -1,4 +1,4 @@
-"""One measurement folded into the registration by the joint filter of α and of passive biases."""
+"""Update the registration by a measurement: the joint filter of α and bias."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ HISTORY_LENGTH = 5000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WindowEstimate(PointedEstimate):
-    """What one dithered window says of α, and of what it was made."""
+    """Estimate of α from one dithered window, with its inputs."""
 
     source: Source
     optical_gain: float
@@ -138,7 +138,7 @@ class WindowEstimate(PointedEstimate):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilterUpdate:
-    """What the filter makes of a window."""
+    """The filter after a window."""
 
     joint: Joint
     n_windows: int

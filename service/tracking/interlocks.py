@@ -1,4 +1,4 @@
-"""Whether an order may be given now: the one place that decides it, whoever asks and however.
+"""Decide whether an order may be given now.
 
 ``step`` enforces it, the state publishes it, and the page and the command line draw from that. Most
 orders are refused because something runs; some need an RTC, α, or a reconstructor besides. What an
@@ -39,7 +39,7 @@ class Permission:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
-    """What an interlock decides on."""
+    """State and policy on which an interlock decides."""
 
     state: TrackerState
     policy: Policy
@@ -232,7 +232,7 @@ def _approve(moment: Moment, matrix_id: str) -> str | None:
     if reason is not None:
         return f"{record.id} cannot be sent: {reason}"
     if registration is not None and beyond_judging(state, record):
-        return f"{record.id}: an open loop does not tell its gains: close it first"
+        return f"{record.id}: an open loop shows no gains: close it first"
     return None
 
 

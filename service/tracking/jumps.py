@@ -1,4 +1,4 @@
-"""How far a measurement lies from what was known: whether the mirror has jumped.
+"""Decide whether the mirror has jumped.
 
 The filter allows for a random walk, which can go far in a few seconds. Flexure is smooth: over less
 than a minute it goes as time itself and not as its root, and what goes faster should be seen.
@@ -72,7 +72,7 @@ EstimateT = TypeVar("EstimateT", bound=TimedEstimate)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Innovation:
-    """How far a reading lies from what was known."""
+    """Distance of a measurement from the prediction."""
 
     mahalanobis_squared: float
     """Squared, normalised, of all four parameters: 4 is expected."""
@@ -84,7 +84,7 @@ class Innovation:
 
     @property
     def excess(self) -> float:
-        """What is least likely of it, over what chance hardly ever exceeds."""
+        """Its least likely part, over what chance hardly ever exceeds."""
         return max(self.mahalanobis_squared / JUMP_THRESHOLD, self.rotation / self.rotation_limit)
 
     @property
@@ -182,7 +182,7 @@ def previous_window(registration: Registration) -> TimedEstimate | None:
 def jump_lasts(
     registration: Registration, first: TimedEstimate, window: PointedEstimate, both: Innovation
 ) -> bool:
-    """Return whether windows have told of a new place, ``both`` so far, for long enough.
+    """Return whether windows have shown the new place, ``both`` so far, for long enough.
 
     Two suffice where windows scatter by what they say and are independent. Where they scatter by
     more, neighbours are wrong together, and they must agree for longer than that lasts.
@@ -195,7 +195,7 @@ def jump_lasts(
 def wholly_after(
     first: TimedEstimate, window: PointedEstimate, old: Misregistration, policy: Policy
 ) -> bool:
-    """Return whether a window is of the new place ``reading`` tells, and not partly of the ``old``.
+    """Return whether a window is of the new place ``reading`` shows, and not partly of ``old``.
 
     The first window after a jump began before it. What it may lack of the way (2 σ of the
     difference allowed for) must be little.
@@ -214,7 +214,7 @@ def passive_innovation(
     window: PointedEstimate,
     policy: Policy,
 ) -> float:
-    """Return the same of a passive look, its bias allowed for; ``joint`` is at ``known``'s time."""
+    """Return the innovation of a passive estimate; ``joint`` is at ``known``'s time."""
     bias = registration.bias(block)
     before = None if bias is None else bias.previous_estimate
     found, off = [], np.square(block.wander) * np.diag(window.covariance)
@@ -238,7 +238,7 @@ def as_previous(registration: Registration) -> PreviousEstimate:
 
 
 def sum_of(registration: Registration, joint: Joint, block: BiasBlock) -> PreviousEstimate:
-    """Return what a passive look should read: α and its bias together, the filter as it stands."""
+    """Return the expected passive estimate: α and its bias together."""
     sees = joint.seen(block)
     return PreviousEstimate(
         alpha=Misregistration.from_vector(sees @ joint.mean),

@@ -1,4 +1,4 @@
-"""How many modes may be controlled for now, and which have shown how they answer."""
+"""How many modes may be controlled for now."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ModeLimit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeAnswer:
-    """How a mode has last answered a dither otherwise than the instrument file says."""
+    """The last answer of a mode that contradicts the instrument file."""
 
     mode: int
     gain: float

@@ -1,4 +1,4 @@
-"""Which modes may be controlled: those that have been seen to answer as the instrument file says.
+"""Which modes have been seen to answer as the instrument file says.
 
 A mode whose sign, place or size is another than the file says makes any loop diverge that begins
 to control it. The RTC's own matrix tells how those modes answer that it controls. All others are
@@ -88,12 +88,12 @@ def _controlled(state: TrackerState) -> frozenset[int]:
 
 
 def shunned_modes(state: TrackerState) -> frozenset[int]:
-    """Return the modes that have answered otherwise and are not in the loop: none tells of α."""
+    """Return the contrary modes outside the loop: none is used for α."""
     return state.matrices.mode_proof.contrary - proven_modes(state)
 
 
 def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str | None:
-    """Return why a window of these modes does not tell of α, or None.
+    """Return why a window of these modes does not determine α, or None.
 
     What the loop makes of a line is fitted with the gain of the line's own mode.
     """
@@ -104,7 +104,7 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
     odd -= proven_modes(context.state).union(estimate.weak)
     if not odd:
         return None
-    return f"{_as_subject(odd)} not answered as the instrument file says: such a window tells no α"
+    return f"{_as_subject(odd)} not answered as the instrument file says: such a window gives no α"
 
 
 def n_proven_modes(state: TrackerState, n_modes: int) -> int:
@@ -114,7 +114,7 @@ def n_proven_modes(state: TrackerState, n_modes: int) -> int:
 
 
 def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None:
-    """Return why a matrix would control modes that nobody has seen to answer, or None."""
+    """Return why a matrix would control unproven modes, or None."""
     if state.operations.acquisition.under_way:
         return None  # it closes the loop on smooth modes first, and watches it
     proven = proven_modes(state)
@@ -191,7 +191,7 @@ def _to_compare(context: StepContext, rtc: Status, shown: list[int]) -> list[int
 
 
 def unknown_loop(state: TrackerState, rtc: Status) -> bool:
-    """Return whether nobody knows how the modes answer that the loop controls already.
+    """Return whether the answers of the controlled modes are unknown.
 
     No matrix can be sent before that is known: one window is enough to begin with.
     """

@@ -1,4 +1,4 @@
-"""Correction by moving: the mirror's image is asked back to where it was drawn, step by step.
+"""Ask a lens or stage to move the mirror's image back.
 
 Some telescopes move a lens or a stage instead of the matrix, or beside it. A demand is a change of
 α. The reply tells that it was made, and when the image stands still: α is expected at the new
@@ -144,7 +144,7 @@ def restore_offload(context: StepContext, offload: Offload) -> None:
 def _may_move(
     context: StepContext, registration: Registration, rtc: Status, limits: Offloading
 ) -> bool:
-    """Return whether α is beyond doubt, nothing else is under way, and nobody forbids it."""
+    """Return whether α is beyond doubt, nothing else is under way, and no alarm forbids it."""
     state, last = context.state, context.alpha.offload
     if state.operator.mode is not Mode.AUTO or state.on_probation or not rtc.in_loop:
         return False
@@ -177,7 +177,7 @@ def _rest_ns(last: Offload, policy: Policy) -> int:
 
 
 def _clock_ns(context: StepContext, after_s: float) -> int:
-    """Return the RTC's clock so long after now, at the latest; 0: no RTC tells it."""
+    """Return the RTC's clock so long after now, at the latest; 0: unknown."""
     return 0 if context.rtc is None else context.rtc.t_ns + round((STATUS_S + after_s) * SECOND_NS)
 
 

@@ -1,4 +1,4 @@
-"""What may have the loop or the mirror for itself, as records: how far each has come."""
+"""Records of operations."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ class AcquisitionStage(StrEnum):
     """How far an acquisition has come."""
 
     IDLE = "idle"
-    """None has been asked for, or needed."""
+    """None yet."""
 
     OPENING = "opening"
     """The RTC has been asked to open the loop."""
 
     COARSE = "coarse"
-    """Smooth modes are dithered with the loop open, to find α from afar."""
+    """Smooth modes are dithered with the loop open, to find α."""
 
     CONFIRMING = "confirming"
-    """Other modes are dithered, which must say the same."""
+    """Other modes are dithered, to confirm it."""
 
     PARTIAL = "partial"
     """A reconstructor for a part of the modes is made, judged and sent; then the loop closes."""
@@ -44,7 +44,7 @@ class AcquisitionStage(StrEnum):
     """An operator ended it."""
 
     INTERRUPTED = "interrupted"
-    """The service ended, or the RTC vanished, in the middle of it; the text says what is done."""
+    """The service ended or the RTC vanished during it; the text says what follows."""
 
 
 UNDER_WAY = frozenset(
@@ -169,7 +169,7 @@ class ProbationState(StrEnum):
     """Telemetry is being compared with that of the matrix before."""
 
     OVERDUE = "overdue"
-    """Telemetry is late: the verdict counts when it comes, and nothing waits for it."""
+    """Telemetry is late; nothing waits for the verdict."""
 
     PASSED = "passed"
     """The loop is as good as before, or better."""
@@ -178,7 +178,7 @@ class ProbationState(StrEnum):
     """It is worse: the matrix before is on its way back."""
 
     WATCHED = "watched"
-    """It was worse; the matrix before is in use again, and the loop is looked at with it."""
+    """It was worse; the matrix before is in use again, and the loop is being checked."""
 
     ROLLED_BACK = "rolled-back"
     """It was worse; the matrix before is in use again."""
@@ -187,7 +187,7 @@ class ProbationState(StrEnum):
     """It is worse, and the service could not go back; the text says why."""
 
     OPENING = "opening"
-    """The loop was lost with it, and going back was no help or no way: it is asked to open."""
+    """The loop was lost, and going back did not help: the RTC is asked to open it."""
 
     OPENED = "opened"
     """The loop opened when it was asked to."""
@@ -280,7 +280,7 @@ class MeasureState(StrEnum):
     """The matrix is in the archive."""
 
     GIVEN_UP = "given-up"
-    """An operator waits for it no longer; the RTC may go on, what it sends is ignored."""
+    """An operator gave it up; the RTC may go on, its matrix is ignored."""
 
 
 _MEASURING = (

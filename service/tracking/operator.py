@@ -1,4 +1,4 @@
-"""What an operator asks for: the mode, dithers, reconstructors, the loop and its gains."""
+"""Carry out orders: mode, dither, reconstructors, loop."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def refit(context: StepContext, command: cmd.Refit) -> None:
 
 
 def start_dither(context: StepContext, command: cmd.StartDither) -> None:
-    """Start a dither; what is not said of it is the service's own choice.
+    """Start a dither; the service chooses what is not given.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def _republish(context: StepContext, source: str, why: str, *, anyway: bool = Fa
 
 
 def set_pointing(context: StepContext, command: cmd.SetPointing) -> None:
-    """Note where the telescope looks, as the observatory tells it."""
+    """Note where the telescope points, as the observatory reports it."""
     note_pointing(context, command.pointing)
 
 

@@ -233,7 +233,7 @@ def _ask_for_window(
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     validity.request_window(context, text)
     if why_none is not None or was_doubted:
-        cannot = "none has since the last look that did" if why_none is None else why_none
+        cannot = "no window since the last disagreement" if why_none is None else why_none
         context.raise_alarm(alarms.DISAGREES, f"{text}: {cannot}; α stands as windows have it")
     validity.age_registration(context)
     _show_passive(context, event, event.estimate.sigma, np.zeros(4), text, consistent=False)

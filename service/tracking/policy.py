@@ -38,7 +38,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Offloading:
-    """How α is corrected by moving the mirror's image; all arrays ``(4,)``, numeric units."""
+    """Limits of offloads; all arrays ``(4,)``, numeric units."""
 
     share: float
     """Of the way back to the nominal registration that is asked for at once."""

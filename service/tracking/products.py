@@ -1,4 +1,4 @@
-"""What is made and measured: reconstructors, interaction matrices, and where each of them is."""
+"""Records of reconstructors and interaction matrices, with their states."""
 
 from __future__ import annotations
 
@@ -21,17 +21,16 @@ from service.wire import (
 
 
 class MatrixState(StrEnum):
-    """Where a reconstructor is on its way to the RTC."""
+    """States of a reconstructor on its way to the RTC."""
 
     REFUSED = "refused"
     """The stability gate refused it: it is never offered."""
 
     PROPOSED = "proposed"
-    """It passed the gate and waits for an operator: for half a minute at least, unless the
-    mirror has moved too far for it."""
+    """It passed the gate and waits for an operator, half a minute at least."""
 
     DISCARDED = "discarded"
-    """An operator rejected it, or what it was made for has passed: another α, another proposal."""
+    """An operator rejected it, or another α or proposal has overtaken it."""
 
     PUBLISHED = "published"
     """Sent; the RTC has not answered yet."""
@@ -60,7 +59,7 @@ _USED = (MatrixState.APPLIED, MatrixState.SUPERSEDED)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Judged(ControlLaw):
-    """What a verdict of the gate is of: of another loop, or of another α, it says nothing.
+    """Loop and α that a verdict of the gate is about.
 
     The gains are those of the modes that the reconstructor commands.
     """
@@ -132,7 +131,7 @@ class ReconstructorRecord:
 
     @property
     def origin(self) -> str:
-        """Who made its numbers: the RTC, or the service."""
+        """Maker of its numbers: the RTC, or the service."""
         if not self.is_rtcs:
             return "the service's"
         return "the RTC's own" + ("" if self.parent is None else f", {self.parent} sent again")
@@ -180,7 +179,7 @@ class ReconstructorRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Assessment:
-    """What the reconstructor in use loses against a new one, at one registration."""
+    """Loss of the reconstructor in use against a new one, at one registration."""
 
     id: str
     """Of the reconstructor in use then."""

@@ -1,4 +1,4 @@
-"""A reconstructor's way: made, kept, judged, sent, acknowledged, in use."""
+"""A reconstructor from made to in use: judged, sent, acknowledged."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def forget_when_judged(context: StepContext) -> None:
 
 
 def forget_session(context: StepContext) -> None:
-    """Note that the RTC has begun a new session: nobody knows what it multiplies with."""
+    """Note that the RTC has begun a new session: its matrix is unknown."""
     for record in context.matrices.reconstructors:
         if record.on_its_way:
             change_state(context, record.id, MatrixState.FAILED, "the RTC restarted")
@@ -140,7 +140,7 @@ def request_verdict(context: StepContext, matrix_id: str) -> None:
 
 
 def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
-    """Keep a new reconstructor; send it if it passed the gate and nobody need approve.
+    """Keep a new reconstructor; send it if it passed the gate and needs no approval.
 
     What an operator wants is sent whatever else is known; what nobody asked for only to a closed
     loop that behaves, and if α may be believed.
@@ -351,7 +351,7 @@ def apply_named(context: StepContext, matrix_id: str) -> None:
         return
     mark_applied(context, matrix_id)
     if record.state is MatrixState.FAILED:
-        text = f"{matrix_id} is in use after all, by the RTC's status; nobody acknowledged it"
+        text = f"{matrix_id} is in use after all, by the RTC's status, without an acknowledgement"
         change_state(context, matrix_id, MatrixState.APPLIED, text)
         context.log("reconstructor.applied", text)
 
@@ -406,7 +406,7 @@ def _distrust(
     text = (
         f"the RTC has {state} other numbers as {record.id}: sha256 {sha256}, {before} "
         f"{record.sha256}; nothing is published until it holds those (rtc/cm/applied), or another "
-        "matrix under an id of its own: open the loop if it suffers, look at the RTC's log"
+        "matrix under an id of its own: open the loop if it suffers, see the RTC's log"
     )
     change_state(context, record.id, MatrixState.FAILED, text)
     if state is MatrixState.APPLIED:
@@ -450,7 +450,7 @@ def _acknowledged_record(state: TrackerState, event: Acknowledgement) -> Reconst
 
 
 def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledgement) -> bool:
-    """Return whether an acknowledgement tells of something that has been overtaken."""
+    """Return whether an acknowledgement is of something overtaken."""
     if state.loop.rtc is not None and event.session != state.loop.rtc.session:
         return True
     if event.state is AckState.STAGED:

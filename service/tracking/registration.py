@@ -1,4 +1,4 @@
-"""The registration: now, window by window, and as ordinary telemetry sees it."""
+"""The registration and the estimates it is made of."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class Source(StrEnum):
-    """What a measurement of α was made from."""
+    """Sources of a measurement of α."""
 
     LOCK_IN = "lock-in"
     """A window of sinusoidal dither."""
@@ -34,7 +34,7 @@ class Validity(StrEnum):
     """Whether α may be relied on."""
 
     FRESH = "fresh"
-    """σ is less than half of what makes it stale."""
+    """σ is below half of the limit."""
 
     AGEING = "ageing"
     """σ grows towards the limit."""
@@ -43,7 +43,7 @@ class Validity(StrEnum):
     """σ has passed the limit, or nothing has confirmed α since a restart."""
 
     INVALID = "invalid"
-    """α may be somewhere else: nothing is made or published from it by itself."""
+    """α may be elsewhere: nothing is made from it by itself."""
 
 
 class Purpose(StrEnum):
@@ -98,7 +98,7 @@ class TimedEstimate(Determination):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointedEstimate(TimedEstimate):
-    """What was measured, or known, and where the telescope looked."""
+    """An estimate of α, and where the telescope pointed."""
 
     pointing: Pointing | None
     """Of the telescope then; None: not known."""
@@ -106,7 +106,7 @@ class PointedEstimate(TimedEstimate):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PreviousEstimate(PointedEstimate):
-    """What was known before the last measurement: a jump inside that one is seen from here."""
+    """The estimate before the last one: a jump inside that one is seen from here."""
 
     next_window: TimedEstimate | None = None
     """The window that entered next; None: it is not kept."""
@@ -117,7 +117,7 @@ class PreviousEstimate(PointedEstimate):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveBias(Bias):
-    """What has been learnt of how far a passive estimate is off, and how sure that is."""
+    """The learnt bias of the passive estimate, with its σ."""
 
     offset: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what a passive estimate reads more than α, numeric units."""
@@ -292,7 +292,7 @@ class HistoryEntry:
 
 
 class OffloadState(StrEnum):
-    """What became of a demand to move the mirror's image."""
+    """Outcomes of a demand to move the mirror's image."""
 
     ASKED = "asked"
     """No reply yet."""

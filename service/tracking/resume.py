@@ -1,4 +1,4 @@
-"""What outlasts a moment: the order to stop everything, and what the next service takes up."""
+"""Stop everything and resume; what a restart takes over."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the RTC says, does not say, and what fails on the way to it."""
+"""React to the RTC: status, session, silence, failures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def on_tick(context: StepContext) -> None:
         if record.on_its_way and context.now_ns - sent_ns > ACKNOWLEDGE_WITHIN_S * SECOND_NS:
             text = (
                 f"{record.id} was not applied within {ACKNOWLEDGE_WITHIN_S:.0f} s; the RTC keeps "
-                "the old one: look at the RTC's log, then publish again"
+                "the old one: see the RTC's log, then publish again"
             )
             reconstructors.change_state(context, record.id, MatrixState.FAILED, text)
             with context.because_of(record.cause):

@@ -1,4 +1,4 @@
-"""Whether a reconstructor may be sent now, by whom, and whether one could go back after it."""
+"""Decide whether a reconstructor may be sent now."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OF_A_SWAP = (
 def why_unsendable(
     state: TrackerState, record: ReconstructorRecord, swapped_ns_utc: int | None = None
 ) -> str | None:
-    """Return why a reconstructor may not be published now, whoever wants it, or None.
+    """Return why a reconstructor may not be published now, whoever asks, or None.
 
     ``swapped_ns_utc``: it was in use until then. What telemetry has complained of since is what the
     swap has done, and no reason against going back.
@@ -78,7 +78,7 @@ def _not_of_swap(state: TrackerState, swapped_ns_utc: int) -> tuple[Alarm, ...]:
 
 
 def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
-    """Return why nobody knows the numbers of this matrix of the RTC's, or None."""
+    """Return why the numbers of this matrix of the RTC's are unknown, or None."""
     if matrix_id is None or matrix_id in state.matrices.verified_ids:
         return None
     if matrix_id == state.matrices.mismatched_id:
@@ -89,7 +89,7 @@ def why_unread(state: TrackerState, matrix_id: str | None) -> str | None:
 
 
 def may_follow(state: TrackerState) -> bool:
-    """Return whether a reconstructor that nobody asked for may be sent."""
+    """Return whether a reconstructor may be sent without an order."""
     rtc, registration = state.loop.rtc, state.alpha.registration
     if state.operator.mode is not Mode.AUTO or state.on_probation or rtc is None or not rtc.in_loop:
         return False
@@ -102,7 +102,7 @@ def may_follow(state: TrackerState) -> bool:
 
 
 def beyond_judging(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether nobody knows the gains it was judged with, nor those it would run with."""
+    """Return whether neither the judged gains nor the present ones are known."""
     opened = state.loop.rtc is not None and state.loop.rtc.loop == "open"
     return opened and record.gate is not None and record.judged is None
 

@@ -1,4 +1,4 @@
-"""Everything the service knows: one frozen record, replaced as a whole, read by REST, metrics."""
+"""The state: ten frozen records, replaced as a whole."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from service.wire import Pointing, Status
 
 
 class Level(StrEnum):
-    """How loudly an event speaks."""
+    """Log levels."""
 
     DEBUG = "debug"
     """Of every quiet minute: in no audit trail."""
@@ -63,13 +63,13 @@ class LogEntry:
 
     @property
     def line(self) -> tuple[int, str, str]:
-        """What makes it this line and no other, however often it has happened."""
+        """Key that makes repeated lines the same."""
         return self.t_ns_utc, self.name, self.text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObservatoryValue:
-    """A value that the observatory tells, for operators' own rules."""
+    """A value that the observatory reports, for operators' own rules."""
 
     name: str
     value: bool | float | str
@@ -92,21 +92,21 @@ class Failure:
 
 
 class Mode(StrEnum):
-    """How much the service may do by itself."""
+    """Modes: how much the service may do by itself."""
 
     AUTO = "auto"
-    """Estimate, compute and publish whatever passes the gate."""
+    """Measure, compute and publish what passes the gate."""
 
     PROPOSE = "propose"
-    """Estimate and compute; an operator approves each publication."""
+    """Measure and compute; an operator approves each publication."""
 
     HOLD = "hold"
-    """Estimate only: nothing is computed or published unless asked for."""
+    """Measure only: nothing is computed or published without an order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OperatorState:
-    """What operators have ordered; written where orders are taken."""
+    """Operators' orders in force."""
 
     mode: Mode = Mode.PROPOSE
 
@@ -122,7 +122,7 @@ class OperatorState:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AlphaState:
-    """What is known of α, and of the telemetry that tells of it."""
+    """α, and the telemetry it comes from."""
 
     registration: Registration | None = None
     """None until the first accepted window."""
@@ -156,7 +156,7 @@ class AlphaState:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WindowCounts:
-    """How many windows there were, and what became of them."""
+    """Counts of windows by outcome."""
 
     accepted: int = 0
 
@@ -221,7 +221,7 @@ class MatrixStates:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Operations:
-    """What may have the loop or the mirror for itself: each under way, or the last one."""
+    """Operations with the loop or the mirror to themselves: each under way, or the last one."""
 
     acquisition: Acquisition = field(default_factory=Acquisition)
     """Finding α from nothing: under way, or how the last one ended."""
@@ -376,7 +376,7 @@ class TrackerState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orders:
-    """What an operator has ordered that a restart of the service does not undo."""
+    """Orders that outlive a restart of the service."""
 
     mode: Mode | None = None
     """None: that of the settings holds."""
@@ -394,7 +394,7 @@ class Orders:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Saved:
-    """What a service leaves to the one after it, besides its products."""
+    """State that a service leaves to the next, besides its products."""
 
     system: str
     """The ``{system}`` of the wire."""

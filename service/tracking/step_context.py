@@ -1,4 +1,4 @@
-"""One event being worked out, and the log and the alarms it may add to."""
+"""The context of one step: state, log, alarms, effects."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class StepContext:
 
     @property
     def registration(self) -> Registration | None:
-        """What is known of α; None: nothing."""
+        """The registration; None: unknown."""
         return self.state.alpha.registration
 
     @property
@@ -176,12 +176,12 @@ class StepContext:
 
     @property
     def dither_policy(self) -> DitherPolicyState:
-        """What the dither policy remembers."""
+        """The state of the dither policy."""
         return self.state.dithers.policy
 
     @property
     def acquisition(self) -> Acquisition:
-        """How far finding α from nothing has come."""
+        """The state of the acquisition."""
         return self.state.operations.acquisition
 
     @property
@@ -204,7 +204,7 @@ class StepContext:
         self.cause = own
 
     def fail(self, text: str) -> None:
-        """Note that something asked for came to nothing, and why, for whoever asked for it."""
+        """Note that a request failed, and why, under the id of its cause."""
         failures = (*self.operator.failures, Failure(cause=self.cause, text=text))
         self.operator = replace(self.operator, failures=failures[-FAILURES_KEPT:])
 

@@ -1,4 +1,4 @@
-"""What a verdict is worth now, whether another reconstructor is worth a swap, of how many modes."""
+"""Decide whether a new reconstructor is worth a swap, and of how many modes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def why_of_another_loop(
     if rtc is None:
         return None
     if judged is None:
-        return "nobody knows of which loop its verdict is"
+        return "the loop of its verdict is unknown"
     if judged.session != rtc.session:
         return "the RTC has begun a new session"
     if abs(judged.leak - rtc.leak) > SAME_LEAK:
@@ -123,7 +123,7 @@ def update_reason(
 
 
 def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
-    """Return whether the last look at the matrix in use says nothing of now.
+    """Return whether the last judgement of the matrix in use no longer applies.
 
     Its verdict holds as long as :func:`verdict_invalid_reason` says. What a new one would win
     counts only where α is known to be elsewhere than where the one in use was made for: there every

@@ -1,4 +1,4 @@
-"""What the service wants by itself: the matrix in use, a verdict on it, a new one, a dither."""
+"""Ask for what the service wants next: a verdict, a new matrix, a dither."""
 
 from __future__ import annotations
 

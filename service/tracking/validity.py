@@ -1,4 +1,4 @@
-"""What is known of α, and how long it is valid."""
+"""How old and how valid α is, and which telemetry counts."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def note_pointing(context: StepContext, pointing: Pointing | None) -> None:
 
 
 def pointing_at(state: TrackerState, t_ns_utc: int) -> Pointing | None:
-    """Return where the telescope looked at a time of the RTC's clock, as far as it is known."""
+    """Return the pointing at a time of the RTC's clock, as far as known."""
     later = [place for place in state.alpha.pointings if place[0] > t_ns_utc]
     if not later:
         return state.alpha.pointing
@@ -169,7 +169,7 @@ def end_window_request(context: StepContext) -> None:
 
 
 def flexure(pointing_then: Pointing | None, now: Pointing | None, policy: Policy) -> Array:
-    """Return ``(4,)`` 1 σ of what a change of elevation has done to α; 0 where nobody tells it."""
+    """Return ``(4,)`` 1 σ of flexure since then; 0 where the pointing is unknown."""
     if pointing_then is None or now is None:
         return np.zeros(4)
     return policy.flexure_per_degree * abs(now.elevation_deg - pointing_then.elevation_deg)
@@ -183,7 +183,7 @@ def slewed_deg(state: TrackerState, registration: Registration) -> float:
 
 
 def elapsed_s(state: TrackerState, registration: Registration, now_ns: int) -> float:
-    """Return how old the estimate is: by the RTC's clock while it tells the time, else by arrival.
+    """Return the age of the estimate: by the RTC's clock if there is one, else by arrival.
 
     A simulated RTC may be slower than its timestamps, and the mirror drifts by its time.
     """

@@ -1,4 +1,4 @@
-"""Which telemetry is void, for what, and why: asked of every window and passive estimate.
+"""Void telemetry: which, for what, and why.
 
 A window is fitted seconds after it was taken, by a busy worker later still, when what spoilt it is
 over. So what spoils telemetry leaves an interval behind, by the RTC's clock: what began before its

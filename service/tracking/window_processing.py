@@ -1,4 +1,4 @@
-"""Dithered windows become the registration, or a reason why not; how many were refused in a row.
+"""Take a window or a passive estimate into the registration, or refuse it.
 
 One window far out may be a jump or a mistake. It is held, nothing is made from α meanwhile, and
 the next window decides: one that agrees with it makes it a jump, one that agrees with all before

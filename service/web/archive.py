@@ -1,4 +1,4 @@
-"""What is kept: matrices and which of them for ever, telemetry on request, and the audit trail."""
+"""Routes of the archive: matrices, recordings, audit trail."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from service.web.history import TimeParameters
 from service.web.problems import COMMAND, INVALID, UNKNOWN
 from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows, to_json
 
-router = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["archive"], responses={**INVALID})
 
 T = TypeVar("T")
 
@@ -40,7 +40,7 @@ ProductId = Annotated[str, Path(alias="id", description="Id of a matrix of any k
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """What lies in the archive."""
+    """Contents of the archive."""
 
     products: tuple[Item, ...]
     """Oldest first."""
@@ -58,7 +58,7 @@ KEPT = define_view("ArchiveView", Kept)
 
 @router.get("/archive", responses={200: shows(KEPT)})
 async def archive(service: ServiceDep) -> Response:
-    """Return the matrices that are kept, and why those stay that are never removed."""
+    """Return the archived matrices, and why some are never removed."""
     in_use = needed(service.snapshot().tracker)
     return answer(await run_in_threadpool(_kept, service.archive, in_use))
 
@@ -71,7 +71,7 @@ def _kept(kept: Archive, in_use: frozenset[str]) -> Kept:
 
 @router.put("/archive/{id}/pin", status_code=202, responses=UNKNOWN)
 async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> AcceptedView:
-    """Keep a matrix for ever, whatever its age: who and why are kept with it."""
+    """Keep a matrix for ever."""
     entry = client.actor.entry(
         "archive.pinned", product_id, by=instruction.by, why=instruction.reason
     )
@@ -101,7 +101,7 @@ PAGE = 1000
 
 
 class AuditFormat(StrEnum):
-    """How the audit trail leaves."""
+    """Formats of the exported audit trail."""
 
     JSON = "json"
     JSONL = "jsonl"
@@ -157,7 +157,7 @@ TRAIL = define_view("AuditView", Trail)
     },
 )
 async def audit(service: ServiceDep, parameters: Annotated[AuditParameters, Query()]) -> Response:
-    """Return the audit trail: the newest entries, those after one, those of a time; or export it.
+    """Return the audit trail, or export it.
 
     ``?after=`` with the ``id`` of the last entry gives the next page; an empty one is the end.
     """
@@ -252,7 +252,7 @@ async def _tried(client: Client, name: str, instruction: Instruction, order: Awa
 async def begin(
     client: ClientDep, choice: Annotated[RecordingChoice, body(RecordingChoice)]
 ) -> RecordingAcceptedView:
-    """Keep the telemetry that comes from now on, for a time, and what came just before.
+    """Record telemetry from now on, and what came just before.
 
     The service holds the last seconds in memory: with ``before_s`` they are in it, and with a
     ``duration_s`` of 0 nothing else.
@@ -270,13 +270,13 @@ async def begin(
 
 @router.get("/recordings", responses={200: shows(RECORDINGS)})
 async def recordings(service: ServiceDep) -> Response:
-    """Return the telemetry that was kept on request, oldest first."""
+    """Return the recordings, oldest first."""
     return answer(RecordingList(recordings=await run_in_threadpool(service.recordings.all)))
 
 
 @router.get("/recordings/{id}", responses={200: shows(RECORDING), **UNKNOWN})
 async def recording(service: ServiceDep, recording_id: RecordingId) -> Response:
-    """Return how far a recording is."""
+    """Return the progress of a recording."""
     every = await run_in_threadpool(service.recordings.all)
     found = next((one for one in every if one.id == recording_id), None)
     return answer(found_or_refuse(found, f"unknown recording {recording_id}"))
@@ -284,7 +284,7 @@ async def recording(service: ServiceDep, recording_id: RecordingId) -> Response:
 
 @router.post("/recordings/{id}/end", status_code=202, responses={**COMMAND, **UNKNOWN})
 async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
-    """End a recording before its time; what is in it is kept."""
+    """End a recording early."""
     recordings = client.service.recordings
     reason = f"{instruction.by or client.actor.key or 'an operator'} has ended it"
     record = await _tried(
@@ -296,7 +296,7 @@ async def end(client: ClientDep, recording_id: RecordingId, instruction: Said) -
 
 @router.delete("/recordings/{id}", status_code=202, responses={**COMMAND, **UNKNOWN})
 async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said) -> AcceptedView:
-    """Remove a recording that has ended: it is gone for good."""
+    """Remove a recording for good."""
     removed = client.service.recordings.remove(recording_id)
     await _tried(client, "recording.remove", instruction, removed)
     return client.accepted(f"{recording_id} is removed", recordings="/v1/recordings")
@@ -315,7 +315,7 @@ async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said
     },
 )
 async def file(request: Request, service: ServiceDep, recording_id: RecordingId) -> Response:
-    """Return a recording that has ended."""
+    """Return a recording's file."""
     path = await run_in_threadpool(service.recordings.file, recording_id)
     tag = tag_of(recording_id).removeprefix("W/")  # a download may be resumed by a strong one
     headers = {"ETag": tag}

@@ -1,4 +1,4 @@
-"""Who may ask over HTTP, and for what.
+"""Decide who may ask over HTTP, and for what.
 
 A page in an operator's browser can send requests to this service: from another origin, or under a
 name of its own that it has had resolved to this address. Programs send no ``Origin``. Whatever is
@@ -92,7 +92,7 @@ class Hosts:
 
     @property
     def local(self) -> bool:
-        """Whether nobody can ask but this machine."""
+        """Whether only this machine can ask."""
         return is_loopback(self.bound)
 
     def know(self, host: str) -> bool:
@@ -124,7 +124,7 @@ class Refusal:
 
 
 class Refusals:
-    """Tells the audit trail of what was refused: of a flood the first ones, and how many more.
+    """Writes refusals to the audit trail: of a flood the first ones, and how many more.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class Refusals:
 
 
 def address_of(request: Request) -> str:
-    """Return the address of whoever asks; empty: it is not known."""
+    """Return the address of a client; empty: unknown."""
     return "" if request.client is None else request.client.host
 
 
@@ -354,12 +354,12 @@ def _same(origin: str, host: str) -> bool:
 # --- who asks, a browser that keeps a key, and whose keys there are
 
 
-router = APIRouter(prefix="/v1", tags=["who may ask"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["access"], responses={**INVALID})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Session:
-    """Whoever asks."""
+    """The key of a request and its scope."""
 
     name: str | None
     """Of the key that was shown; null: there are no keys, and none is needed."""
@@ -370,7 +370,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Holders:
-    """Who may ask."""
+    """Names and scopes of the keys."""
 
     keys: tuple[Key, ...]
 
@@ -384,7 +384,7 @@ KEYS = define_view("KeysView", Holders)
 
 @router.get("/session", responses={200: shows(SESSION)})
 async def session(request: Request) -> Response:
-    """Return whose key was shown, and what may be asked with it."""
+    """Return the name and scope of the key."""
     key: Key | None = request.user
     if key is None:
         return answer(Session(name=None, scope=KeyScope.ADMIN))
@@ -393,7 +393,7 @@ async def session(request: Request) -> Response:
 
 @router.post("/session", openapi_extra=needs(KeyScope.READ), responses={200: shows(SESSION)})
 async def log_in(request: Request) -> Response:
-    """Have the browser that shows a key in ``Authorization`` keep it, out of reach of scripts.
+    """Have the browser keep the key in ``Authorization``, out of reach of scripts.
 
     The cookie goes to this host alone, with nothing that another site's page asks for, and lasts
     until the browser is closed.
@@ -415,7 +415,7 @@ async def log_out(response: Response) -> None:
 
 @router.get("/keys", openapi_extra=needs(KeyScope.ADMIN), responses={200: shows(KEYS)})
 async def keys(request: Request) -> Response:
-    """Return who may ask; ``pyrcal key add`` makes a key."""
+    """Return the names and scopes of all keys."""
     return answer(Holders(keys=_file(request).all() if request.user is not None else ()))
 
 
@@ -423,7 +423,7 @@ async def keys(request: Request) -> Response:
     "/keys/{name}", status_code=204, openapi_extra=needs(KeyScope.ADMIN), responses=UNKNOWN
 )
 async def revoke(request: Request, name: Annotated[str, Path(description="Of the key")]) -> None:
-    """Make a key worthless from this moment on, also where it has a stream open."""
+    """Revoke a key at once, open streams included."""
     if request.user is None:
         raise UnknownIdError(f"key {name!r:.80}: no such key; there are none at all")
     await run_in_threadpool(_file(request).revoke, name)

@@ -1,4 +1,4 @@
-"""What an operator asks of the service, and what the observatory tells it: a route for each order.
+"""Routes of orders and of the observatory's values.
 
 The routes are made of the table of orders, ``service/commands.toml``. A body is read straight into
 the record that the tracker obeys, all faults at once. Each answer is 202 and says in one sentence
@@ -47,7 +47,7 @@ JSON = "application/json"
 
 
 class Body:
-    """What a request has to say, as a command; a dependency of a route.
+    """A request's body as a command; a dependency of a route.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ Where = tuple[int | str, ...]
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where a fault is in the JSON."""
+    """Place of a fault in the JSON."""
 
     path: Where
     tried: tuple[tuple[Where, int | str], ...]
@@ -174,22 +174,22 @@ class OrderRoute:
     decides_on: tuple[str, ...] = ()
     follows: Mapping[str, str] = field(default_factory=dict)
     makes: str = ""
-    tag: str = "what an operator asks of it"
+    tag: str = "orders"
 
     @property
     def kinds(self) -> tuple[type[Instruction], ...]:
-        """The commands that may be given there: several are told apart by their ``action``."""
+        """Commands of the route, told apart by ``action``."""
         names = [self.command] if isinstance(self.command, str) else self.command.values()
         return tuple(getattr(instructions, name) for name in names)
 
     @property
     def path(self) -> str:
-        """Where REST takes it."""
+        """Path of REST."""
         return self.call.partition(" ")[2]
 
     @property
     def method(self) -> str:
-        """How."""
+        """HTTP method."""
         return self.call.partition(" ")[0]
 
     @property
@@ -199,7 +199,7 @@ class OrderRoute:
 
     @property
     def read(self) -> Any:  # noqa: ANN401  the type of a type
-        """What the body is read as: of the command all that neither path nor service says."""
+        """Type of the body: the command without what path or service fills in."""
         if len(self.kinds) > 1:
             return Annotated[Union[self.kinds], Discriminator("action")]  # noqa: UP007
         told = {self.named, "id" if self.makes else ""}
@@ -223,7 +223,7 @@ ORDERS: Final = TypeAdapter(dict[str, OrderRoute]).validate_python(
 
 
 class AcceptedView(BaseModel):
-    """What came of an order."""
+    """Result of an order."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
@@ -253,7 +253,7 @@ _ALWAYS = {"state": "/v1/state", "events": "/v1/events"}
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Whoever gives orders in a request."""
+    """The giver of orders in a request."""
 
     service: Supervisor
     """That is to obey."""
@@ -269,7 +269,7 @@ class Client:
     """Of the answer."""
 
     async def gives(self, order: OrderRoute, said: Any, name: str) -> AcceptedView:  # noqa: ANN401
-        """Hand an order on; say what was done, and where to look for what becomes of it.
+        """Hand an order on; return what was done, and where its work can be followed.
 
         One that decides about something only if that still is what whoever decides has seen.
         """
@@ -297,10 +297,10 @@ class Client:
         now = [_SHOWN[what](state, name).headers["ETag"] for what in decides_on]
         if self.seen != "*" and not {tag.strip() for tag in self.seen.split(",")} & {*now}:
             told = " or ".join(now)
-            raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: look again")
+            raise StaleError(f"found If-Match {self.seen:.80}, it is {told} now: read it again")
 
     def accepted(self, text: str, **links: str) -> AcceptedView:
-        """Return what came of an order; the first link is where to look for what was begun."""
+        """Return the result of an order; the first link is to the work begun."""
         self.headers["Location"] = next(iter(links.values()))
         return AcceptedView(text=text, links=links)
 

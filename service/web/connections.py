@@ -1,4 +1,4 @@
-"""Requests over HTTP, whatever they ask: how much time and memory one may take, its id, done once.
+"""Limits of time and memory, request ids, idempotency.
 
 The same POST sent twice, by a double click or a lost answer, is carried out once; what a client has
 already is not sent again.
@@ -89,7 +89,7 @@ async def bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
 
 
 async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Run a request; one that is still at work when the service ends is told so, if it can be."""
+    """Run a request; one still at work when the service ends gets an error, if possible."""
     begun = False
 
     async def noted(message: Message) -> None:
@@ -159,7 +159,7 @@ def again(body: bytes, receive: Receive) -> Receive:
 
 
 class Server(uvicorn.Server):
-    """uvicorn, with an end of its own, and connections that nobody uses ended.
+    """uvicorn that ends with the service and closes idle connections.
 
     uvicorn limits the time between two requests, not that of a request's head, and not how long
     it waits for somebody who takes nothing of an answer.

@@ -1,4 +1,4 @@
-"""Fits of measured matrices that are uploaded: ask for one, see how far it is, take it away."""
+"""Routes of fits of uploaded matrices."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _packaged(name: str) -> None:
 
 
 class FitParameters(BaseModel):
-    """What is asked for; the same words as of ``pyrcal fit``."""
+    """Parameters of a fit, in the words of ``pyrcal fit``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -105,7 +105,7 @@ class FitParameters(BaseModel):
     """Id of a matrix the RTC has measured for this service; there is no body then."""
 
     def asked(self) -> dict[str, Any]:
-        """Return what ``pyrcal fit`` is told of it."""
+        """Return the arguments for ``pyrcal fit``."""
         return self.model_dump(mode="json", exclude={"name", "measurement"})
 
 
@@ -149,7 +149,7 @@ async def fit(
     parameters: Annotated[FitParameters, Query()],
     content_length: Annotated[int | None, Header(ge=0)] = None,
 ) -> FitAcceptedView:
-    """Fit the registration to the measured interaction matrix that is the body of this request.
+    """Fit the registration to the matrix in the body.
 
     `curl -X POST -T im.h5 ...`. The answer comes as soon as the file is here; the fit runs in
     a process of its own, one after the other. `?measurement=ID` fits a matrix the RTC has measured
@@ -170,7 +170,7 @@ async def fit(
 
 @router.get("/fits", responses={200: views.shows(FIT_JOBS)})
 async def fits_known(fits: FitsDep) -> Response:
-    """Return the fits the service remembers, oldest first."""
+    """Return the last fits, oldest first."""
     return views.answer(FitJobs(fits=tuple(fits.jobs())))
 
 
@@ -191,7 +191,7 @@ _DRAWN = {"$ref": f"{views.SCHEMAS}FitFigures"}
     },
 )
 async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
-    """Return what a fit has found, or why it has found nothing; 202 while it is not finished.
+    """Return the result of a fit; 202 while it runs.
 
     What was found has a ``verdict``; a fit that failed, or was given up, has ``state`` and
     ``reason`` instead.
@@ -214,7 +214,7 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
     },
 )
 async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
-    """Return what the figures of a finished fit are drawn from; 404 while there are none."""
+    """Return the numbers behind a fit's figures; 404 while there are none."""
     job = fits.job(fit_id)
     return Response(
         views.found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
@@ -224,7 +224,7 @@ async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
 
 @router.delete("/fits/{id}", responses={200: views.shows(FIT_JOB), **UNKNOWN, **COMMAND})
 async def give_up_fit(fits: FitsDep, fit_id: FitId) -> Response:
-    """End a fit that waits or runs; 409 where it is over."""
+    """End a fit; 409 if it is over."""
     return views.answer(await fits.give_up(fit_id))
 
 

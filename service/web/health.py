@@ -1,4 +1,4 @@
-"""How the service is doing: for orchestrators and Prometheus."""
+"""Routes for orchestrators and Prometheus."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from service.web.problems import problem, problem_response
 from service.web.views import ServiceDep
 from service.wire import Pattern
 
-router = APIRouter(tags=["how it is doing"])
+router = APIRouter(tags=["health"])
 
 FRESH_S = 3.0
 """Telemetry whose last frame is older has stopped, seconds."""
@@ -64,7 +64,7 @@ async def healthz(service: ServiceDep) -> HealthView:
     responses={503: problem_response("Telemetry, archive or worker: the detail says which, why")},
 )
 async def readyz(request: Request, service: ServiceDep) -> ReadyView | Response:
-    """Say whether telemetry is fresh, the archive writable and the worker keeps up; which is not.
+    """Say whether telemetry is fresh, the archive writable and the worker keeps up.
 
     It asks for more than ``ready`` of the state, which a service without an RTC is, too.
     """
@@ -105,7 +105,7 @@ def find_problems(snapshot: Snapshot) -> dict[str, str]:
     },
 )
 async def metrics(request: Request, service: ServiceDep) -> Response:
-    """Return everything that can be counted or measured, for Prometheus."""
+    """Return all metrics for Prometheus."""
     encode, content_type = choose_encoder(request.headers.get("accept", ""))
     registry = CollectorRegistry(auto_describe=False)
     registry.register(SnapshotCollector(service.snapshot))
@@ -126,16 +126,16 @@ _ALPHA = (
 _LINK_COUNTERS = {
     "batches_received": "Telemetry batches taken in",
     "frames_received": "Frames that could be used",
-    "frames_recovered": "Frames that came late and still found their place",
+    "frames_recovered": "Frames that came late but in time",
     "frames_duplicate": "Frames that came again",
-    "frames_late": "Frames that came when their place had been passed",
+    "frames_late": "Frames that came too late",
     "frames_nonfinite": "Frames dropped because a number in them was not finite",
-    "frames_overwritten": "Frames nobody drained in time, or that a new session made void",
+    "frames_overwritten": "Frames not drained in time, or void by a new session",
     "statuses_received": "Status messages of the RTC",
     "acknowledgements_received": "Acknowledgements of reconstructors",
     "acknowledgements_unknown": "Acknowledgements for an id that was never offered",
-    "events_dropped": "Events of the link that nobody took in time",
-    "callback_errors": "Faults of the service while it took a message in",
+    "events_dropped": "Events of the link not taken in time",
+    "callback_errors": "Faults of the service while taking a message",
 }
 
 
@@ -185,8 +185,8 @@ def _of_alarms(snapshot: Snapshot) -> Iterator[Metric]:
     shown = {str(severity): by_severity[severity] for severity in Severity}
     yield _gauge("alarms_shown", "Alarms that last and are not muted", shown, "severity")
     active = sum(alarm.record.alarm_state is AlarmState.ACTIVE for alarm in lasting)
-    yield _gauge("alarms_unacknowledged", "Alarms that last and nobody has acknowledged", active)
-    stale = "Alarms that have gone and nobody has acknowledged"
+    yield _gauge("alarms_unacknowledged", "Alarms that last and are not acknowledged", active)
+    stale = "Alarms that ended without an acknowledgement"
     yield _gauge("alarms_stale", stale, len(snapshot.stale_alarms))
     yield _gauge("alarms_muted", "Alarms that are muted", len(snapshot.muted_alarms))
     states = _one_of(ServiceState, operating.service_state)
@@ -248,10 +248,10 @@ def _of_registration(snapshot: Snapshot) -> Iterator[Metric]:
             yield _gauge(f"{name}_{parameter}", text, value)
     yield _gauge("alpha_age_seconds", "Age of the estimate", alpha.age_s)
     worth = registration.validity.level
-    text = "1 for what the estimate is worth"
+    text = "1 for the validity of the estimate"
     yield _gauge("alpha_validity", text, _one_of(Validity, worth), "validity")
     due = tracker.alpha.dither_due_since_ns_utc is not None
-    yield _gauge("dither_due", "1 while a dithered window is wanted before all else", due)
+    yield _gauge("dither_due", "1 while a dithered window is wanted first", due)
     gain = "Mean optical gain of the dithered modes"
     yield _gauge("optical_gain_ratio", gain, registration.optical_gain)
 
@@ -289,7 +289,7 @@ def _of_measurement(snapshot: Snapshot) -> Iterator[Metric]:
     yield _gauge("measuring", text, patterns, "pattern")
     if current is not None and current.asked_ns_utc is not None:
         age_s = (snapshot.now_ns - current.asked_ns_utc) / 1e9
-        yield _gauge("measuring_seconds", "Since it was asked for", age_s)
+        yield _gauge("measuring_seconds", "Time since the request", age_s)
 
 
 def _one_of(kinds: type[StrEnum], current: StrEnum | None) -> dict[str, int]:

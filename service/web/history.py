@@ -1,4 +1,4 @@
-"""What was: α over time, the nights and what happened in them, trends, and notes of operators."""
+"""Routes of the past: α, nights, marks, trends, notes."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from service.tracking.registration import HistoryEntry
 from service.web import commands, connections, numbers, problems, views
 from service.web.views import ServiceDep, answer, define_view, shows
 
-router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**problems.INVALID})
-notes = APIRouter(prefix="/v1", tags=["what it has kept"], responses={**problems.INVALID})
+router = APIRouter(prefix="/v1", tags=["state"], responses={**problems.INVALID})
+notes = APIRouter(prefix="/v1", tags=["archive"], responses={**problems.INVALID})
 
 Points = Annotated[int, Field(ge=8, le=2000)]
 Nanoseconds = Annotated[int, Field(ge=0, le=(1 << 63) - 1)]
@@ -179,7 +179,7 @@ class NightList:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MarkList:
-    """What belongs into a chart of α besides α."""
+    """Marks for a chart of α."""
 
     marks: tuple[Mark, ...]
     """Oldest first."""
@@ -200,14 +200,14 @@ MARKS = define_view("MarksView", MarkList)
 
 @router.get("/nights", responses={200: shows(NIGHTS)})
 async def nights(service: ServiceDep, parameters: Annotated[TimeParameters, Query()]) -> Response:
-    """Return the nights of a time, from noon to noon, and what there is of each."""
+    """Return the nights of a time, from noon to noon, with their contents."""
     found = await run_in_threadpool(service.archive.nights.between, *parameters.between)
     return answer(NightList(nights=found))
 
 
 @router.get("/marks", responses={200: shows(MARKS)})
 async def marks(service: ServiceDep, parameters: Annotated[MarkParameters, Query()]) -> Response:
-    """Return swaps, jumps, alarms and starts of a time, for a chart of it."""
+    """Return swaps, jumps, alarms and starts of a time."""
     found = await run_in_threadpool(
         service.archive.nights.marks, *parameters.between, parameters.limit
     )
@@ -238,7 +238,7 @@ TRENDS = define_view("TrendsView", TrendList)
 
 @router.get("/trends", responses={200: shows(TRENDS)})
 async def trends(service: ServiceDep, parameters: Annotated[TrendParameters, Query()]) -> Response:
-    """Return wavefront error, margin, gain, flux, pointing and α as they were known over a time.
+    """Return samples of wavefront error, margin, gain, flux, pointing and α.
 
     A sample is taken every few seconds while the service runs, with or without telemetry.
     """
@@ -283,7 +283,7 @@ class AnnotationAcceptedView(commands.AcceptedView):
 async def list_annotations(
     service: ServiceDep, parameters: Annotated[AnnotationParameters, Query()]
 ) -> Response:
-    """Return what operators have noted about a time, oldest first."""
+    """Return operators' notes about a time, oldest first."""
     found = await run_in_threadpool(
         service.archive.nights.notes, *parameters.between, parameters.limit
     )
@@ -294,7 +294,7 @@ async def list_annotations(
 async def annotate(
     client: commands.ClientDep, choice: Annotated[AnnotationChoice, commands.body(AnnotationChoice)]
 ) -> AnnotationAcceptedView:
-    """Note something about a moment: it is kept for ever, in the history and the audit trail."""
+    """Note something about a moment, for ever."""
     entry = client.actor.entry("annotation", choice.note, by=choice.by, why=choice.reason)
     t_ns = entry.t_ns_utc if choice.t_ns_utc is None else choice.t_ns_utc
     note = Annotation(t_ns_utc=t_ns, written_ns_utc=entry.t_ns_utc, who=entry.who, note=choice.note)

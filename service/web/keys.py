@@ -1,4 +1,4 @@
-"""API keys: who may ask the service, and for what; a file that the keys cannot be read from.
+"""API keys: names, scopes, hashes.
 
 A key is 256 random bits. What is kept of it is its SHA-256: there is no dictionary to try such keys
 from, so that a slow hash would protect nothing and cost the service its time with each request.
@@ -34,7 +34,7 @@ _TAKEN = {"service", "operator"}
 
 
 class KeyScope(StrEnum):
-    """What a key is good for; each one for what those before it are, too."""
+    """Scopes of a key; each includes those before it."""
 
     READ = "read"
     """Look at everything, and order nothing."""
@@ -53,7 +53,7 @@ class KeyScope(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Key:
-    """What is kept of a key."""
+    """Record of a key."""
 
     name: str
     """Of the person, program or place that has it."""

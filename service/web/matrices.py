@@ -1,4 +1,4 @@
-"""Matrices that are made or measured on request: how far each is, and take it away.
+"""Routes of refits, measured and noisy matrices.
 
 A reconstructor for the registration of now is a job that can be followed to its end. The RTC
 measures an interaction matrix, or the service sums a noisy one on sky from a random dither. A noisy
@@ -23,10 +23,8 @@ from service.web.numbers import MatrixParameters, describes_numbers, numbers_of
 from service.web.problems import INVALID, UNKNOWN
 from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
 
-router = APIRouter(
-    prefix="/v1", tags=["interaction matrices it has measured"], responses={**INVALID}
-)
-refits = APIRouter(prefix="/v1", tags=["what an operator asks of it"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["measured matrices"], responses={**INVALID})
+refits = APIRouter(prefix="/v1", tags=["orders"], responses={**INVALID})
 noisy = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
 
 REFIT = define_view("RefitView", RefitJob)
@@ -70,19 +68,19 @@ async def _file(request: Request, file_of: Callable[[str], bytes], matrix_id: st
 
 @refits.get("/refits/{id}", responses={200: shows(REFIT), **UNKNOWN})
 async def refit_job(service: ServiceDep, refit_id: RefitId) -> Response:
-    """Return how far a refit is: which reconstructor it has made, or why none."""
+    """Return the progress of a refit, and the reconstructor it has made."""
     return answer(service.refits.job(refit_id))
 
 
 @router.get("/measurements", responses={200: shows(views.MEASUREMENTS)})
 async def measurements(service: ServiceDep) -> Response:
-    """Return the interaction matrices that were measured or are being measured, oldest first."""
+    """Return the measured interaction matrices, oldest first."""
     return answer(service.snapshot().tracker, views.MEASUREMENTS)
 
 
 @router.get("/measurements/{id}", responses={200: shows(views.MEASUREMENT), **UNKNOWN})
 async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
-    """Return how a matrix was measured, or how far it is."""
+    """Return how a matrix was measured, or its progress."""
     record = service.snapshot().tracker.measurement(measurement_id)
     return answer(found_or_refuse(record, f"unknown measurement {measurement_id}"))
 
@@ -98,7 +96,7 @@ async def measured_matrix(
     measurement_id: MeasurementId,
     parameters: Annotated[MatrixParameters, Query()],
 ) -> Response:
-    """Return a measured interaction matrix ``(n_slopes, n_modes)``, slope per metre OPD.
+    """Return a measured matrix ``(n_slopes, n_modes)``, slope per metre OPD.
 
     ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes whose SHA-256 is the
     measurement's ``sha256``, ``hdf5`` the archived product with how it was measured, ``fits`` an
@@ -110,13 +108,13 @@ async def measured_matrix(
 
 @noisy.get("/noisy-matrix", responses={200: shows(NOISY_MATRICES)})
 async def noisy_matrices(service: ServiceDep) -> Response:
-    """Return the noisy interaction matrices the service remembers, oldest first."""
+    """Return the noisy interaction matrices, oldest first."""
     return answer(service.snapshot().tracker, NOISY_MATRICES)
 
 
 @noisy.get("/noisy-matrix/{id}", responses={200: shows(NOISY), **UNKNOWN})
 async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
-    """Return what is known of a noisy matrix, or how far it is."""
+    """Return the record of a noisy matrix, or its progress."""
     record = service.snapshot().tracker.measurement(noisy_id)
     return answer(found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
 
@@ -133,5 +131,5 @@ async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     },
 )
 async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
-    """Return the archived HDF5 file of a noisy matrix; ``pyrcal fit`` reads it."""
+    """Return the HDF5 file of a noisy matrix."""
     return await _file(request, service.archive.noisy.file, noisy_id)

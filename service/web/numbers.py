@@ -1,4 +1,4 @@
-"""Which matrix is meant, its numbers as they leave, and those behind the figures of the page."""
+"""Routes of matrices and of the numbers behind the page's figures."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ OtherId = Annotated[str, Depends(_other)]
 
 
 class MatrixFormat(StrEnum):
-    """How a matrix leaves."""
+    """Formats of an exported matrix."""
 
     NPY = "npy"
     """NumPy's own file format."""
@@ -97,7 +97,7 @@ class MatrixFormat(StrEnum):
 
 
 class MatrixParameters(Parameters):
-    """How to return a matrix."""
+    """Format of the returned matrix."""
 
     format: MatrixFormat = MatrixFormat.NPY
     """"npy", "raw", "hdf5" or "fits"."""
@@ -184,12 +184,12 @@ def describes_numbers(description: str, rows_and_columns: str, example: str) -> 
 # --- what the small figures of the page are drawn from
 
 
-router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["state"], responses={**INVALID})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SingularValues:
-    """How strongly a reconstructor's modes are seen: the weak ones amplify noise."""
+    """Singular values of a reconstructor's modes: weak ones amplify noise."""
 
     id: str
     """Of the reconstructor."""
@@ -225,7 +225,7 @@ class SlopeMaps:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixComparison:
-    """How two reconstructors differ, mode by mode: of as many modes as both have."""
+    """Difference of two reconstructors, mode by mode: of as many modes as both have."""
 
     id: str
     other: str
@@ -252,7 +252,7 @@ COMPARISON = define_view("MatrixComparisonView", MatrixComparison)
 
 @router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
 async def singular_values(request: Request, service: ServiceDep, matrix_id: MatrixId) -> Response:
-    """Return the singular values that a reconstructor stands for."""
+    """Return the singular values of a reconstructor."""
     known = service.description
     products = None if known is None else known.products
     tag = tag_of(matrix_id, products is None)
@@ -291,7 +291,7 @@ def _rounded(values: NDArray[np.float64]) -> list[float]:
 async def compare(
     request: Request, service: ServiceDep, matrix_id: MatrixId, other: OtherId
 ) -> Response:
-    """Return how a reconstructor differs from another one, mode by mode."""
+    """Return the difference of two reconstructors, mode by mode."""
     tag = tag_of(matrix_id, other)
     if (same := not_modified(request, tag)) is not None:
         return same

@@ -1,4 +1,4 @@
-"""The operator's page: its files, served from the package, and the mirror that it draws."""
+"""The operator's page and the manual."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.web.authentication import OPEN
 from service.web.connections import Middleware
 from service.web.views import ServiceDep, answer, define_view, shows
 
-router = APIRouter(prefix="/v1", tags=["what the service knows"])
+router = APIRouter(prefix="/v1", tags=["state"])
 
 FILES: Final = Path(__file__).parent / "dashboard"
 
@@ -177,7 +177,7 @@ MIRROR: Final = define_view("MirrorView", MirrorDrawing)
 
 @router.get("/mirror", responses={200: shows(MIRROR)})
 async def mirror(service: ServiceDep) -> Response:
-    """Return what the mirror looks like on the sensor; α of ``GET /v1/alpha`` says where it is."""
+    """Return the mirror's drawing on the sensor; ``GET /v1/alpha`` says where it lies."""
     instrument = service.instrument
     wfs = instrument.wfs
     return answer(

@@ -1,4 +1,4 @@
-"""Errors as ``application/problem+json`` (RFC 9457), all of them."""
+"""Errors as ``application/problem+json`` (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -81,15 +81,15 @@ Responses = dict[int | str, dict[str, Any]]
 
 INVALID: Responses = {422: problem_response("A parameter or a field of the body cannot be used")}
 EVERYWHERE: Responses = {
-    401: problem_response("There are keys, and none was shown, or one that is none"),
-    403: problem_response("The key's scope is another, or a page from elsewhere has sent it"),
+    401: problem_response("A key is needed, and none was given, or a wrong one"),
+    403: problem_response("The key's scope does not allow it, or another site's page has sent it"),
     408: problem_response("The request did not come in time"),
     413: problem_response("The body is larger than this service takes"),
-    421: problem_response("Asked for under a name this service does not know"),
+    421: problem_response("Host is a name that this service does not know"),
 }
 UNKNOWN: Responses = {404: problem_response("No such thing")}
 DECISION: Responses = {
-    412: problem_response("It has changed since it was seen: If-Match names another ETag"),
+    412: problem_response("It has changed: If-Match names another ETag"),
     428: problem_response("Prefer: handling=strict was sent, and no If-Match"),
 }
 COMMAND: Responses = {

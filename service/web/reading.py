@@ -1,4 +1,4 @@
-"""What the service knows, for whoever reads: no route here changes anything."""
+"""Routes that read the service's state."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from service.web import numbers, views
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem, problem_response
 from service.web.views import ServiceDep, answer, found_or_refuse, shows, tagged
 
-router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["state"], responses={**INVALID})
 
 
 class LimitParameters(numbers.Parameters):
-    """How much of a list to return."""
+    """Length of the returned list."""
 
     limit: int = Field(default=200, ge=1, le=100_000)
     """At most so many entries, the newest ones."""
@@ -28,7 +28,7 @@ class LimitParameters(numbers.Parameters):
 
 @router.get("/state", responses={200: shows(views.STATE)})
 async def state(service: ServiceDep) -> Response:
-    """Return everything the service knows, at one glance."""
+    """Return the whole state."""
     return answer(service.snapshot())
 
 
@@ -55,13 +55,13 @@ async def alpha(request: Request, service: ServiceDep) -> Response:
 
 @router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})
 async def reconstructors(service: ServiceDep) -> Response:
-    """Return the reconstructors the service remembers, oldest first."""
+    """Return the reconstructors, oldest first."""
     return tagged(service.snapshot().tracker, views.RECONSTRUCTORS)
 
 
 @router.get("/reconstructors/{id}", responses={200: shows(views.RECONSTRUCTOR), **UNKNOWN})
 async def reconstructor(service: ServiceDep, matrix_id: numbers.MatrixId) -> Response:
-    """Return what is known of one reconstructor."""
+    """Return the record of a reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
     return tagged(found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
 
@@ -84,7 +84,7 @@ async def reconstructor_matrix(
     matrix_id: numbers.MatrixId,
     parameters: Annotated[numbers.MatrixParameters, Query()],
 ) -> Response:
-    """Return a reconstructor's numbers, ``(n_modes, n_slopes)``, metres OPD per slope.
+    """Return a reconstructor ``(n_modes, n_slopes)``, metres OPD per slope.
 
     ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes as they travel to the RTC,
     whose SHA-256 is the reconstructor's ``sha256``, ``hdf5`` the archived product, ``fits`` an
@@ -101,20 +101,20 @@ async def reconstructor_matrix(
 
 @router.get("/alarms", responses={200: shows(views.ALARMS)})
 async def alarms(service: ServiceDep) -> Response:
-    """Return the alarms: those that last, those that went unseen, those that are muted."""
+    """Return the alarms: lasting, ended unseen, muted."""
     return answer(service.snapshot(), views.ALARMS)
 
 
 @router.get("/events", responses={200: shows(views.EVENTS)})
 async def events(service: ServiceDep, parameters: Annotated[LimitParameters, Query()]) -> Response:
-    """Return what happened, oldest first, and the alarms that last."""
+    """Return the log, oldest first, and the alarms."""
     tracker = service.snapshot().tracker
     return answer(replace(tracker, log=tracker.log[-parameters.limit :]), views.EVENTS)
 
 
 @router.get("/gains", responses={200: shows(views.GAINS), **COMMAND})
 async def gains(service: ServiceDep) -> Response:
-    """Return the optical gains as they are now, for all modes of the basis.
+    """Return the optical gains of all modes now.
 
     ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
     """
@@ -128,7 +128,7 @@ async def gains(service: ServiceDep) -> Response:
 
 @router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})
 async def reconstructor_gains(service: ServiceDep, matrix_id: numbers.MatrixId) -> Response:
-    """Return the optical gains that were measured when a reconstructor was made, for its modes."""
+    """Return the optical gains when a reconstructor was made."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
     record = found_or_refuse(found, f"unknown reconstructor {matrix_id}")
     return _gain_table(record.id, record.optical_gains, record.n_modes)

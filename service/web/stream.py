@@ -1,4 +1,4 @@
-"""News as it happens: server-sent events, rendered once for all who listen."""
+"""Server-sent events, rendered once for all listeners."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from service.tracking.step_context import LOG_LENGTH
 from service.web.problems import INVALID, problem_response
 from service.web.views import as_json, to_json
 
-router = APIRouter(prefix="/v1", tags=["what the service knows"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["state"], responses={**INVALID})
 
 LOOK_S = 0.5
 """Between two looks at what is new, seconds: all listeners wake together and share one."""
@@ -42,7 +42,7 @@ Log = tuple[LogEntry, ...]
 
 
 class Stream:
-    """What is new in the service, for every listener.
+    """The service's news for every listener.
 
     There is no queue: the service's log is one, and a listener is a place in it. One that falls
     further behind than the log reaches is told to read the whole of it again. Of the state only the
@@ -69,7 +69,7 @@ class Stream:
         """Streams that are open."""
 
     async def listen(self, heard: str) -> AsyncIterator[bytes]:
-        """Yield server-sent events from after the line of the log with the id ``heard`` on."""
+        """Yield server-sent events after the log line with the id ``heard``."""
         ids: list[str] | None = None
         version, quiet_since = 0, 0
         yield f"retry: {RETRY_MS}\n\n".encode()
@@ -112,7 +112,7 @@ class Stream:
                 await self._over.wait()
 
     def _since(self, heard: str) -> bytes:
-        """Return what came after the line of the log that was heard last."""
+        """Return the events after a log line."""
         if heard not in self._ids:
             return _event("reset", b'{"log":"/v1/events"}', self._ids[-1])
         first = self._ids.index(heard)
@@ -185,7 +185,7 @@ async def stream(
     stream: Annotated[Stream, Depends(_stream_of)],
     last_event_id: Annotated[str, Header(max_length=200)] = "",
 ) -> StreamingResponse:
-    """Send what is new as it happens, the state twice a second at most.
+    """Send the state, at most twice a second, and the log as it grows.
 
     Who comes back with the ``Last-Event-ID`` it has heard gets the lines it has missed.
     """

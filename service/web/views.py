@@ -1,4 +1,4 @@
-"""What leaves over REST: which fields of which record, and how they are written.
+"""Which fields of which record REST shows, and how.
 
 Records leave as they are: a view names the fields of one, in boundary units. A registration, or its
 1 σ, leaves as its four parameters; a number that is not finite is null. The OpenAPI document takes
@@ -180,7 +180,7 @@ def tagged(record: object, of: View | None = None) -> Response:
 
 
 def found_or_refuse(record: Record | None, refusal: str) -> Record:
-    """Return the record that was looked up.
+    """Return the record, or refuse an unknown id.
 
     Raises
     ------

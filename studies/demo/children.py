@@ -35,7 +35,7 @@ class Child:
         if status is None:
             return None
         words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(words) if line.strip()), "it said nothing")
+        last = next((line.strip() for line in reversed(words) if line.strip()), "without a message")
         how = f"was killed by signal {-status}" if status < 0 else f"ended with status {status}"
         return f"the {self.name} {how}: {last}"
 

@@ -352,7 +352,7 @@ def test_an_alarm_is_acknowledged_and_muted_also_by_keys_alone(page):
     page.says("#alarms", "power is off")
     assert page.faults_of_access() == []
     page.click(f"{vanished}[data-about=mute]")
-    page.says("#order", "it goes on to forbid")
+    page.says("#order", "stays forbidden")
     page.driver.find_element("css selector", "#order [name=for_s]").send_keys("an hour")
     page.js("document.querySelector('#reason').focus()")
     page.send("until noon")

@@ -843,7 +843,7 @@ async def test_openapi_describes_every_route_with_its_answers_and_errors(client)
             assert answer["description"], name
             assert expected is None or list(answer["content"]) == [expected], (name, status)
         if not name.startswith("GET"):
-            at_once = operation["tags"] == ["who may ask"] or name in {
+            at_once = operation["tags"] == ["access"] or name in {
                 "POST /v1/annotations",
                 "DELETE /v1/fits/{id}",
             }

@@ -154,7 +154,7 @@ async def test_who_decides_on_what_has_changed_since_is_told_to_look_again(
     answer = await client.post(order, headers={"If-Match": tag})
     assert answer.status_code == 412
     assert answer.json()["type"] == "urn:pyrcal:problem:stale"
-    assert "look again" in answer.json()["detail"]
+    assert "read it again" in answer.json()["detail"]
     now = (await client.get(seen)).headers["etag"]
     for given in (now, f'"other", {now}', "*"):
         assert (await client.post(order, headers={"If-Match": given})).status_code == 202

@@ -1,4 +1,4 @@
-"""The heavy work, in a process of its own: fitting, computing reconstructors, judging them.
+"""The worker process: fits, reconstructors, verdicts.
 
 A compute thread beside the ingest raises its latency thirty-fold; a nice'd process leaves it
 alone.

@@ -1,4 +1,4 @@
-"""The optical model at work: fitting windows, computing reconstructors, judging them."""
+"""The jobs of the worker: fit windows, compute and judge reconstructors."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class OpticsWorker:
             model.forget()
 
     def describe(self) -> Description:
-        """Return what telemetry must look like, and prepare for the first fit."""
+        """Return the expected telemetry, and prepare for the first fit."""
         linearisation = self._first()
         self._sensor.keep(linearisation)
         return Description(
@@ -193,7 +193,7 @@ class OpticsWorker:
     def read_slope_convention(
         self, in_use: NDArray[np.float32], near: Misregistration | None
     ) -> SlopeConvention:
-        """Return whether the RTC's own matrix is of the slopes that the instrument file tells.
+        """Compare the RTC's own matrix with the instrument file.
 
         Where the file leaves the orientation open, what is found is taken over.
         """
@@ -379,7 +379,7 @@ class OpticsWorker:
         loop: ControlLoop,
         magnitude: float | None,
     ) -> ExpectedGain | None:
-        """Return what a new reconstructor would win over the one in use; None: nobody can say.
+        """Return what a new reconstructor would win over the one in use; None: unknown.
 
         ``magnitude`` is the star's; None: the noise of the settings.
         """

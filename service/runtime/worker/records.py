@@ -1,4 +1,4 @@
-"""What the worker is told, what it asks of an instrument, and what it says of a matrix."""
+"""Records of jobs: settings, conditions, answers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def patience_s(job: Callable[..., Any]) -> float:
 
 
 class Sampling(NamedTuple):
-    """How finely the optics are computed, and of which working point."""
+    """Sampling of the optics, and its working point."""
 
     pupil: int = 3
     """Points of the pupil along a subaperture."""
@@ -60,7 +60,7 @@ class Sampling(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compute:
-    """What the worker may use, and how it computes."""
+    """Limits and options of the worker."""
 
     threads: int = 2
     """Threads that share the rows of a product; BLAS itself keeps to one."""
@@ -87,7 +87,7 @@ class Compute:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Conditions(Determination):
-    """What a reconstructor has to hold in; the covariance includes the model's error."""
+    """Conditions a reconstructor must hold in; the covariance includes the model's error."""
 
     loop: ControlLoop
     """As the gate is to see it."""

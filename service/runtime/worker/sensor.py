@@ -1,4 +1,4 @@
-"""The sensor as telemetry shows it: at a flat wavefront, or at its working point.
+"""The sensor's model at a flat wavefront or at its working point.
 
 The working point is one of a loop whose residual is not known beforehand: the seeing, the star and
 the loop's gains all play a part. How strong it is can be read off the dithered modes, whose

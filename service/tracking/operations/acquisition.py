@@ -1,4 +1,4 @@
-"""From nothing known to tracking: open, look from afar, confirm, close on few modes, widen.
+"""Acquisition: from nothing known to tracking.
 
 Nothing is assumed of the registration. The loop is opened, for one that is closed far from
 registration slips; smooth modes lead to α and other modes must confirm it; a reconstructor for as
@@ -278,7 +278,7 @@ def _widen(context: StepContext, rtc: Status, record: ReconstructorRecord | None
         )
         return
     if rtc.loop == "open":
-        stages.restart_acquisition(context, "somebody opened the loop")
+        stages.restart_acquisition(context, "the loop was opened from outside")
         return
     doubted = registration is not None and bool(registration.doubt)
     waiting = doubted or context.matrices.making_since_ns_utc is not None
@@ -419,7 +419,7 @@ def _note_interrupted(context: StepContext, what: str, do: str = "") -> None:
 
 
 def _note_closed(context: StepContext, rtc: Status) -> None:
-    """End it after somebody, or the acquisition itself, has closed the loop."""
+    """End the acquisition after the loop was closed."""
     matrix, judged = rtc.cm_id or "an unknown matrix", "which it has not judged"
     if rtc.cm_id is not None and rtc.cm_id == context.acquisition.matrix:
         judged = "which had passed the gate: the registration is followed from there"

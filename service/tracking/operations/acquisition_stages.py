@@ -1,4 +1,4 @@
-"""What an acquisition asks for, how it goes from stage to stage, and its stages in an open loop."""
+"""The stages of an acquisition, and their dithers."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ MAX_MISSES = 4
 """Windows of a stage that lead nowhere before the loop is opened anew."""
 
 STOPS_WITHIN_S = 2.0
-"""A dither that was told to stop, by the status."""
+"""A dither that was asked to stop, by the status."""
 
 
 def band_of(stage: AcquisitionStage) -> Band:
@@ -360,7 +360,7 @@ def wide_capture_stage(context: StepContext, rtc: Status) -> None:
         text = "looking for the registration with the loop open, on smooth modes"
         enter_stage(context, AcquisitionStage.COARSE, text)
     elif rtc.loop != "open":
-        restart_acquisition(context, "somebody closed the loop")
+        restart_acquisition(context, "the loop was closed from outside")
         return
     _keep_dithering(context, rtc)
 

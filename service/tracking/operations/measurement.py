@@ -1,4 +1,4 @@
-"""Interaction matrices that the RTC measures by itself, and the records of all measurements."""
+"""Measurements of interaction matrices by the RTC."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def on_answer(context: StepContext, request: MeasureRequest, reply: Reply) -> No
 
 
 def on_measured(context: StepContext, event: ev.MatrixMeasured) -> None:
-    """Take over how far a measurement is, from whoever makes its matrix."""
+    """Take over the progress of a measurement."""
     before = context.state.measurement(event.record.id)
     with context.because_of("" if before is None else before.cause):
         _update(context, event.record)
@@ -178,7 +178,7 @@ def _kind(record: MeasurementRecord) -> str:
 
 
 def _give_up_overdue(context: StepContext, record: MeasurementRecord, *, closed: bool) -> None:
-    """Give up a matrix that does not come although everything looks as if it were over."""
+    """Give up a matrix that does not arrive although the RTC seems done."""
     asked_ns = record.asked_ns_utc or context.now_ns
     if context.now_ns - asked_ns > LONGEST_S * SECOND_NS:
         fail_measurement(context, record, f"no matrix came within {LONGEST_S:.0f} s")

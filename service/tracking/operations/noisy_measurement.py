@@ -1,4 +1,4 @@
-"""Noisy interaction matrices: measured on sky by random signs of many modes at once.
+"""Noisy interaction matrices, measured on sky by random signs.
 
 The sums are kept where the telemetry comes in; here is only how far each measurement is.
 """

@@ -1,4 +1,4 @@
-"""Probation: a matrix just applied that makes the loop worse gives way to the one before.
+"""Probation: go back from a matrix that makes the loop worse.
 
 The one before held the loop until a moment ago, whoever made it: it is sent again whatever the gate
 or telemetry have said since. If the loop is lost all the same it is asked to open.
@@ -97,7 +97,7 @@ def _go_on(context: StepContext, trial: Probation, event: Event) -> None:
 
 
 def on_compared(context: StepContext, event: ev.Compared) -> None:
-    """Take the verdict of telemetry: a matrix that is worse gives way, and nobody asked does more.
+    """Take the verdict on a new matrix: one that makes the loop worse gives way.
 
     What was said of other matrices than the two on record is not meant.
     """
@@ -168,7 +168,7 @@ def _on_swap(context: StepContext, before: str | None, in_use: str | None) -> No
         return
     if record is None or before is None:
         if trial is not None and trial.judges is not None:
-            why = "nobody knows what the RTC uses"
+            why = "the RTC's matrix is unknown"
             _set(context, replace(trial, state=ProbationState.NOT_JUDGED, text=why))
         return
     why = _why_none(context, record, trial)
@@ -205,7 +205,7 @@ def _await_republished(context: StepContext, trial: Probation, event: Event) -> 
 
 
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
-    """Look whether the loop is as it was, now that the matrix before is in use again."""
+    """Check whether the loop recovers, now that the matrix before is in use again."""
     text = f"{trial.worse}: the service went back to {trial.before}, as {in_use}"
     # an operator's rollback would go back to it
     reconstructors.change_state(
@@ -223,7 +223,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
 
 
 def _watch(context: StepContext, trial: Probation) -> None:
-    """End the look at a loop with the matrix before: it is lost, opened, or nothing tells."""
+    """End the check of the loop with the matrix before: lost, opened, or undecided."""
     waited_s = (context.now_ns - trial.since_ns_utc) / SECOND_NS
     lost = next((a for a in context.alarms.active if alarm_blocks(a, Interlock.HOLD)), None)
     if context.rtc is None or not context.rtc.in_loop:
@@ -232,7 +232,7 @@ def _watch(context: StepContext, trial: Probation) -> None:
     elif lost is not None and waited_s > CALM_WITHIN_S:
         _end_watch(context, trial, lost.text, lost=True)
     elif waited_s > WITHIN_S + LATE_S:
-        _end_watch(context, trial, "telemetry does not tell how the loop is since", lost=False)
+        _end_watch(context, trial, "telemetry does not show how the loop is since", lost=False)
 
 
 def _end_watch(context: StepContext, trial: Probation, found: str, *, lost: bool) -> None:
@@ -300,7 +300,7 @@ def _why_none(context: StepContext, record: ReconstructorRecord, last: Probation
     if last is not None and last.state in _WORSE:
         worse = context.state.reconstructor(last.id)
         if worse is not None and worse.sha256 == record.sha256 != "":
-            return "it was found worse before, and somebody wants it all the same"
+            return "it was found worse before, and is wanted all the same"
     return _why_not_comparable(context)
 
 

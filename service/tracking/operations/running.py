@@ -1,4 +1,4 @@
-"""What occupies the mirror or the loop now, and what to call it.
+"""Name the operations that run now.
 
 Which orders that allows is in :mod:`service.tracking.interlocks`. What the service is in, in the
 words of a control room, follows from what runs and which alarms last.
@@ -22,7 +22,7 @@ ANSWERED_WITHIN_S = 30.0
 
 
 class OperationKind(StrEnum):
-    """What may run, or keep everything from running."""
+    """Operations that may run, or keep others from running."""
 
     STOPPED = "an operator has stopped everything"
     MEASURING = "an interaction matrix is being measured"
@@ -30,7 +30,7 @@ class OperationKind(StrEnum):
     RAMPING = "a gain ramp is under way"
     ACQUIRING = "an acquisition is under way"
     OWN_DITHER = "a dither of the service's own choice plays"
-    OTHER_DITHER = "a dither of an operator's, or of somebody else, plays"
+    OTHER_DITHER = "a dither of an operator or another program plays"
     STANDING_BY = "another service drives the RTC"
     MAKING = "a reconstructor is being computed"
     SENDING = "a reconstructor is on its way to the RTC"
@@ -88,7 +88,7 @@ def _exclusive(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
 
 
 def _dither(state: TrackerState, now_ns: int) -> Iterator[RunningOperation]:
-    """Yield the dither that plays, followed or not; one that was told to stop does no more."""
+    """Yield the dither that plays, unless it was ordered to stop."""
     followed = None if state.dithers.dither is None else state.dithers.dither.id
     stopping = now_ns - state.dithers.policy.stop_asked_ns_utc < GONE_WITHIN_S * SECOND_NS
     seen = None if state.loop.rtc is None or stopping else state.loop.rtc.dither_id
@@ -114,38 +114,38 @@ class ServiceState(StrEnum):
     """Whether the service does its work; the first that holds, from below."""
 
     OPERATIONAL = "Operational"
-    """It works for an RTC whose loop is closed, or has its mirror; what it does says the rest."""
+    """It works for an RTC whose loop is closed, or has the mirror."""
 
     READY = "Ready"
-    """It can work, and does not: no RTC is there, its loop is open, or everything was stopped."""
+    """It could work: there is no RTC, the loop is open, or everything was stopped."""
 
     DEGRADED = "Degraded"
-    """An alarm that is serious lasts: it does less than it should."""
+    """A serious alarm lasts."""
 
     NOT_READY = "NotReady"
-    """It can do nothing of its work: it starts, stands by, or waits for what everything needs."""
+    """It starts, stands by, or waits for what everything needs."""
 
     ERROR = "Error"
-    """An alarm that is critical lasts: the loop, or what is heard of it, cannot be relied on."""
+    """A critical alarm lasts."""
 
 
 class CurrentOperation(StrEnum):
-    """What it does; the first that holds, from above."""
+    """The service's operation; the first that holds, from above."""
 
     ACQUIRING = "Acquiring"
-    """α is looked for from nothing, with the loop open."""
+    """An acquisition runs."""
 
     MEASURING = "Measuring"
-    """An interaction matrix is being measured, or gains are tried in a ramp."""
+    """A matrix is being measured, or a gain ramp runs."""
 
     HOLD = "Hold"
-    """An operator has set mode hold, or stopped everything: nothing is made or sent by itself."""
+    """Mode hold, or everything is stopped."""
 
     TRACKING = "Tracking"
     """α is known, and followed in a closed loop."""
 
     IDLE = "Idle"
-    """None of these: α is not known, or there is no closed loop to follow it in."""
+    """α is unknown, or the loop is open."""
 
 
 OPERATION_OF: dict[OperationKind, CurrentOperation] = {
@@ -160,7 +160,7 @@ OPERATION_OF: dict[OperationKind, CurrentOperation] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Operating:
-    """What the service is in and does, and why."""
+    """State and operation of the service, and why."""
 
     service_state: ServiceState
     current_operation: CurrentOperation

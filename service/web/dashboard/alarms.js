@@ -97,7 +97,7 @@ export class CriticalBanner {
     part(".remedy").hidden = !alarm.do || Boolean(muted);
     put(part(".found"), alarm.text);
     part(".found").hidden = Boolean(muted);
-    put(part(".since"), `since ${clock(since)} UTC, ${ago(since, now, true)}${known}${fresh ? "" : "; as last heard"}`);
+    put(part(".since"), `since ${clock(since)} UTC, ${ago(since, now, true)}${known}${fresh ? "" : "; last known"}`);
     const runbook = runbookOf(alarm.name);
     part("a").hidden = !runbook;
     if (runbook) part("a").href = runbook;

@@ -88,7 +88,7 @@ export class Events {
     list.replaceChildren(...shown.map(lineOf), ...muted.map(mutedLine));
     const n = unseen(this.#service.state).length;
     this.root.querySelector("#unseen").hidden = n < 2;
-    put(this.root.querySelector("#unseen span"), `${n} that nobody has acknowledged`);
+    put(this.root.querySelector("#unseen span"), `${n} not acknowledged`);
     if (focus) list.querySelector(`[data-about="${focus.about}"][data-name="${focus.name}"]`)?.focus();
     this.#age();
     this.#announce(alarms.filter((alarm) => !alarm.muted));

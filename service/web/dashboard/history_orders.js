@@ -37,7 +37,7 @@ export const HISTORY_ORDERS = {
     make(orders) {
       const { rtc, registration, mode } = orders.state;
       return {
-        title: "Refit: a reconstructor for α of now",
+        title: "Refit: a reconstructor for the present α",
         fields: [{ name: "n_modes", label: "Modes", min: 1, max: rtc.n_modes, placeholder: `as many as now, ${rtc.n_controlled}` }],
         facts: [
           `A reconstructor is computed and judged for ${registrationOf(registration.alpha, registration.sigma)}.`,

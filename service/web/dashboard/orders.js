@@ -207,15 +207,15 @@ export class Orders {
     const { name, value, title } = this.#order;
     let why = this.whyNot(name);
     if (!why) await this.#look(name, value).catch((error) => (why = error.message));
-    const text = why ? `it cannot be ordered now: ${why}. Cancel, and look again.` : "above is how it is now: look again, then send or cancel.";
-    put(this.#dialog.querySelector(".refused"), `The state has changed since you looked, and nothing was done; ${text}`);
+    const text = why ? `it cannot be ordered now: ${why}. Cancel and try again.` : "the dialog shows the new state: send or cancel.";
+    put(this.#dialog.querySelector(".refused"), `The state has changed, and nothing was sent; ${text}`);
     this.#dialog.querySelector("[value=send]").disabled = Boolean(why);
-    this.say(`${title}: nothing was done, the state had changed`);
+    this.say(`${title}: nothing was sent, the state had changed`);
   }
 
   #waits(waits) {
     this.#dialog.querySelector("[value=send]").disabled = waits;
-    put(this.#dialog.querySelector(".asked"), waits ? "◐ ordered, waiting for what comes of it" : "");
+    put(this.#dialog.querySelector(".asked"), waits ? "◐ ordered, waiting for the result" : "");
   }
 }
 
@@ -259,7 +259,7 @@ const PERMITTED = {
 };
 
 function pathOf(record) {
-  needs(record, "the reconstructors are being read: look again");
+  needs(record, "the reconstructors are still loading: try again");
   return `v1/reconstructors/${encodeURIComponent(record.id)}`;
 }
 
@@ -293,8 +293,8 @@ const ORDERS = {
       facts: [
         orders.work && `${orders.work.title} is ended.`,
         dither && `${dither.id} is stopped; no other is started.`,
-        `Nothing is made or sent, whoever asks (mode is ${mode}); ${inUse ?? "what the RTC uses"} stays in use, telemetry is still looked at.`,
-        "It lasts until somebody releases it, over a restart of the service, too. Mode and dither are then as before.",
+        `Nothing is made or sent, whoever asks (mode is ${mode}); ${inUse ?? "what the RTC uses"} stays in use, telemetry is still used.`,
+        "It lasts until it is released, even over a restart of the service. Mode and dither are then as before.",
       ],
       button: "Stop everything",
       method: "POST",
@@ -310,7 +310,7 @@ const ORDERS = {
       facts: [
         alarm.text,
         alarm.do && `What to do: ${alarm.do}.`,
-        lasts ? "It stays on this page, with who knows of it, until it is over." : "It is over; nobody had acknowledged it. It leaves this page.",
+        lasts ? "It stays on this page, with who acknowledged it, until it is over." : "It is over and was not acknowledged. It leaves this page.",
         lasts && "If it becomes worse, it has to be acknowledged again.",
       ],
       button: "Acknowledge",
@@ -326,7 +326,7 @@ const ORDERS = {
       title: `Acknowledge ${alarms.length} alarms`,
       facts: [
         ...alarms.map((alarm) => `${alarm.severity ? SYMBOLS[alarm.severity] : SYMBOLS.over} ${alarm.name}${alarm.severity ? "" : " (over)"}: ${alarm.text}`),
-        "Those that last stay on this page, with who knows of them; those that are over leave it.",
+        "Those that last stay on this page, with who acknowledged them; those that are over leave it.",
       ],
       button: "Acknowledge all",
       parts: alarms.map(({ name, worst_severity: severity }) => ({ name, path: `v1/alarms/${encodeURIComponent(name)}/acknowledge`, body: { severity } })),
@@ -341,7 +341,7 @@ const ORDERS = {
       facts: ({ for_s: seconds }) => [
         alarm.text,
         `It is not listed here until ${seconds ? `${clock(orders.service.now + seconds * 1000)} UTC` : DASH}, however often it comes; muted alarms are counted.`,
-        "What it forbids, it goes on to forbid.",
+        "What it forbids stays forbidden.",
       ],
       button: "Mute",
       asked: true,
@@ -436,7 +436,7 @@ const ORDERS = {
       facts: [
         `Mode ${mode}: ${MODES[mode]}. It is ${state.mode} now.`,
         proposal && mode === "auto" && `${proposal.id} waits for an approval; in auto another one is made and sent when it wins enough.`,
-        "It stands until it is changed again, over a restart of the service, too.",
+        "It stands until it is changed again, even over a restart of the service.",
       ],
       button: `Set mode ${mode}`,
       method: "PUT",
@@ -451,7 +451,7 @@ const ORDERS = {
       title: "Stop the dither",
       facts: [
         dither ? `${dither.id} is stopped: modes ${dither.modes.slice(0, 8).join(", ")}${dither.modes.length > 8 ? " and more" : ""}.` : "None plays now.",
-        "None is started by itself until somebody starts one, over a restart of the service, too.",
+        "None starts by itself until one is ordered, even over a restart of the service.",
         until ? `α is not measured by a dither any more, and stale by ${clock(until)} UTC unless ordinary telemetry keeps it.` : "α is not measured by a dither any more.",
       ],
       button: "Stop the dither",
@@ -479,9 +479,9 @@ const ORDERS = {
       title: "Acquire",
       facts: [
         `The loop, now ${rtc.loop} with ${rtc.n_controlled} modes, is opened: the image is lost for some tens of seconds.`,
-        "Smooth modes are dithered far above the budget while it is open, until two looks agree where the mirror is.",
+        "Smooth modes are dithered far above the budget while it is open, until two windows agree where the mirror is.",
         "The loop is closed on at most 150 modes first, then on more; these matrices need no further approval, but pass the gate.",
-        registration ? "What is known of α now is given up." : `α is ${DASH}: nothing is lost by it.`,
+        registration ? "The present α is given up." : `α is ${DASH}: nothing is lost by it.`,
       ],
       button: "Open the loop and acquire",
       asked: true,
@@ -510,8 +510,8 @@ const ORDERS = {
     return {
       title: `Give up ${one.id}`,
       facts: [
-        `${one.id} is ${one.state}; there will be no matrix of it.`,
-        measuring && "The RTC may go on to its end, and refuse other commands until then; what it sends is ignored.",
+        `${one.id} is ${one.state}; its matrix is given up.`,
+        measuring && "The RTC may measure to the end, and refuse other commands until then; its matrix is ignored.",
       ],
       button: "Give up",
       method: "DELETE",
@@ -569,8 +569,8 @@ const ORDERS = {
       ],
       facts: ({ duration_s: seconds = 0, before_s: before = 0 }) => [
         `All that the RTC sends in the next ${number(seconds, 0)} s goes to the archive, byte for byte.`,
-        before > 0 ? `What came in the last ${number(before, 0)} s is in it too, as far as the service still holds it: a minute, usually.` : "What came before is not in it.",
-        "It stays until somebody removes it; it ends before its time where the disk becomes full.",
+        before > 0 ? `What came in the last ${number(before, 0)} s is in it too, as far as the service still holds it (usually a minute).` : "It begins now.",
+        "It stays until it is removed; it ends early if the disk becomes full.",
       ],
       button: "Begin",
       asked: true,

@@ -112,7 +112,7 @@ const OPERATIONS = {
 export const MODES = {
   auto: "it makes and sends by itself whatever passes the gate",
   propose: "it makes matrices, and an operator approves each one",
-  hold: "it measures only: nothing is made or sent unless asked for",
+  hold: "it only measures: nothing is made or sent without an order",
 };
 
 // What the gate found, as a line.

@@ -185,7 +185,7 @@ def test_what_is_decided_on_is_shown_and_the_service_told_which_it_was(capsys, s
 def test_what_changes_while_somebody_decides_is_not_decided(capsys, service, monkeypatch):
     monkeypatch.setattr(orders, "_asked", lambda *_: becomes(service, "cm-1", "failed") or "yes")
     assert main(["approve", "--no-wait"]) == 1
-    assert "look again" in capsys.readouterr().err
+    assert "read it again" in capsys.readouterr().err
     assert service.commands == []
 
 

@@ -43,7 +43,7 @@ def told(order, world):
         (
             idle,
             cmd.SetPointing(elevation_deg=61.5, azimuth_deg=-20.0),
-            "the telescope looks at elevation 61.5 deg, azimuth -20 deg",
+            "the telescope points at elevation 61.5 deg, azimuth -20 deg",
         ),
         (idle, cmd.Refit(), "a reconstructor is being computed; mode is propose"),
         (idle, cmd.Acquire(), "an acquisition is under way: opening the loop"),
@@ -185,9 +185,9 @@ def test_a_dither_is_over_when_the_status_shows_none():
     world = own_dither()
     order = given(world, cmd.StopDither())
     first, last = answered_in_the_end(world, order, 1.0)
-    assert first[0].startswith("the RTC was told to stop dither-")
+    assert first[0].startswith("the RTC was asked to stop dither-")
     assert not first[1]
-    assert last == ("no dither plays; no dither is started until one is asked for", True)
+    assert last == ("no dither plays; no dither starts until one is ordered", True)
 
 
 def test_the_loop_tells_what_the_rtc_has_accepted():

@@ -361,7 +361,7 @@ class Counting:
     [
         ({"lost": 20}, "of 5000 in the last 5 s 100 never came (2.0 %)"),
         ({"nonfinite": 20}, "100 are not finite"),
-        ({"overwritten": 20}, "100 were not looked at in time"),
+        ({"overwritten": 20}, "100 were not read in time"),
     ],
 )
 def test_more_than_one_frame_in_a_hundred_lost_over_five_seconds_is_named(how, words):

@@ -110,7 +110,7 @@ def matrix_at(alpha):
 
 
 class Mistold:
-    """A workbench whose instrument file tells another listing of the slopes than the RTC's."""
+    """A workbench whose instrument file says another listing of the slopes than the RTC's."""
 
     def __init__(self, order="xy", **axes):
         self.setting = SlopeRecipe(order=SlopeOrder(order), orientation=Orientation(**axes))

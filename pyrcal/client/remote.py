@@ -1,4 +1,4 @@
-"""The commands that ask a running service, in the words of the command line; quick to import.
+"""The commands that ask a running service; quick to import.
 
 Where REST takes an order, what it is decided on and where to look for what becomes of it stands in
 the service's own table, ``service/commands.toml``. What the service answers to an order is printed

@@ -1,4 +1,4 @@
-"""The models of one fit, from coarse to fine, and with other numbers of the instrument."""
+"""The models of one fit, from coarse to fine."""
 
 from __future__ import annotations
 

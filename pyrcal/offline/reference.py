@@ -1,4 +1,4 @@
-"""Whether a measured interaction matrix can be fitted: its shape, its columns, its unit."""
+"""Check whether a measured interaction matrix can be fitted."""
 
 from __future__ import annotations
 

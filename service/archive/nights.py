@@ -1,4 +1,4 @@
-"""Every estimate of α over the nights, the events beside it, a sample of the state, notes."""
+"""Estimates of α over the nights, events, samples and notes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every streaming estimator is: fed block by block, begun anew by one declared rule.
+"""The protocols of streaming estimators and detectors.
 
 An estimator is a frozen record that returns itself anew. The bank that feeds all of them
 (``service.runtime.estimator_bank``) knows none by name: each says what it begins anew for, of which

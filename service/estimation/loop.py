@@ -1,4 +1,4 @@
-"""The loop as a status shows it: what makes two of them the same, and what a matrix closes."""
+"""The loop as a status shows it."""
 
 from __future__ import annotations
 

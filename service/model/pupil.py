@@ -1,4 +1,4 @@
-"""The pupil: points, how much light passes at each, and which subapertures it lights."""
+"""The pupil: points, their light, and lit subapertures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Passive estimates become the registration, its bias allowed for, or doubt it.
+"""Take a passive estimate into the registration, or doubt α.
 
 A passive estimate alone is no match for dithered windows: where it disagrees it asks for one.
 """
@@ -216,7 +216,7 @@ def _ask_for_window(
     """
     text = (
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "
-        "dithered window must tell which"
+        "dithered window must decide which"
     )
     registration = context.registration or registration
     was_doubted, void = (

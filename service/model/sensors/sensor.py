@@ -1,4 +1,4 @@
-"""A sensor with its pupil, and its response to small wavefronts, whatever its kind.
+"""A sensor with its pupil, and its response to small wavefronts.
 
 Signals stand plane by plane, each plane over all valid subapertures in row-major order of the mask:
 Sx, then Sy, or whatever planes ``SignalKind`` has. In which order an RTC lists them, and how its

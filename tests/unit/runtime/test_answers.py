@@ -50,7 +50,7 @@ def told(order, world):
         (acquiring, cmd.AbortAcquisition(), "the acquisition has ended by the operator; the loop"),
         (measuring, cmd.GiveUp(id="im-1"), "im-1 is given up by the operator; the RTC"),
         (gathering, cmd.GiveUp(id="noisy-1"), "noisy-1 is given up by the operator"),
-        (idle, cmd.StopDither(), "no dither plays; no dither is started until"),
+        (idle, cmd.StopDither(), "no dither plays; no dither starts until"),
     ],
 )
 def test_what_the_service_does_by_itself_is_done_when_it_is_answered(activity, command, text):

@@ -96,7 +96,7 @@ def test_the_worst_is_kept_and_what_becomes_worse_is_acknowledged_again(story):
         next(a for a in story.state.alarms.active if a.name == "margin").definition
         is ALARMS["margin"]
     )
-    with pytest.raises(CommandError, match="margin has been critical, and serious was seen of it"):
+    with pytest.raises(CommandError, match="margin has been critical, and serious was seen"):
         story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.SERIOUS))
     story.tell(cmd.AcknowledgeAlarm(name="margin", severity=Severity.CRITICAL))
 

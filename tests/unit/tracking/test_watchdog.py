@@ -223,7 +223,7 @@ class TestBark:
     def test_a_second_one_that_disagrees_unanswered_is_an_alarm_and_voids_nothing(self, barking):
         watch(barking, moved(shift_x_subap=1.3))
         assert "watchdog" in barking.alarms
-        assert "none has since" in barking.state.alarm("watchdog").text
+        assert "no window since" in barking.state.alarm("watchdog").text
         assert barking.state.alpha.registration.usable
 
     def test_where_no_dither_can_be_had_the_first_is_an_alarm_with_the_reason(self, story):

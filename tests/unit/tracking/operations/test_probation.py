@@ -181,7 +181,7 @@ def test_an_operator_who_wants_it_all_the_same_gets_it():
     told.make("cm-6", wanted=True, sha256="2" * 64)
     told.acknowledge("cm-6")
     assert trial(told).state is ProbationState.NOT_JUDGED
-    assert "somebody wants it all the same" in trial(told).text
+    assert "is wanted all the same" in trial(told).text
     told.tell(found(before="cm-3", after="cm-6"))
     assert len(told.asked(ev.RepublishMatrix)) == 1
 

@@ -29,16 +29,9 @@ from service.tracking import commands as instructions
 from service.tracking.commands import Instruction
 from service.tracking.events import new_id
 from service.tracking.state import TrackerState
+from service.web import keys, numbers, views
 from service.web.authentication import actor_of, needs
-from service.web.keys import KeyScope
-from service.web.numbers import MatrixId
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
-from service.web.views import (
-    RECONSTRUCTORS,
-    ServiceDep,
-    found_or_refuse,
-    tagged,
-)
 
 # --- what is asked: JSON, read into a record
 
@@ -170,7 +163,7 @@ class OrderRoute:
     call: str
     command: str | dict[str, str]
     text: str
-    scope: KeyScope = KeyScope.OPERATE
+    scope: keys.KeyScope = keys.KeyScope.OPERATE
     decides_on: tuple[str, ...] = ()
     follows: Mapping[str, str] = field(default_factory=dict)
     makes: str = ""
@@ -305,7 +298,7 @@ class Client:
         return AcceptedView(text=text, links=links)
 
 
-async def _client_of(request: Request, response: Response, service: ServiceDep) -> Client:
+async def _client_of(request: Request, response: Response, service: views.ServiceDep) -> Client:
     sent = request.headers
     strict = "handling=strict" in sent.get("prefer", "").replace(" ", "").lower()
     return Client(service, actor_of(request), sent.get("if-match"), strict, response.headers)
@@ -316,11 +309,13 @@ ClientDep = Annotated[Client, Depends(_client_of)]
 
 
 def _one(state: TrackerState, name: str) -> Response:
-    return tagged(found_or_refuse(state.reconstructor(name), f"unknown reconstructor {name}"))
+    return views.tagged(
+        views.found_or_refuse(state.reconstructor(name), f"unknown reconstructor {name}")
+    )
 
 
 def _all(state: TrackerState, _: str = "") -> Response:
-    return tagged(state, RECONSTRUCTORS)
+    return views.tagged(state, views.RECONSTRUCTORS)
 
 
 def _before(state: TrackerState, _: str) -> Response:
@@ -329,7 +324,7 @@ def _before(state: TrackerState, _: str) -> Response:
     It stays as it is while the one in use is judged and others are proposed.
     """
     before = state.reconstructor(state.previous or "")
-    return _all(state) if before is None else tagged(before)
+    return _all(state) if before is None else views.tagged(before)
 
 
 _SHOWN: Mapping[str, Callable[[TrackerState, str], Response]] = {
@@ -348,7 +343,7 @@ RefitId = Annotated[str, Path(alias="id", max_length=128, description="Id of a r
 _AlarmName = Annotated[str, Path(alias="name", max_length=128)]
 
 _NAMED: Mapping[str, Any] = {
-    "reconstructors": MatrixId,
+    "reconstructors": numbers.MatrixId,
     "alarms": _AlarmName,
     "values": _AlarmName,
     "measurements": MeasurementId,

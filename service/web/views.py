@@ -22,21 +22,17 @@ import numpy as np
 from fastapi import Depends, Request, Response
 from numpy.typing import NDArray
 
-from service.archive import AuditEntry
+from service import archive, errors, wire
 from service.control.expected_gain import ExpectedGain
 from service.control.gains import ModeGain
 from service.control.gate import GateVerdict
-from service.errors import UnknownIdError
 from service.estimation.comparison import ProbationFinding
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 from service.runtime.snapshot import AlarmStatus, Alpha, ModeGainTable, Rtc, Snapshot, WorkerLoad
 from service.runtime.supervisor import Supervisor
-from service.tracking.alarms import Alarm, AlarmRecord, OperatorNote, Prerequisite
-from service.tracking.commands import GainGroup
-from service.tracking.dither_request import Dither, DitherPlan, DitherPolicyState
-from service.tracking.interlocks import Permission
-from service.tracking.mode_limits import ModeLimit, ModeProof
+from service.tracking import alarms, dither_request, interlocks, mode_limits, products
+from service.tracking import commands as cmd
 from service.tracking.operation_records import (
     Acquisition,
     LoopCommand,
@@ -44,10 +40,8 @@ from service.tracking.operation_records import (
     Probation,
 )
 from service.tracking.operations.running import Operating
-from service.tracking.products import Assessment, ReconstructorRecord
 from service.tracking.registration import HistoryEntry, Offload, PassiveState
 from service.tracking.state import LogEntry, ObservatoryValue, TrackerState
-from service.wire import Pointing
 
 Record = TypeVar("Record")
 
@@ -135,7 +129,7 @@ def to_json(record: object, of: View | None = None) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=1500)
-def _lasting(record: HistoryEntry | LogEntry | AuditEntry) -> dict[str, Any]:
+def _lasting(record: HistoryEntry | LogEntry | archive.AuditEntry) -> dict[str, Any]:
     """Return the picture of what is asked for again and again, and never changes."""
     return to_json(record)
 
@@ -188,7 +182,7 @@ def found_or_refuse(record: Record | None, refusal: str) -> Record:
         If there is none: ``refusal`` says of what.
     """
     if record is None:
-        raise UnknownIdError(refusal)
+        raise errors.UnknownIdError(refusal)
     return record
 
 
@@ -221,7 +215,7 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     return to_json(value, of)
 
 
-_LASTING = (HistoryEntry, LogEntry, AuditEntry)
+_LASTING = (HistoryEntry, LogEntry, archive.AuditEntry)
 
 
 # a plain function would be called in a thread, which takes as long as most answers
@@ -237,17 +231,17 @@ ServiceDep = Annotated[Supervisor, Depends(_service_of)]
 # --- what of each record leaves
 
 
-define_view("PointingView", Pointing)
+define_view("PointingView", wire.Pointing)
 define_view("ModeGainView", ModeGain, "mode gain gain_sigma=sigma gain_scatter=scatter t_ns_utc")
 define_view("VerdictView", GateVerdict)
 define_view("ExpectedGainView", ExpectedGain)
-define_view("AssessmentView", Assessment)
+define_view("AssessmentView", products.Assessment)
 define_view("ProbationFindingView", ProbationFinding)
 define_view(
     "ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback"
 )
-define_view("ModeLimitView", ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
-define_view("ModeProofView", ModeProof, "n_proven contrary_modes own_response_ratio")
+define_view("ModeLimitView", mode_limits.ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
+define_view("ModeProofView", mode_limits.ModeProof, "n_proven contrary_modes own_response_ratio")
 ALPHA = define_view(
     "AlphaView",
     Alpha,
@@ -265,7 +259,7 @@ define_view("HistoryEntryView", HistoryEntry)
 HISTORY = define_view("HistoryView", TrackerState, "entries=alpha.history", "The last estimates.")
 define_view("PassiveView", PassiveState)
 
-define_view("GainGroupView", GainGroup)
+define_view("GainGroupView", cmd.GainGroup)
 define_view(
     "RtcView",
     Rtc,
@@ -277,14 +271,14 @@ define_view(
 define_view("LoopCommandView", LoopCommand, "id text state reason asked_ns_utc lasts_s")
 define_view(
     "DitherView",
-    Dither,
+    dither_request.Dither,
     "id request.modes request.amplitude_m request.kind frequency_hz request.seed "
     "request.duration_s start_seq",
 )
-define_view("DitherPlanView", DitherPlan)
+define_view("DitherPlanView", dither_request.DitherPlan)
 define_view(
     "DitherPolicyView",
-    DitherPolicyState,
+    dither_request.DitherPolicyState,
     "phase reason budget_m mean_cost_m plan next_ns_utc n_windows_learnt avoided_hz",
 )
 define_view(
@@ -296,7 +290,7 @@ define_view(
 define_view("OffloadView", Offload, "id state text step total n_moves asked_ns_utc")
 RECONSTRUCTOR = define_view(
     "ReconstructorView",
-    ReconstructorRecord,
+    products.ReconstructorRecord,
     "id state n_modes created_ns_utc alpha sigma parent origin sha256 condition_number gate reason "
     "published_ns_utc applied_frame_seq",
 )
@@ -330,7 +324,7 @@ NOISY_MEASUREMENT = define_view(
     "The noisy interaction matrix under way: ``/v1/noisy-matrix/{id}`` says more.",
 )
 
-define_view("OperatorNoteView", OperatorNote)
+define_view("OperatorNoteView", alarms.OperatorNote)
 define_view(
     "AlarmView",
     AlarmStatus,
@@ -338,16 +332,16 @@ define_view(
     "record.text cause "
     "do record.over_ns_utc record.acknowledged record.muted",
 )
-define_view("RaisedView", Alarm, "name since_ns_utc text")
-define_view("MutedView", AlarmRecord, "name muted")
+define_view("RaisedView", alarms.Alarm, "name since_ns_utc text")
+define_view("MutedView", alarms.AlarmRecord, "name muted")
 define_view("OperatingView", Operating)
 define_view("ObservatoryValueView", ObservatoryValue)
 define_view("LogEntryView", LogEntry, "t_ns_utc level name text n_times=times cause")
 EVENTS = define_view(
     "EventsView", TrackerState, "alarms=alarms.active log", "What happened, and what is wrong now."
 )
-define_view("PrerequisiteView", Prerequisite)
-define_view("PermissionView", Permission)
+define_view("PrerequisiteView", alarms.Prerequisite)
+define_view("PermissionView", interlocks.Permission)
 define_view("WorkerLoadView", WorkerLoad)
 define_view(
     "LinkView",

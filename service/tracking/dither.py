@@ -364,7 +364,9 @@ def _end_when_done(context: StepContext, rtc: Status, dither: Dither, wanted: Wa
         and 2.0 * total_m(dither.request) < wanted.parameters.total_m
     )
     moved = dither_plan.why_moved(dither, rtc, context.policy, wanted.parameters.shunned)
-    if wanted.parameters.modes and not is_proving(dither.request):
+    # weak lines are worth another dither where what is known was restored, and is to be confirmed
+    confirms = registration is not None and bool(wanted.parameters.modes)
+    if (confirms or wanted.phase is DitherPhase.PROVE) and not is_proving(dither.request):
         moved = wanted.reason
     if done or weak or moved:
         # the next one must not overtake the command to stop

@@ -133,6 +133,8 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     choice = _parameters(context, total_m, window_s, max(requirement.window_s, _lasting_s(phase)))
     if phase is DitherPhase.ACQUIRE and not context.acquisition.under_way:
         choice = _with_others(context, rtc, choice)
+        if choice.modes:
+            reason = f"{reason}; weak lines show more modes beside"
     return WantedDither(phase=phase, reason=reason, parameters=choice, next_ns_utc=next_ns), plan
 
 
@@ -158,7 +160,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
 
     The modes that tell of α keep most of the power, and there are none where the star is so faint
     that one window is not as precise as is asked. It lasts for the two windows that are asked for
-    before anything is made, and ends by itself.
+    before anything is made, or one where all modes are to be shown first, and ends by itself.
     """
     registration, policy = context.registration, context.policy
     begun = registration is not None and registration.n_windows > 0
@@ -186,7 +188,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
         modes=tuple(sorted(lines)),
         lines_hz=tuple(lines[mode][0] for mode in sorted(lines)),
         shares=tuple(lines[mode][1] for mode in sorted(lines)),
-        n_windows=MIN_BESIDE,
+        n_windows=1 if mode_proof.unknown_loop(context.state, rtc) else MIN_BESIDE,
     )
 
 

@@ -21,6 +21,9 @@ CERTAIN = 3.0
 NEIGHBOURS = 10
 """Modes that one is compared with; a window of no more tells nothing of it."""
 
+FARTHEST = 2 * NEIGHBOURS
+"""Modes away that one of them may be: others have another optical gain."""
+
 MAX_WINDOWS = 3
 """That compare a mode, before it is let be though none of them was certain."""
 
@@ -115,7 +118,7 @@ def compare(
     for k, mode in enumerate(modes.tolist()):
         beside = np.argsort(np.abs(modes - mode), kind="stable")[1 : NEIGHBOURS + 1]
         usual = float(np.median(gains[beside]))
-        if usual > 0.0:
+        if usual > 0.0 and abs(modes[beside[-1]] - mode) <= FARTHEST:
             found[mode] = ModeRatio(
                 mode=mode, ratio=float(gains[k]) / usual, sigma=float(sigma[k]) / usual
             )

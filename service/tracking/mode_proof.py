@@ -158,18 +158,18 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
     shown += others[: most - len(shown)]
     telling = chosen_modes(rtc, context.policy, shunned_modes(state))
     spare = [mode for mode in telling if mode not in shown]
-    return tuple(sorted([*shown, *spare[: max(min(N_LINES, most) - len(shown), 0)]]))
+    room = min(N_LINES if others else N_LINES - len(shown), most - len(shown))
+    return tuple(sorted([*shown, *spare[: max(room, 0)]]))
 
 
 def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) -> list[int]:
-    """Return the modes that weak lines show beside the first dither of those that tell of α.
+    """Return the free modes that weak lines show beside the first dither of those that tell of α.
 
-    Where somebody knows how the modes answer that the loop controls: others are free.
+    None beside one whose window was refused: few lines are found again soonest.
     """
-    state = context.state
-    proven = state.matrices.in_use is not None and not unknown_loop(state, rtc)
-    chosen = context.policy.mode_information is not None and state.operator.mode is not Mode.HOLD
-    if not proven or not chosen or not awaits_proof(context, rtc):
+    chosen = context.policy.mode_information is not None
+    idle = context.operator.mode is Mode.HOLD or context.windows.run < 0
+    if idle or not chosen or not awaits_proof(context, rtc):
         return []
     free = (mode for mode in _missing_modes(context, rtc) if mode >= rtc.n_controlled)
     return [mode for mode in free if mode not in telling][:MAX_BESIDE]
@@ -455,14 +455,14 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
 def _missing_modes(context: StepContext, rtc: Status) -> list[int]:
     """Return the modes that are wanted now, and that nobody has seen to answer.
 
-    Those that one window has accused are shown again whatever is wanted: an accusation is named,
-    or it is none.
+    Those that one window has accused come first, whatever is wanted: an accusation is named, or it
+    is none.
     """
     proof, wanted = context.matrices.mode_proof, _wanted_modes(context, rtc)
     doubted = {one.mode for one in proof.doubtful} - _controlled(context.state)
-    accused = {mode for mode in proof.suspected | doubted if wanted <= mode < rtc.n_modes}
     proven = proven_modes(context.state) - doubted
-    return [mode for mode in (*range(wanted), *sorted(accused)) if mode not in proven]
+    accused = sorted(m for m in (proof.suspected | doubted) - proven if m < rtc.n_modes)
+    return [*accused, *(m for m in range(wanted) if m not in proven and m not in accused)]
 
 
 def _wanted_modes(context: StepContext, rtc: Status) -> int:

@@ -7,6 +7,7 @@ import pytest
 
 from service.errors import CommandError
 from service.estimation.lockin import WEAK
+from service.estimation.windows import WindowRefused
 from service.tracking import alarms
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -422,10 +423,10 @@ def test_the_first_matrix_is_asked_for_as_soon_as_with_four_lines():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"mode": Mode.HOLD}, {"offered": False}, {"max_dither_modes": 4}, {"magnitude": 10.0}],
+    [{"mode": Mode.HOLD}, {"max_dither_modes": 4}, {"magnitude": 10.0}],
 )
 def test_no_weak_lines_are_asked_for_where(changes):
-    """Nothing is made; nobody knows the modes of the loop; the RTC plays no more; a faint star."""
+    """Nothing is made; the RTC plays no more; a faint star."""
     first = Shown(policy=informed(), **changes).asked(DitherRequest)[0]
     assert len(first.modes) == 4
 
@@ -483,3 +484,34 @@ def test_a_mode_is_compared_with_those_beside_it_in_the_basis():
     assert found[20].sigma == pytest.approx(0.03 / gains[20] * 2.0, rel=0.03)
     assert max(abs(one.ratio - 1.0) for mode, one in found.items() if mode != 20) < 0.25
     assert compare(modes[:10], gains[:10], np.full(10, 0.03)) == {}
+    # nor with those far from it, whose optical gains are others
+    far = np.array([1, *range(25, 40)])
+    assert compare(far, gains[far], np.full(16, 0.03)).keys() == set(range(25, 40))
+
+
+def test_where_all_modes_are_to_be_shown_the_first_dither_shows_the_free_ones_in_one_window():
+    world = Shown({430: -0.6}, policy=informed(), offered=False)
+    first = world.asked(DitherRequest)[0]
+    assert set(first.modes) == {460, 470, 480, 490} | set(range(400, 400 + MAX_BESIDE))
+    assert first.duration_s == pytest.approx(0.3 + WINDOW_S + 0.9)
+    world.pass_(3.0)
+    assert 430 in world.shown[1]
+    assert {0, 1, 2} <= set(world.shown[1])
+
+
+def test_beside_a_dither_whose_window_was_refused_no_weak_lines_are_asked_for():
+    world = Shown.__new__(Shown)
+    world.windows = lambda: None
+    world.__init__(policy=informed(), offered=False)
+    world.tell(ev.WindowLost(refused=WindowRefused(reason="none found", t_ns_utc=world.now_ns)))
+    world.pass_(6.0)
+    assert len(world.asked(DitherRequest)[-1].modes) == 4
+
+
+def test_a_dither_found_after_a_restart_gives_way_to_one_that_shows_modes():
+    world = Shown(policy=informed()).pass_(4.0)
+    world.state = changed(world.state, mode_proof=ModeProof())
+    killed(world)
+    assert not world.playing.request.id.startswith("dither-prove-")
+    world.pass_(4.0)
+    assert world.playing.request.id.startswith("dither-prove-")

@@ -20,8 +20,8 @@ from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import Illumination
-from service.model.sensors.light import CannotTell
 from service.model.sensors.pyramid.light import PyramidLight, find_pupil, measured_illumination
+from service.model.sensors.sensor import CannotTell
 from studies.registered import PASSES, STROKE_M, Array, measured_by_day, registered
 
 N_FRAMES = 100

@@ -13,8 +13,8 @@ from service.errors import MatrixError
 from service.files.container import opened
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination
-from service.model.sensors.light import CannotTell, Light, PupilPosition
 from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import CannotTell, Light, PupilPosition
 
 FLUX = "flux"
 """Name of the array in its file."""

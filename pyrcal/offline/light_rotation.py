@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.estimation.solver import vertex
 from service.model.pupil import Illumination
-from service.model.sensors.light import CannotTell, PupilPosition
+from service.model.sensors.sensor import CannotTell, PupilPosition
 
 Array = NDArray[np.float64]
 

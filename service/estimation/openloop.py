@@ -24,8 +24,8 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
-from service.model.sensors.light import CannotTell
 from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import CannotTell
 from service.model.slopes import Orientation
 
 Array = NDArray[Any]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument
 from service.model.kinds import SignalKind
-from service.model.sensors.light import CannotTell
 from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import CannotTell
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from service.model.instrument import Instrument, SensorDescription
     from service.model.kinds import SignalKind
     from service.model.pupil import PupilGrid
-    from service.model.sensors.light import CannotTell, Light
-    from service.model.sensors.sensor import Fineness, Sensor
+    from service.model.sensors.sensor import CannotTell, Fineness, Light, Sensor
     from service.model.slopes import SlopeRecipe
 
 
@@ -195,6 +194,6 @@ class SensorKind(ABC):
 
     def light(self, instrument: Instrument) -> Light | CannotTell:
         """Return how an instrument's light tells of the pupil, or that it does not."""
-        from service.model.sensors.light import CannotTell
+        from service.model.sensors.sensor import CannotTell
 
         return CannotTell(reason=f"the light of a {self.name} does not tell where the pupil lies")

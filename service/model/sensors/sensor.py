@@ -1,4 +1,4 @@
-"""A sensor with its pupil, and its response to small wavefronts.
+"""A sensor with its pupil, its response to small wavefronts and its light, whatever its kind.
 
 Signals stand plane by plane, each plane over all valid subapertures in row-major order of the mask:
 Sx, then Sy, or whatever planes ``SignalKind`` has. In which order an RTC lists them, and how its
@@ -14,6 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from service.model.pupil import Illumination
 
 Array = NDArray[Any]
 
@@ -91,6 +93,71 @@ class Fineness:
 
     mapper: Mapper = map
     """Spreads rows over threads."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PupilPosition:
+    """Where the image of the pupil lies."""
+
+    at: tuple[float, float]
+    """x and y of their centre from that of the sensor's grid, subapertures."""
+
+    sigma: tuple[float, float]
+    """1 σ of both."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CannotTell:
+    """The map does not say; a value, because it may well happen."""
+
+    reason: str
+    """What was found, and what would help."""
+
+
+class Light(Protocol):
+    """The light of one instrument's sensor; counts are in the axes of conventions.md."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the counts."""
+
+    def counts_of(self, flux: bytes) -> NDArray[Any]:
+        """Return the counts that a status carries.
+
+        Raises
+        ------
+        ModelError
+            If they are not this sensor's.
+        """
+
+    def counts(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Return a response's light as counts are laid out."""
+
+    def turned(self, counts: NDArray[Any]) -> NDArray[Any]:
+        """Return counts in the RTC's axes, in those of conventions.md."""
+
+    def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
+        """Return where the image of the pupil lies, at any shift that light can tell.
+
+        Raises
+        ------
+        ModelError
+            If the counts have another shape.
+        """
+
+    def illumination(self, counts: NDArray[Any], position: PupilPosition) -> Illumination:
+        """Return how evenly the beam is lit.
+
+        Raises
+        ------
+        ModelError
+            If the counts have another shape, or are dark.
+        """
+
+    def relative(
+        self, counts: NDArray[Any], position: PupilPosition
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the light over that of an even beam, ``(n, n)`` on the sensor, and where known."""
 
 
 def by_rows(mapper: Mapper, function: Callable[[Array], Array], rows: Array) -> Array:

@@ -7,8 +7,8 @@ import pytest
 
 from pyrcal.offline.light_rotation import Arms, LightRotation, find_rotation
 from service.errors import ModelError
-from service.model.sensors.light import CannotTell, PupilPosition
 from service.model.sensors.pyramid.light import measured_illumination, relative_light
+from service.model.sensors.sensor import CannotTell, PupilPosition
 from tests.unit.estimation.lamps import beam, counts_of, flao, gaussian
 from tests.unit.model.sensors.test_pyramid_light_illumination import at
 

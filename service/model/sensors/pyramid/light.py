@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination, instrument_pupil
-from service.model.sensors.light import CannotTell, PupilPosition
 from service.model.sensors.pyramid.description import pyramid_in
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
+from service.model.sensors.sensor import CannotTell, PupilPosition
 from service.model.slopes import turned_mask
 
 Array = NDArray[np.float64]

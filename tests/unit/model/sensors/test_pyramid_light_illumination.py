@@ -8,8 +8,8 @@ import pytest
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
-from service.model.sensors.light import PupilPosition
 from service.model.sensors.pyramid.light import find_pupil, measured_illumination, relative_light
+from service.model.sensors.sensor import PupilPosition
 from tests.numerics import small_basis
 from tests.unit.estimation.lamps import beam, counts_of, flao, fringes, gaussian, small
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.sensors.light import CannotTell, PupilPosition
 from service.model.sensors.pyramid.light import find_pupil, repaired
+from service.model.sensors.sensor import CannotTell, PupilPosition
 from tests.unit.estimation.lamps import (
     beam,
     counts_of,

@@ -11,11 +11,10 @@ from service.errors import ModelError
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.pupil import instrument_pupil
 from service.model.sensors.kind import SensorKind, WorkingPoint
-from service.model.sensors.light import CannotTell
 from service.model.sensors.pyramid.kind import PyramidKind
 from service.model.sensors.pyramid.signals import pixel_places
 from service.model.sensors.registry import KINDS, kind_of
-from service.model.sensors.sensor import Fineness
+from service.model.sensors.sensor import CannotTell, Fineness
 from tests.numerics import small_basis, small_instrument
 
 SHIFT = (0.21, -0.13)

@@ -153,9 +153,9 @@ def _jump_suspected(context: StepContext) -> str | None:
 
 
 RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
-    alarms.STOPPED: _stopped,
+    "stopped": _stopped,
     alarms.LOOP_OPEN: _loop_open,
-    alarms.ACQUISITION: _acquisition,
+    "acquisition": _acquisition,
     alarms.NOT_FOUND: _not_found,
     alarms.OTHER_SUM: _other_numbers,
     alarms.SHORT_MARGIN: _margin,
@@ -170,6 +170,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
 }
 """The text of each alarm by state, policy and time; None: there is nothing to see.
 
+A name that nothing else in the code speaks of stands here alone, without a constant in alarms.py.
 One that must not waver about a limit asks whether it lasts already: alarms are part of the state.
 """
 

@@ -15,8 +15,6 @@ from typing import Final
 
 import msgspec
 
-STOPPED = "stopped"
-ACQUISITION = "acquisition"
 VANISHED = "rtc-vanished"
 LOOP_OPEN = "loop-open"
 SECOND_RTC = "second-rtc"

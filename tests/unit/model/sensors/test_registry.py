@@ -6,9 +6,9 @@ from typing import ClassVar, Literal
 import numpy as np
 import pytest
 
+from pyrcal.offline.models import FitModels, Optic
 from service.config import load_instrument
 from service.errors import ConfigurationError
-from service.estimation.models import FitModels, Optic
 from service.estimation.openloop import far_starts
 from service.model.instrument import instrument_sha256
 from service.model.kinds import SignalKind

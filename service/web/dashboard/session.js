@@ -23,7 +23,7 @@ export class Session {
   async #ask() {
     const answer = await fetch(WHERE, { cache: "no-store" }).catch(() => null);
     if (answer?.ok) this.#take(await answer.json());
-    else if (answer?.status === 401 || answer?.status === 429) this.#want();
+    else if (answer?.status === 401) this.#want();
   }
 
   #take({ name, scope }) {

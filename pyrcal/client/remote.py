@@ -21,7 +21,7 @@ from service import errors
 from service.errors import ConfigurationError, say
 
 DONE, NOT_DONE, UNREACHABLE = 0, 1, 3
-"""Exit statuses; 2 is that of a command 2 a command."""
+"""Exit statuses; 2 is that of a wrong command line."""
 
 USUAL_URL = "http://127.0.0.1:8080"
 ORDERS: Final = tomllib.loads(
@@ -33,9 +33,9 @@ URL, KEY = "PYRCAL_URL", "PYRCAL_API_KEY"
 """Variables of the environment."""
 
 _EPILOG = """
-Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a command
-2 a command, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for
---url and the key's file.
+Exit status: 0 done, 1 refused by the service or not done (of status: not all is well), 2 a wrong
+command line, 3 the service is not reached. PYRCAL_URL and PYRCAL_API_KEY stand for --url and the
+key's file.
 """
 
 

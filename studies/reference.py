@@ -223,7 +223,8 @@ def rest(described: Schema) -> str:
     by_tag: dict[str, list[tuple[str, str]]] = {}
     for path, operations in described["paths"].items():
         for method, operation in operations.items():
-            text = f"{operation['summary']}.".replace("``", "`")
+            text = f"{operation['summary']}.".replace("``", "`").removeprefix("Return ")
+            text = text[:1].upper() + text[1:]
             row = (f"`{method.upper()} {path}`", text)
             by_tag.setdefault(operation["tags"][0], []).append(row)
     parts = []
@@ -240,15 +241,15 @@ def runbook(acts: Mapping[str, str]) -> str:
     parts = [
         "An alarm lasts as long as what it tells of. It is on the page, in `GET /v1/state`, on "
         "the wire (`ao/v1/{system}/alarm`), and in [the metrics](monitoring.md). Its text has the "
-        "numbers; here is what each means and what to do.",
+        "numbers; here is what each means, what to do, and in brackets the file that finds it.",
         "## What an alarm may forbid",
         listed((f"`{act}`", text) for act, text in acts.items()),
     ]
     for name, kind in ALARMS.items():
         forbids = ", ".join(f"`{act}`" for act in acts if act in kind.blocks)
-        head = [f"*{kind.severity.value}*", forbids and f"forbids {forbids}"]
+        head = [f"*{kind.severity.value}* (`service/{kind.origin}`)"]
+        head.append(f"forbids {forbids}" if forbids else "")
         head.append(f"the {kind.responsible} can end it" if kind.responsible else "")
-        head.append(f"found in `service/{kind.origin}`")
         means = kind.means[:1].upper() + kind.means[1:]
         do = f"**Do**: {kind.do}."
         parts += [f"## {name}", "; ".join(part for part in head if part), f"{means}.", do]

@@ -28,7 +28,6 @@ from service.runtime.clock import ServiceClock
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
-from service.runtime.refits import Refits
 from service.runtime.snapshot import Snapshot
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool
@@ -91,7 +90,7 @@ class Supervisor:
             audit=self._writer.add,
         )
         """Telemetry kept on request."""
-        self.refits = Refits()
+        self.refits = command_results.Refits()
         """Reconstructors that operators have ordered."""
         self._pending_window = PendingWindow()
         self._worker_load = WorkerLoadMeter(workers)

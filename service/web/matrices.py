@@ -13,7 +13,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
-from service.runtime.refits import RefitJob
+from service.runtime.command_results import RefitJob
 from service.tracking.operation_records import MeasurementRecord, NoisyFinding
 from service.tracking.state import TrackerState
 from service.web import views

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from service.runtime.refits import Refits
+from service.runtime.command_results import Refits
 from service.runtime.snapshot import Snapshot
 from service.tracking.commands import Refit
 from service.tracking.events import MakeMatrix

@@ -28,7 +28,7 @@ from service.errors import (
 )
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
-from service.runtime.refits import Refits
+from service.runtime.command_results import Refits
 from service.runtime.snapshot import Snapshot
 from service.tracking.alarms import Alarm
 from service.tracking.commands import (

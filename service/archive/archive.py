@@ -10,8 +10,7 @@ from typing import IO, Any, Self
 
 from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
 from service.archive.nights import Nights, TrendSample
-from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive
-from service.archive.recordings import Recordings
+from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive, Recordings
 from service.archive.serialisation import TrackingFile
 from service.archive.store import Store
 from service.errors import ArchiveError, StorageError, UnknownIdError

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.archive import Archive, AuditEntry
 from service.archive.nights import TREND_S, TrendSample
-from service.archive.recordings import RUNNING, STORED, RecordingRecord
+from service.archive.products import RUNNING, STORED, RecordingRecord
 from service.archive.retention import GIGABYTE, RetentionPolicy, low_on_space
 from service.errors import (
     CommandError,

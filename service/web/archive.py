@@ -19,7 +19,7 @@ from pydantic import Field
 
 from service.archive import Archive, AuditEntry, Pin, Range
 from service.archive.nights import FOREVER_NS
-from service.archive.recordings import RecordingRecord
+from service.archive.products import RecordingRecord
 from service.archive.retention import Item, items
 from service.errors import PyrcalError
 from service.runtime.archiving import needed

@@ -18,7 +18,7 @@ from pyrcal.client import orders
 from pyrcal.client.remote import REQUESTS
 from service.api import create_app
 from service.archive import AuditEntry, Channel
-from service.archive.recordings import RecordingRecord
+from service.archive.products import RecordingRecord
 from service.errors import CommandError
 from service.runtime.snapshot import Snapshot
 from service.tracking.events import MakeMatrix, MatrixMade

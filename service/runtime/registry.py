@@ -13,12 +13,11 @@ from service.estimation.control_law import ControlLawCheck
 from service.estimation.dither_monitor import LOUDER, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
 from service.estimation.estimator import Detector, LoopContext, Streaming
-from service.estimation.health import EdgeHealth, LoopHealth, VibrationMonitor
+from service.estimation.health import EdgeHealth, LoopHealth, Standstill, VibrationMonitor
 from service.estimation.loopcheck import LoopCheck
 from service.estimation.passive import Passive
 from service.estimation.probation import Comparison
-from service.estimation.rejection import Rejection
-from service.estimation.standstill import Standstill
+from service.estimation.residual import Rejection
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.dither import SILENT_S

@@ -3,7 +3,7 @@
 import numpy as np
 
 from service.estimation.frames import FrameBlock
-from service.estimation.rejection import Rejection
+from service.estimation.residual import Rejection
 
 N_MODES, DT_NS, GAIN = 12, 1_000_000, 0.4
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.estimation.frames import FrameBlock
-from service.estimation.standstill import Standstill
+from service.estimation.health import Standstill
 
 BLOCK, DT_NS, N_SLOPES = 50, 1_000_000, 30
 

@@ -38,6 +38,9 @@ from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequ
 RETRY_S = 2.0
 """Between two attempts while the disk refuses."""
 
+SAVE_INTERVAL_S = 5.0
+"""Between two writes of what the next service needs; an α that old is as good as a new one."""
+
 LOOK_S = 30.0
 """Between two looks at the free space."""
 
@@ -361,10 +364,6 @@ def asked_for(command: Command, actor: Actor) -> str:
 def _loss_text(lost: int) -> tuple[AuditEntry]:
     text = f"{lost} lines came while the disk refused and {MAX_WAITING} waited already"
     return (AuditEntry(t_ns_utc=time.time_ns(), who="service", name="archive.lost", text=text),)
-
-
-SAVE_INTERVAL_S = 5.0
-"""Least time between two writes; an α that old is as good as a new one."""
 
 
 def taken_up(archive: Archive, state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:

@@ -298,10 +298,8 @@ class Refits:
 
     def end(self, effect: Effect, event: Event | None) -> None:
         """Note what came of an effect, if a job waits for it."""
-        job = self._jobs.get(effect.cause)
+        job = self._jobs.get(effect.cause) if isinstance(effect, ev.MakeMatrix) else None
         if job is None or job.state is not RefitState.RUNNING:
-            return
-        if not isinstance(effect, ev.MakeMatrix):
             return
         match event:
             case ev.MatrixMade(record=record):

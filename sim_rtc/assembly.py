@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError
 from service.files.disk_cache import DiskCache, usual_folder
-from service.model.described import KarhunenLoeve
 from service.model.instrument import Instrument, TabulatedModes
-from service.model.kinds import Normalisation
+from service.model.kinds import KarhunenLoeve, Normalisation
 from service.model.modes import ModalBasis, analytic_basis, mirror_surface
 from service.model.slopes import Orientation
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source

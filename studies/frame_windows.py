@@ -18,9 +18,8 @@ from threadpoolctl import threadpool_limits
 from pyrcal.offline.matrix import fit_matrix
 from service.config.mirrors import grid
 from service.estimation.reference import Reference
-from service.model.described import KarhunenLoeve
 from service.model.instrument import Instrument, Mirror
-from service.model.kinds import Normalisation, Stop
+from service.model.kinds import KarhunenLoeve, Normalisation, Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import modal_basis
 from service.model.pupil import rtc_valid_subapertures

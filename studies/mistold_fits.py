@@ -24,9 +24,16 @@ from threadpoolctl import threadpool_limits
 from pyrcal.offline.matrix import fit_matrix
 from service.errors import PyrcalError
 from service.estimation.reference import Reference
-from service.model.described import InfluenceShape, KarhunenLoeve
 from service.model.instrument import Instrument, Mirror
-from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop
+from service.model.kinds import (
+    BasisKind,
+    Influence,
+    InfluenceShape,
+    KarhunenLoeve,
+    Normalisation,
+    SlopeOrder,
+    Stop,
+)
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import karhunen_loeve_basis
 from service.model.sensors.pyramid.description import Pyramid

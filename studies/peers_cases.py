@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config import load_instrument
-from service.model.described import InfluenceShape
 from service.model.instrument import Instrument, Mirror
-from service.model.kinds import Influence, Stop
+from service.model.kinds import Influence, InfluenceShape, Stop
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.sensors.pyramid.description import pyramid_in

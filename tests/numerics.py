@@ -18,10 +18,9 @@ from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockInPlan
 from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache, usual_folder
-from service.model.described import InfluenceShape, KarhunenLoeve
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import InteractionModel, Linearisation
-from service.model.kinds import Influence, Stop
+from service.model.kinds import Influence, InfluenceShape, KarhunenLoeve, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.sensors.pyramid.description import Pyramid

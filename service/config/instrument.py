@@ -23,8 +23,8 @@ from service.config.instrument_schema import (
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.sources import refuse
 from service.errors import ConfigurationError
-from service.model.described import KarhunenLoeve, LoopFacts
 from service.model.instrument import Instrument, Mirror, SensorDescription, TabulatedModes
+from service.model.kinds import KarhunenLoeve, LoopFacts
 from service.model.sensors.kind import SensorKind, SensorTable
 from service.model.slopes import Orientation, SlopeRecipe
 

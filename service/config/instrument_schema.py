@@ -14,15 +14,18 @@ from pydantic import BeforeValidator, Field, create_model
 from service.config import instrument_path
 from service.config.sources import Id, Table, in_file, read_dataset, read_toml, refuse, validated
 from service.errors import ConfigurationError, ModelError
-from service.model.described import (
+from service.model.kinds import (
+    BasisKind,
     Count,
     InfluenceShape,
     KarhunenLoeve,
     LoopFacts,
+    Normalisation,
     Positive,
+    SignalKind,
+    SlopeOrder,
     Telescope,
 )
-from service.model.kinds import BasisKind, Normalisation, SignalKind, SlopeOrder
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 

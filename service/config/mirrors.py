@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from service.config.instrument_schema import MirrorTable, Section
 from service.config.sources import refuse
 from service.errors import ConfigurationError
-from service.model.described import InfluenceShape
 from service.model.instrument import Mirror, TabulatedModes
-from service.model.kinds import BasisKind, Influence
+from service.model.kinds import BasisKind, Influence, InfluenceShape
 from service.model.misregistration import unit_like
 from service.model.tabulated import (
     ENOUGH_POINTS_PER_SUBAPERTURE,

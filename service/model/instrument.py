@@ -1,6 +1,6 @@
 """An instrument as frozen records.
 
-What the file says as it is comes from ``service.model.described``; arrays are added here.
+What the file says as it is comes from ``service.model.kinds``; arrays are added here.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.described import (
+from service.model.kinds import (
+    BasisKind,
     InfluenceShape,
     KarhunenLoeve,
     LoopFacts,
     Telescope,
 )
-from service.model.kinds import BasisKind
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
 

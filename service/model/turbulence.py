@@ -8,8 +8,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.model.described import KarhunenLoeve
 from service.model.instrument import Instrument
+from service.model.kinds import KarhunenLoeve
 from service.model.pupil import instrument_pupil
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.described import KarhunenLoeve
+from service.model.kinds import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
 
 Array = NDArray[np.float64]

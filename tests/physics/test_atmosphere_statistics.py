@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy
 
-from service.model.described import KarhunenLoeve
+from service.model.kinds import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
 from sim_rtc.telescope.atmosphere import ExtrudedScreen, FrozenLayer, Layer
 from sim_rtc.telescope.imperfections import FOCUS, TILT, TIP, low_orders

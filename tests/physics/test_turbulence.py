@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.model.described import KarhunenLoeve
+from service.model.kinds import KarhunenLoeve
 from service.model.modes import karhunen_loeve_basis
 from service.model.turbulence import REFERENCE_WAVELENGTH_M, von_karman_covariance
 from tests.numerics import flao_basis, small_instrument

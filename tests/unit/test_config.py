@@ -11,9 +11,8 @@ import pytest
 from service.config import Settings, load_instrument, load_settings
 from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
-from service.model.described import LoopFacts
 from service.model.instrument import instrument_sha256
-from service.model.kinds import Influence, Normalisation, SignalKind, SlopeOrder, Stop
+from service.model.kinds import Influence, LoopFacts, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from service.config.mirrors import rings
-from service.model.described import InfluenceShape
 from service.model.instrument import Mirror
-from service.model.kinds import Influence
+from service.model.kinds import Influence, InfluenceShape
 from service.model.modes import Gaussian, ThinPlate, mirror_surface
 
 POSITIONS = rings(1, 4, 1.1)

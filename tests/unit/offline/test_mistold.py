@@ -16,9 +16,8 @@ from pyrcal.offline.models import Optic
 from service.config.mirrors import grid
 from service.errors import ModelError
 from service.estimation.reference import Reference
-from service.model.described import InfluenceShape
 from service.model.instrument import Instrument, Mirror
-from service.model.kinds import BasisKind, Influence, Normalisation, Stop
+from service.model.kinds import BasisKind, Influence, InfluenceShape, Normalisation, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import lit_subapertures
 from service.model.sensors.pyramid.description import Pyramid

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.model.described import KarhunenLoeve
 from service.model.instrument import Mirror
+from service.model.kinds import KarhunenLoeve
 from service.model.modes import karhunen_loeve_basis
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from service.model.described import Count, Positive, Read
+from service.model.kinds import Count, Positive, Read
 
 USUAL_SEPARATION = 1.2
 """Distance of neighbouring pupil images over their diameter, where nobody tells."""

@@ -4,7 +4,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from service.model.described import KarhunenLoeve
+from service.model.kinds import KarhunenLoeve
 from service.model.misregistration import Misregistration
 from sim_rtc.computer.feed import BATCH_FRAMES, Ahead, OpenLoopFeed, OpenModes, message_frames
 from sim_rtc.telescope.atmosphere import Layer, frozen_layers

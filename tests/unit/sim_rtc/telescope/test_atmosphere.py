@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from service.model.described import KarhunenLoeve
+from service.model.kinds import KarhunenLoeve
 from service.model.turbulence import von_karman_covariance
 from sim_rtc.telescope.atmosphere import ExtrudedScreen, fried_parameter_m
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.described import KarhunenLoeve
+from service.model.kinds import KarhunenLoeve
 from sim_rtc.telescope.atmosphere import (
     FrozenLayer,
     Layer,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.described import KarhunenLoeve
-from service.model.kinds import Stop
+from service.model.kinds import KarhunenLoeve, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics

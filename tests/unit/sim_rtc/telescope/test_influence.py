@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.model.described import InfluenceShape
-from service.model.kinds import Influence
+from service.model.kinds import Influence, InfluenceShape
 from service.model.misregistration import Misregistration
 from service.model.modes import ThinPlate, karhunen_loeve_basis, mirror_surface
 from sim_rtc.assembly import build_plant

@@ -23,7 +23,6 @@ from service.tracking import (
     resume,
     rtc,
     validity,
-    void_intervals,
     window_processing,
 )
 from service.tracking import commands as cmd
@@ -134,7 +133,7 @@ def _on_log_event(context: StepContext, event: ev.LogEvent) -> None:
 def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
     """Raise or end its alarm; stop a dither that the mirror does not follow."""
     if event.over:
-        void_intervals.end_alarm(context, event.name, event.t_ns_utc)
+        validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
         dither.stop_unanswered(context, event.text)
     else:

@@ -24,7 +24,7 @@ from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import Source
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.void_intervals import telemetry_span
+from service.tracking.validity import telemetry_span
 from service.tracking.window_processing import process_window
 from studies.campaign.rows import floats
 

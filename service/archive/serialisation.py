@@ -19,7 +19,7 @@ from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE, Misr
 from service.tracking.filtering import joint_of
 from service.tracking.registration import Purpose, Registration
 from service.tracking.state import Saved
-from service.tracking.void_intervals import BEFORE_DOUBT, BOTH_SIDES, MOVING
+from service.tracking.validity import BEFORE_DOUBT, BOTH_SIDES, MOVING
 
 NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
 """What reading a record of another version, or a damaged one, raises."""

@@ -23,7 +23,6 @@ from service.tracking import (
     dither_plan,
     mode_proof,
     validity,
-    void_intervals,
     window_processing,
 )
 from service.tracking import commands as cmd
@@ -51,7 +50,7 @@ def derive_alarms(context: StepContext) -> None:
     for alarm in context.alarms.active:
         lasts = LASTING.get(alarm.name)
         if lasts is not None and not lasts(context):
-            void_intervals.end_alarm(context, alarm.name)
+            validity.end_alarm(context, alarm.name)
     for own in context.policy.rules:
         _update(context, f"{RULE_PREFIX}{own.name}", _rule_text(context, own), _own_definition(own))
 
@@ -63,7 +62,7 @@ def _update(
     raised = context.state.alarm(name)
     if text is None:
         if raised is not None:
-            void_intervals.end_alarm(context, name)
+            validity.end_alarm(context, name)
     elif raised is None or (raised.text, raised.own) != (text, definition):
         context.raise_alarm(name, text, definition)
 

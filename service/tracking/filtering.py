@@ -15,7 +15,7 @@ from service.estimation.lockin import MAX_LAG_FRAMES
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind, Why
 from service.model.misregistration import Misregistration
-from service.tracking import mode_proof, validity, void_intervals
+from service.tracking import mode_proof, validity
 from service.tracking.alarms import Interlock, blocking_alarm
 from service.tracking.jumps import as_previous
 from service.tracking.policy import SECOND_NS, Policy
@@ -31,7 +31,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.void_intervals import TelemetrySpan
+from service.tracking.validity import TelemetrySpan
 
 MODES_KEPT = 64
 """More than any dither plays at once: of those measured longest ago the rest is forgotten."""
@@ -157,7 +157,7 @@ class FilterUpdate:
 def predict(context: StepContext, registration: Registration, t_ns_utc: int) -> Joint:
     """Return what is known at a time of the RTC's clock, drift and flexure since then added."""
     elapsed_ns = t_ns_utc - registration.t_ns_utc
-    if elapsed_ns < -void_intervals.CLOCK_SET_BACK_S * SECOND_NS:
+    if elapsed_ns < -validity.CLOCK_SET_BACK_S * SECOND_NS:
         # a clock that was set back, or another night played again: the service's own must do
         elapsed_ns = context.now_ns - registration.arrived_ns_utc
     policy = context.policy
@@ -240,7 +240,7 @@ def accept(
     validity.store_registration(context, registration)
     context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
     if not doubted:
-        void_intervals.make_valid(context, Purpose.SETTLE)
+        validity.make_valid(context, Purpose.SETTLE)
         validity.end_window_request(context)
     add_history(context, history_entry(measured, registration, update.innovation))
     validity.age_registration(context)
@@ -257,7 +257,7 @@ def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpa
         return False
     if update.jumped:
         when = replace(when, began_ns_utc=when.ended_ns_utc)
-    return void_intervals.why_void(state, when, Purpose.SETTLE) is not None
+    return validity.why_void(state, when, Purpose.SETTLE) is not None
 
 
 def _jumped_ns_utc(
@@ -371,6 +371,6 @@ def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:
     """Return why telemetry taken then, or any that comes now, measures nothing; None: it does."""
     alarm = blocking_alarm(state.alarms.active, Interlock.MEASURE)
     if alarm is None:
-        because = void_intervals.why_void(state, when)
+        because = validity.why_void(state, when)
         return because and f"{because} when it was taken: its telemetry is no measurement"
     return f"{alarm.definition.because}: its telemetry is no measurement"

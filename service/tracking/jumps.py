@@ -22,8 +22,7 @@ from service.tracking.registration import (
     Registration,
     TimedEstimate,
 )
-from service.tracking.validity import flexure
-from service.tracking.void_intervals import CLOCK_SET_BACK_S
+from service.tracking.validity import CLOCK_SET_BACK_S, flexure
 
 STEADY_S = 60.0
 """The drift of a minute is what the settings tell: over less it is that share of it."""

@@ -23,7 +23,7 @@ from service.tracking.registration import Offload, OffloadState, Purpose, Regist
 from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.update_policy import is_settled
-from service.tracking.void_intervals import MOVING, end_of, make_valid, void_until
+from service.tracking.validity import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
 DISOBEDIENCE = 0.3

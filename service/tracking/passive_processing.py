@@ -16,7 +16,7 @@ from service.estimation.estimate import PassiveEstimate
 from service.estimation.kalman import Joint
 from service.estimation.loop import loop_numbers, same_numbers
 from service.model.misregistration import Misregistration
-from service.tracking import alarms, filtering, jumps, validity, void_intervals
+from service.tracking import alarms, filtering, jumps, validity
 from service.tracking import events as ev
 from service.tracking.dither_plan import why_no_dither
 from service.tracking.registration import (
@@ -31,7 +31,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.void_intervals import BOTH_SIDES, TelemetrySpan
+from service.tracking.validity import BOTH_SIDES, TelemetrySpan
 
 Array = NDArray[Any]
 
@@ -116,7 +116,7 @@ def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str |
     if event.loop and of_loop and not same_numbers(event.loop, of_loop):
         return "the loop has changed since"
     return filtering.why_no_measurement(
-        state, void_intervals.telemetry_span(event.began_ns_utc, event.t_ns_utc)
+        state, validity.telemetry_span(event.began_ns_utc, event.t_ns_utc)
     )
 
 
@@ -125,10 +125,10 @@ def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | No
     registration = state.alpha.registration
     if registration is None or not registration.window_began_ns_utc:
         return None
-    since = void_intervals.telemetry_span(
+    since = validity.telemetry_span(
         registration.window_began_ns_utc, registration.window_began_ns_utc
     )
-    if void_intervals.precedes(state, since, event.t_ns_utc):
+    if validity.precedes(state, since, event.t_ns_utc):
         return None
     return "a dithered window taken since has been fitted before it"
 
@@ -199,7 +199,7 @@ def _why_of_two_places(
     bias = registration.bias(event.estimate.bias)
     began_ns = 0 if bias is None else bias.looked_ns_utc
     span = TelemetrySpan(began_ns_utc=began_ns, ended_ns_utc=event.t_ns_utc)
-    return void_intervals.why_void(state, span, Purpose.PASSIVE)
+    return validity.why_void(state, span, Purpose.PASSIVE)
 
 
 def _ask_for_window(
@@ -229,7 +229,7 @@ def _ask_for_window(
     biases = _biases_after_look(context.state, registration, gone, event)
     doubted = replace(after, biases=biases, doubt=text, doubt_voids=void)
     validity.store_registration(context, doubted)
-    void_intervals.cast_doubt(context, event.t_ns_utc)
+    validity.cast_doubt(context, event.t_ns_utc)
     context.warn("registration.passive-jump", f"{text} (innovation {far:.0f}, expected 4)")
     validity.request_window(context, text)
     if why_none is not None or was_doubted:

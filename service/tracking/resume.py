@@ -20,8 +20,12 @@ from service.tracking.reconstructors import prune
 from service.tracking.registration import without_previous
 from service.tracking.state import Orders, Saved, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.validity import age_registration, forget_registration, restore_registration
-from service.tracking.void_intervals import restore_intervals
+from service.tracking.validity import (
+    age_registration,
+    forget_registration,
+    restore_intervals,
+    restore_registration,
+)
 
 CLOCKS_AGREE_S = 60.0
 """A state from further in the future than this was saved under another clock."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation.loop import loop_numbers, same_loop, same_numbers
-from service.tracking import alarms, dither, mode_proof, reconstructors, validity, void_intervals
+from service.tracking import alarms, dither, mode_proof, reconstructors, validity
 from service.tracking import events as ev
 from service.tracking.events import Effect
 from service.tracking.operator import end_ramp
@@ -112,7 +112,7 @@ def _drop_other_basis(context: StepContext) -> None:
 def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
     reconstructors.forget_session(context)
-    void_intervals.invalidate_telemetry(context, "the RTC was in another session")
+    validity.invalidate_telemetry(context, "the RTC was in another session")
     dither.forget_dither(context)
     end_ramp(context)
     validity.require_new_windows(context)

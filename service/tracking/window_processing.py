@@ -19,7 +19,7 @@ from service.estimation.kalman import Joint
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind
 from service.model.misregistration import step_text
-from service.tracking import alarms, filtering, jumps, validity, void_intervals
+from service.tracking import alarms, filtering, jumps, validity
 from service.tracking import events as ev
 from service.tracking.alarms import Interlock
 from service.tracking.dither import note_found
@@ -37,7 +37,7 @@ from service.tracking.registration import (
 )
 from service.tracking.state import Level
 from service.tracking.step_context import StepContext, same_but_for_numbers
-from service.tracking.void_intervals import BOTH_SIDES
+from service.tracking.validity import BOTH_SIDES
 
 Array = NDArray[Any]
 
@@ -57,18 +57,18 @@ AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
 def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     """Fold one window's estimate into the registration, or refuse it with its reason."""
     estimate = event.estimate
-    when = void_intervals.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+    when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
     why = filtering.why_no_window(context, estimate, when)
     if why is not None:
         kind, reason = why
         reject_window(context, reason, kind)
         return
     context.windows = replace(context.windows, run=max(context.windows.run, 0) + 1)
-    if void_intervals.is_since_alarm(context.state, alarms.DITHER_LOST, when):
+    if validity.is_since_alarm(context.state, alarms.DITHER_LOST, when):
         note_found(context)
     random = isinstance(estimate, RandomEstimate)
     for name in (alarms.MISALIGNED, *(() if random else (alarms.WRONG_ANSWER,))):
-        if void_intervals.is_since_alarm(context.state, name, when):
+        if validity.is_since_alarm(context.state, name, when):
             context.clear_alarm(name)
     registration = context.registration
     modes, gains, gain_sigma = filtering.gains_of(estimate)
@@ -133,7 +133,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
             _suspect_jump(context, registration, measured, both, first)
         return
     far = jumps.window_innovation(registration, measured, context.policy)
-    too_early = void_intervals.why_void(context.state, measured.when, Purpose.SETTLE)
+    too_early = validity.why_void(context.state, measured.when, Purpose.SETTLE)
     if too_early is not None and not far.is_outlier:
         _note_refusal(context, too_early)
         return
@@ -191,7 +191,7 @@ def _suspect_jump(
     validity.store_registration(
         context, replace(registration, doubt=doubt, doubt_voids=True, suspected_jump=candidate)
     )
-    void_intervals.cast_doubt(context, measured.t_ns_utc)
+    validity.cast_doubt(context, measured.t_ns_utc)
     filtering.add_history(
         context, filtering.history_entry(measured, registration, innovation, entered=False)
     )
@@ -226,7 +226,7 @@ def _jump(
         jumped=True,
     )
     validity.store_registration(context, registration)
-    void_intervals.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
+    validity.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
     both = whole and registration.suspected_jump is not None
     filtering.accept(context, update, measured, n_accepted=2 if both else 1)
     context.warn(

@@ -20,7 +20,7 @@ from service.estimation.loop import NO_RTC
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
-from service.tracking import validity, void_intervals
+from service.tracking import validity
 from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import request_dither, request_stop, stop_running_dither
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
@@ -181,7 +181,7 @@ def begin_acquisition(context: StepContext, rtc: Status, *, why: str, commanded:
             cause=context.cause,
         ),
     )
-    void_intervals.invalidate_telemetry(context, "the acquisition had not begun")
+    validity.invalidate_telemetry(context, "the acquisition had not begun")
     validity.forget_registration(context)
     forget_verdict(context)
 
@@ -294,7 +294,7 @@ def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = Fa
         most = half_of_modes(acquisition.n_modes)
         limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
-    void_intervals.invalidate_telemetry(context, "the acquisition had not begun anew")
+    validity.invalidate_telemetry(context, "the acquisition had not begun anew")
     stop_running_dither(context)
     validity.forget_registration(context)
     set_acquisition(
@@ -369,8 +369,8 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
     """Take over where a window puts the mirror, or hold it against where another one did."""
     rtc, before, estimate = context.rtc, context.acquisition, event.found.estimate
     if (
-        void_intervals.why_void(
-            context.state, void_intervals.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
+        validity.why_void(
+            context.state, validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
         )
         is not None
     ):

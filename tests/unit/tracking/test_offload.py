@@ -17,7 +17,7 @@ from service.tracking.policy import Offloading
 from service.tracking.registration import OffloadState, Purpose, Validity
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode
-from service.tracking.void_intervals import MOVING, end_of
+from service.tracking.validity import MOVING, end_of
 from service.wire import OffloadRequest, Reply
 from tests.states import changed, tracker_state
 from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, moved, rtc

@@ -2,9 +2,9 @@
 
 import pytest
 
-from service.tracking import void_intervals
+from service.tracking import validity
 from service.tracking.registration import Purpose
-from service.tracking.void_intervals import (
+from service.tracking.validity import (
     INTERVALS_KEPT,
     KEPT_S,
     TelemetrySpan,
@@ -79,6 +79,6 @@ def test_a_clock_that_was_set_back_makes_nothing_void(ahead_s, is_void):
 def test_telemetry_until_now_is_void_by_the_rtcs_clock_or_by_what_is_known_better():
     now = turned(STATE, invalidate_telemetry, "one")
     better = turned(STATE, invalidate_telemetry, "one", t_ns_utc=START_NS + SECOND)
-    assert void_intervals.end_of(now, "one") == START_NS
-    assert void_intervals.end_of(better, "one") == START_NS + SECOND
-    assert void_intervals.end_of(changed(now, void_intervals=()), "one") == 0
+    assert validity.end_of(now, "one") == START_NS
+    assert validity.end_of(better, "one") == START_NS + SECOND
+    assert validity.end_of(changed(now, void_intervals=()), "one") == 0

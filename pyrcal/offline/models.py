@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.estimation.models import LowOrder, coarse_sampling, low_order_of
+from service.estimation.orientation import LowOrder, coarse_sampling, low_order_of
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, Stop

@@ -1,6 +1,6 @@
 """``python -m pyrcal.offline.uploaded FOLDER``: the process of an uploaded fit.
 
-Nothing large is imported before the process is nice and knows how much memory it may have.
+Nothing large is imported before the process is nice.
 """
 
 from __future__ import annotations
@@ -16,14 +16,19 @@ from service.files.fit_folder import FitRequest, read_request
 
 DONE, FAILED = 0, 2
 
+ROOM_BYTES = 48_000_000
+"""Beyond the imports, or a fit is not begun: a buffer of BLAS for a second thread, and objects."""
+
 
 def main(folder: Path) -> int:
     """Fit the upload in the folder, and return the exit status."""
     request = read_request(folder)
-    _keep_within(request)
+    os.nice(request.nice)
+    threading.Thread(target=_follow_service, daemon=True).start()
     try:
         from pyrcal.offline.fit_upload import fit_upload
 
+        _limit_memory(request.memory_mb * 1_000_000)
         fit_upload(folder, request)
     except PyrcalError as error:
         return _failed(str(error))
@@ -34,12 +39,28 @@ def main(folder: Path) -> int:
     return DONE
 
 
-def _keep_within(request: FitRequest) -> None:
-    """Be as nice as asked, take no more memory, and be gone when the service is gone."""
-    os.nice(request.nice)
-    most_bytes = request.memory_mb * 1_000_000
+def _limit_memory(most_bytes: int) -> None:
+    """Take no more memory from now on.
+
+    Only after the imports, with BLAS's buffers taken and room for small objects: BLAS asks for
+    ever for a buffer that it cannot have, and so does CPython 3.11 for 32 bytes while it unwinds
+    its stack. An array that is too large is an error at once.
+
+    Raises
+    ------
+    MemoryError
+        If the imports have left no room.
+    """
+    import numpy as np
+    import scipy.linalg
+
+    for linalg in (np.linalg, scipy.linalg):  # each has a BLAS of its own
+        linalg.inv(np.eye(64))
+    page_bytes = resource.getpagesize()
+    taken_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5]) * page_bytes
+    if taken_bytes + ROOM_BYTES > most_bytes:
+        raise MemoryError
     resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
-    threading.Thread(target=_follow_service, daemon=True).start()
 
 
 def _follow_service() -> None:

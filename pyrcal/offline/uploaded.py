@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 
 from service.errors import PyrcalError
-from service.files.fit_folder import FitRequest, read_request
+from service.files.fit_folder import read_request
 
 DONE, FAILED = 0, 2
 

@@ -55,7 +55,7 @@ holds again shows it within a second, not after seven memories."""
 class LoopHealth(Detector):
     """Forgetting mean of how far the high modes are beyond what turbulence asks of them."""
 
-    resets = Change.SESSION | Change.OPEN | Change.MATRIX
+    resets = Change.GONE | Change.SESSION | Change.OPEN | Change.MATRIX
     unless = Mark.STANDS
     only_closed = True
 

@@ -190,6 +190,10 @@ class LastTelemetry:
             return [one for one in self._held if one.time_s >= first_s]
 
 
+_REFUSED = (OSError, RuntimeError, ValueError)
+"""What h5py raises where the disk refuses: of a flush or a close a RuntimeError."""
+
+
 class RecordingWriter:
     """Writes messages in a thread while its ``with`` block lasts; ``put`` never waits."""
 
@@ -240,7 +244,10 @@ class RecordingWriter:
         """Write what waits and close the file."""
         self._stopped.set()
         self._thread.join()
-        self._file.close()
+        try:
+            self._file.close()
+        except _REFUSED as error:
+            self._failed(error)
         _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
 
     def begin_with(self, past: Sequence[Message]) -> None:
@@ -267,12 +274,15 @@ class RecordingWriter:
             while not self._stopped.wait(FLUSH_S):
                 self._write()
             self._write()
-        except OSError as error:
-            _log.error("record.failed", file=str(self._path), reason=str(error))
-            with self._lock:
-                self.n_dropped += len(self._waiting)
-                self._waiting.clear()
-                self.trouble = str(error)
+        except _REFUSED as error:
+            self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        _log.error("record.failed", file=str(self._path), reason=str(error))
+        with self._lock:
+            self.n_dropped += len(self._waiting)
+            self._waiting.clear()
+            self.trouble = self.trouble or str(error) or type(error).__name__
 
     def _write(self) -> None:
         """Append what waits: first of what was there before the recording, bit by bit."""

@@ -316,8 +316,8 @@ class ArchiveWriter:
                 lost = self._lost
             told = _loss_text(lost) if lost else ()
             try:
-                if records or entries or estimates or samples:
-                    entries_told = (*entries, *told)
+                entries_told = (*entries, *told)
+                if records or entries_told or estimates or samples:
                     self._archive.record(tuple(records.values()), entries_told, estimates, samples)
             except StorageError:
                 raise

@@ -101,10 +101,14 @@ class Engine:
         )
 
     def begin_anew(self) -> None:
-        """Give up what the estimators have gathered; they listen from here on."""
+        """Give up what the estimators have gathered; they listen from here on.
+
+        The matrices stay: nobody hands them in again before the next swap.
+        """
         self._checked_out = None
         if self.bank is not None:
-            self.bank = EstimatorBank.of(self.bank.loop.description)
+            before, anew = self.bank.loop, EstimatorBank.of(self.bank.loop.description)
+            self.bank = replace(anew, loop=replace(anew.loop, matrices=before.matrices))
             self._follow()
 
     def post(self, event: Event, cause: str = "") -> tuple[Effect, ...]:

@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -241,13 +242,20 @@ class TelemetryRecorder:
         try:
             while True:
                 await asyncio.sleep(LOOK_S)
-                if self._recorder is not None:
-                    reason = await asyncio.to_thread(self._why_end, self._recorder)
-                    if reason is not None and self._recorder is not None:
-                        await self.end(reason)
+                await self._end_if_due()
         finally:
             if self._recorder is not None:
                 await self.end("the service was ended")
+
+    async def _end_if_due(self) -> None:
+        """End the recording under way where it is time; somebody may end it meanwhile."""
+        recorder, record = self._recorder, self._record
+        if recorder is None or record is None:
+            return
+        reason = await asyncio.to_thread(self._why_end, recorder)
+        if reason is not None:
+            with suppress(CommandError):
+                await self.end(reason, record.id)
 
     def _full(self) -> str | None:
         """Return a warning if the disk has little room, else None."""

@@ -316,6 +316,10 @@ class FitQueue:
         except errors.PyrcalError as error:
             self._put(replace(self._jobs[fit_id], state=FitState.FAILED, reason=str(error)))
             self._log.warning("fit.failed", id=fit_id, text=str(error))
+        except Exception as error:  # noqa: BLE001 - unfinished, it would hold a place for ever
+            reason = f"failed unforeseen: {error!r}"
+            self._put(replace(self._jobs[fit_id], state=FitState.FAILED, reason=reason))
+            self._log.exception("fit.failed", id=fit_id)
         finally:
             await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
 

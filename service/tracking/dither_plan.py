@@ -36,6 +36,7 @@ from service.tracking.dither_request import (
     is_own_sine,
     is_proving,
     n_lines,
+    step_of,
     total_m,
 )
 from service.tracking.policy import SECOND_NS, Policy
@@ -84,7 +85,10 @@ ALL_BESIDE, ONE_BESIDE = 0.25, 0.02
 tenth of what a strong one has, or nothing of α would be told where such a mode is another."""
 
 BESIDE_HZ = 4.0
-"""Between a weak line and a strong one."""
+"""Between a weak line and a strong one, or more where windows are short."""
+
+LINES_APART = 5.0
+"""Steps of lines between them at least: four are resolved, and lines are rounded to a step."""
 
 MIN_BESIDE = 2
 """Windows that such a dither lasts for: they name a mode, and are enough to make a matrix."""
@@ -168,11 +172,14 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
     if begun or policy.dither_frequencies_hz or np.any(window_sigma > policy.dither_sigma):
         return choice
     telling = chosen_modes(rtc, policy, choice.shunned)[: rtc.max_dither_modes]
+    if not telling:  # the RTC plays none, or none can be believed: the dither itself says so
+        return choice
     strong = clear_lines(rtc, len(telling), choice)
+    apart_hz = max(BESIDE_HZ, LINES_APART * step_of(rtc, choice.window_s))
     free = [
         line
         for line in mode_proof.lines_clear(context, rtc, choice.window_s)
-        if min(abs(line - other) for other in strong) >= BESIDE_HZ
+        if min(abs(line - other) for other in strong) >= apart_hz
     ]
     others = mode_proof.modes_beside(context, rtc, telling)
     others = others[: min(len(free), rtc.max_dither_modes - len(telling))]

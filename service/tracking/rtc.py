@@ -162,7 +162,7 @@ def on_services(context: StepContext, event: ev.ServicesMet) -> None:
     if stood_by:
         text = "the service that drove the RTC has gone: this one drives it from now on"
         context.warn("service.takes-over", text)
-    context.clear_alarm(alarms.STANDING_BY)
+    validity.end_alarm(context, alarms.STANDING_BY)
 
 
 def on_failure(context: StepContext, effect: Effect, text: str) -> None:

@@ -238,7 +238,8 @@ class StepContext:
     def log(self, name: str, text: str, level: Level = Level.INFO) -> LogEntry:
         """Add a line to the log, and return it; one that repeats is counted instead."""
         self.state = logged(self.state, name, text, self.now_ns, level, self.cause)
-        return next(line for line in reversed(self.state.log) if line.name == name)
+        lines = (line for line in reversed(self.state.log) if line.name == name)
+        return max(lines, key=lambda line: line.last_ns_utc or line.t_ns_utc)
 
     def warn(self, name: str, text: str) -> None:
         """Add a warning to the log."""

@@ -388,7 +388,8 @@ def invalidate_telemetry(context: StepContext, because: str, t_ns_utc: int = 0) 
     ``t_ns_utc`` is the RTC's clock now, where it is known better than by its status.
     """
     until_ns = max(t_ns_utc, 0 if context.rtc is None else context.rtc.t_ns)
-    void_until(context, until_ns, because)
+    if until_ns:  # else no clock is known that tells more than what is void already
+        void_until(context, until_ns, because)
 
 
 def end_alarm(context: StepContext, name: str, t_ns_utc: int = 0) -> None:

@@ -262,7 +262,7 @@ def refused_text(context: StepContext) -> str | None:
         if raised is not None and same_but_for_numbers(raised, text):
             text = raised  # one cause is one text: of each window the log tells the numbers
     elif raised is not None:
-        text = raised if run < IN_A_ROW else ""
+        text = raised if run < IN_A_ROW or _missing_text(context) else ""
     else:
         text = _missing_text(context)
     return None if not text or _is_excused(context) else text

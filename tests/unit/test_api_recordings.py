@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from types import SimpleNamespace
 
 import pytest
 
@@ -83,6 +84,41 @@ async def test_what_comes_is_kept_byte_for_byte_with_who_and_why(client, service
     ]  # fmt: skip
     twice = await client.post(f"/v1/recordings/{name}/end", json={})
     assert_problem(twice, 409, "not-now", "is not under way")
+
+
+def _refused(*_):
+    raise RuntimeError("Can't decrement id ref count (file write failed)")
+
+
+async def test_a_disk_that_refuses_ends_the_recording_and_nothing_else(
+    client, service, keeper, monkeypatch
+):
+    """As h5py says it: a flush and a close that fail are RuntimeErrors."""
+    name = await begun(client)
+    recorder = keeper.tap.recorder
+    file = recorder._file
+    monkeypatch.setattr(recorder, "_write", _refused)
+    monkeypatch.setattr(recorder, "_file", SimpleNamespace(close=_refused))
+    running = asyncio.create_task(keeper.run())
+    await ended_by_itself(client, name)
+    told = await of(client, name)
+    assert (told["state"], "file write failed" in told["reason"]) == ("stored", True)
+    assert not running.done()
+    file.close()
+    running.cancel()
+
+
+async def test_an_operator_may_end_it_while_its_time_is_up(client, keeper, monkeypatch):
+    name = await begun(client)
+    monkeypatch.setattr(keeper, "_why_end", lambda _: "")
+    async with keeper._guard:
+        ended = asyncio.create_task(keeper.end("Bob has ended it"))
+        await asyncio.sleep(0.05)
+        due = [asyncio.create_task(keeper._end_if_due()) for _ in range(2)]
+        await asyncio.sleep(0.05)
+    assert (await ended).reason == "Bob has ended it"
+    await asyncio.gather(*due)
+    assert (await of(client, name))["state"] == "stored"
 
 
 async def test_what_came_before_is_in_it_as_far_as_it_is_held(client, keeper):

@@ -5,6 +5,7 @@ import threading
 
 import pytest
 
+from service.archive import AuditEntry
 from service.errors import StorageError
 from service.runtime import archiving
 from service.runtime.archiving import ArchiveWriter
@@ -85,6 +86,15 @@ async def test_a_disk_that_refuses_for_long_loses_the_newest_and_says_how_many(
     assert kept(archive) == [0, 1, 2]
     assert recorder.waiting == 0
     assert archive.audit_trail()[-1].text.startswith("2 lines came while the disk refused")
+
+
+async def test_lines_that_were_lost_are_told_of_where_nothing_else_waits(archive, monkeypatch):
+    recorder = ArchiveWriter(archive, lambda: None, lambda event: None)
+    monkeypatch.setattr(archiving, "MAX_WAITING", 0)
+    recorder.add(AuditEntry(t_ns_utc=1, who="Ada", name="mode", text=""))
+    await recorder.flush()
+    assert archive.audit_trail()[-1].text.startswith("1 lines came while the disk refused")
+    assert recorder.waiting == 0
 
 
 class TestDemandToMoveTheImage:

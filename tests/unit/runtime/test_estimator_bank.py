@@ -6,6 +6,7 @@ import pytest
 from typing_extensions import override
 
 from service.estimation.estimator import UNMARKED, Change, Detector, LoopContext, Mark
+from service.estimation.health import LoopHealth
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
 from service.runtime.registry import REGISTRY
 from service.tracking.alarms import ALARMS
@@ -90,6 +91,14 @@ def test_blocks_of_an_open_loop_are_not_for_one_of_closed_loops():
 def test_without_an_rtc_only_those_begin_anew_that_declare_it():
     bank, _ = process_block(with_rtc(bank_of(Counter()), RTC), block(0))
     assert with_rtc(bank, None)[Counter] == bank[Counter]
+
+
+def test_a_loop_that_ran_away_is_forgotten_with_its_rtc():
+    ran_away = LoopHealth(ratio=50.0, diverging=True, absurd=True)
+    bank = with_rtc(bank_of(LoopHealth()), RTC)
+    bank = replace(bank, members=(ran_away,))
+    assert with_rtc(bank, RTC)[LoopHealth] == ran_away
+    assert with_rtc(bank, None)[LoopHealth] == LoopHealth()
 
 
 def test_each_detector_has_as_many_conditions_as_alarms():

@@ -352,9 +352,11 @@ async def test_estimators_that_break_whatever_is_posted_begin_anew(supervisor, m
             supervisor._telemetry_lock
         ):  # what is lent to somebody is not what it was when it is back
             bank = supervisor._engine.bank
-            marked = replace(bank.loop, received_ns_utc=1)
+            matrices = (("cm-1", np.ones((2, 3), np.float32)),)
+            marked = replace(bank.loop, received_ns_utc=1, matrices=matrices)
             supervisor._engine.bank = replace(bank, loop=marked)
         await until(lambda: supervisor._engine.bank.loop.received_ns_utc != 1)
+        assert supervisor._engine.bank.loop.matrices is matrices  # nobody hands them in again
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a tick was dropped" in entry.text
         assert "samples of two matrices" in entry.text

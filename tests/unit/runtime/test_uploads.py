@@ -1,6 +1,7 @@
 """The desk for fits, with jobs that only say what they were given."""
 
 import asyncio
+import errno
 import hashlib
 import sys
 import time
@@ -209,6 +210,17 @@ async def test_a_disk_that_is_full_is_said_as_such(opened, monkeypatch):
     with pytest.raises(StorageError, match="No space left on device"):
         await taken(desk)
     assert not desk.jobs()
+
+
+async def test_a_fit_whose_request_cannot_be_written_has_failed(opened, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    desk = opened()
+    monkeypatch.setattr(uploads.FitRequest, "write", full)
+    failed = await finished(desk, await taken(desk))
+    assert failed.state is FitState.FAILED
+    assert "No space left on device" in failed.reason
 
 
 async def test_a_fit_that_takes_too_long_is_stopped(opened, tmp_path):

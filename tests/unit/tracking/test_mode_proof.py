@@ -489,6 +489,21 @@ def test_a_mode_is_compared_with_those_beside_it_in_the_basis():
     assert compare(far, gains[far], np.full(16, 0.03)).keys() == set(range(25, 40))
 
 
+@pytest.mark.parametrize("told", [{"max_dither_modes": 0}, {"max_dither_modes": 1}])
+def test_an_rtc_that_plays_hardly_any_mode_is_asked_for_no_weak_lines(told):
+    world = Shown(policy=informed(), **told).pass_(4.0)
+    assert all(len(one.modes) <= 1 for one in world.asked(DitherRequest))
+
+
+def test_weak_lines_are_as_far_from_strong_ones_as_short_windows_ask():
+    window_s = 0.9
+    first = Shown(policy=informed(window_s=window_s)).asked(DitherRequest)[0]
+    assert len(first.modes) > 4
+    lines = dict(zip(first.modes, first.frequency_hz, strict=True))
+    gaps = [abs(lines[m] - lines[s]) for s in (460, 470, 480, 490) for m in lines if m != s]
+    assert min(gaps) >= 4.0 / window_s - 1e-9
+
+
 def test_where_all_modes_are_to_be_shown_the_first_dither_shows_the_free_ones_in_one_window():
     world = Shown({430: -0.6}, policy=informed(), offered=False)
     first = world.asked(DitherRequest)[0]

@@ -119,6 +119,14 @@ def test_it_ends_where_no_window_is_expected_and_does_not_begin_there(story, eve
     assert WINDOWS_REFUSED not in story.alarms
 
 
+def test_the_last_refusal_is_told_though_another_came_between_two_alike(story):
+    refuse(story, reason="edge slip")
+    refuse(story, reason="frames were lost")
+    last = refuse(story, reason="edge slip").state.windows
+    assert (last.refusal.text, last.refusal.times) == ("edge slip", 2)
+    assert last.refused_because == "edge slip"
+
+
 def test_a_dither_of_a_minute_without_any_window_is_one_as_well(story):
     accepted = dither_answered(story.state.dithers.dither.id, accepted=True, reason="", start_seq=1)
     story.tell(accepted)
@@ -127,6 +135,8 @@ def test_a_dither_of_a_minute_without_any_window_is_one_as_well(story):
     assert WINDOWS_REFUSED not in story.alarms
     for _ in range(4):
         story.tell(ev.Tick(), after_s=1.0)
-    assert "no window was accepted for 60 s although a dither runs" in text_of(story)
+    for _ in range(6):  # it does not waver, though windows had been used before
+        story.tell(ev.Tick(), after_s=1.0)
+        assert "no window was accepted for 60 s although a dither runs" in text_of(story)
     story.see(n_windows=IN_A_ROW)
     assert WINDOWS_REFUSED not in story.alarms

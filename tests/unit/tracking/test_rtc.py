@@ -64,6 +64,8 @@ def test_a_service_that_is_not_the_first_stands_by_until_the_first_has_gone(stor
     story.tell(ev.ServicesMet(drives=True, others=()))
     assert not {"second-service", "standing-by"} & story.alarms
     assert "service.takes-over" in story.logged
+    because = "another service was driving the RTC"
+    assert because in {each.because for each in story.state.alpha.void_intervals}
     story.wait(10.0)
     assert story.asked(DitherRequest)
 

@@ -329,3 +329,5 @@ def test_telemetry_until_now_is_void_by_the_rtcs_clock_or_by_what_is_known_bette
     assert validity.end_of(now, "one") == START_NS
     assert validity.end_of(better, "one") == START_NS + SECOND
     assert validity.end_of(changed(now, void_intervals=()), "one") == 0
+    gone = turned(changed(better, rtc=None), invalidate_telemetry, "one")
+    assert validity.end_of(gone, "one") == START_NS + SECOND  # no clock tells more

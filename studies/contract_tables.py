@@ -38,7 +38,7 @@ from service.wire import (
     StateMessage,
     Status,
 )
-from service.wire.codec import FourNumbers, names_of
+from service.wire.codec import FourNumbers, may_be_absent, names_of
 from service.wire.matrices import MATRIX_LIMIT
 
 Row = tuple[str, str, str, str, str, str]
@@ -70,15 +70,6 @@ PARTS: Final[dict[str, type]] = {
     "alpha": FourNumbers,
 }
 """Maps inside of messages."""
-
-MAY_BE_ABSENT: Final = {
-    ("status", "pointing"),
-    ("status", "trouble"),
-    ("im-commit", "reason"),
-    ("state", "validity"),
-    ("state", "waiting_for"),
-    ("state", "operation"),
-}
 
 _VERSION: Final = ("`v`", "int", "", "1", "no", "Version of the contract.")
 _ACTION: Final[dict[str, Row]] = {
@@ -149,7 +140,7 @@ def _rows(name: str, record: type) -> Iterator[Row]:
             yield _DTYPE
             continue
         nil = "yes" if _optional(kind) else "no"
-        if (name, key) in MAY_BE_ABSENT:
+        if key in may_be_absent(record):
             nil = "may be absent" if nil == "no" else "yes, or absent"
         yield (
             f"`{key}`",

@@ -138,8 +138,8 @@ class Form(Generic[_R]):
     first: tuple[str, ...] = ()
     """Keys that travel before the others, which follow in the order of the fields."""
 
-    extensions: tuple[str, ...] = ()
-    """Keys that came after the contract: who does not know them need not send them."""
+    may_be_absent: tuple[str, ...] = ()
+    """Keys that came after the contract, or that mean something in some messages alone."""
 
     opened: Callable[[bytes, str], Map] | None = None
     """Bytes to keys; None: a map of at most :data:`MESSAGE_LIMIT` bytes."""
@@ -208,7 +208,7 @@ def of_map(kind: type[_R], values: Map, where: str) -> _R:
         If it breaks the contract.
     """
     form: Form[_R] = _FORMS[kind]
-    record = read(form.fields(values, where), kind, where, form.extensions)
+    record = read(form.fields(values, where), kind, where, form.may_be_absent)
     form.check(record, where)
     return record
 
@@ -297,7 +297,12 @@ def names_of(kind: type[DataclassInstance]) -> tuple[str, ...]:
     return (*first, *(field.name for field in fields(kind) if field.name not in first))
 
 
-def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = ()) -> _R:
+def may_be_absent(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    """Return the keys of a record that need not be sent."""
+    return _FORMS[kind].may_be_absent if kind in _FORMS else ()
+
+
+def read(values: Map, kind: type[_R], where: str, absent: tuple[str, ...] = ()) -> _R:
     """Return the record of a map whose keys are named like the fields.
 
     Parameters
@@ -308,8 +313,8 @@ def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = 
         The record's type.
     where
         What the map is, for the text of a refusal.
-    extensions
-        Keys that came after the contract: who does not know them need not send them.
+    absent
+        Keys that need not be there.
 
     Raises
     ------
@@ -317,7 +322,7 @@ def read(values: Map, kind: type[_R], where: str, extensions: tuple[str, ...] = 
         If a key is missing or its value is not what the field's type says.
     """
     for name in names_of(kind):
-        if name not in values and name not in extensions:
+        if name not in values and name not in absent:
             get(values, name, where)
     try:
         record = msgspec.convert(values, kind, builtin_types=(bytes,))

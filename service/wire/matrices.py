@@ -189,6 +189,7 @@ codec.travels(
     MeasuredManifest,
     "the manifest of a measured matrix",
     keys=_with_keys_of_layout,
+    may_be_absent=("reason",),
     fields=_measured_fields,
     check=_check_measured,
 )

@@ -300,15 +300,14 @@ def _check_acknowledgement(ack: Acknowledgement, where: str) -> None:
 
 def _state_fields(values: codec.Map, where: str) -> codec.Map:
     four = {key: codec.read_four(values, key, where) for key in ("alpha", "sigma")}
-    absent = {"waiting_for": values.get("waiting_for") or (), "operation": values.get("operation")}
-    return {**values, **four, **absent}
+    return {**values, **four, "waiting_for": values.get("waiting_for") or ()}
 
 
 codec.travels(
     Status,
     WHERE,
     first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
-    extensions=("pointing", "trouble"),
+    may_be_absent=("pointing", "trouble"),
     opened=_opened,
     keys=_status_keys,
     fields=_status_fields,
@@ -318,6 +317,10 @@ codec.travels(
     Acknowledgement, "an acknowledgement", fields=codec.reason_or_none, check=_check_acknowledgement
 )
 codec.travels(
-    StateMessage, "a state message", extensions=("validity",), fields=_state_fields, held=False
+    StateMessage,
+    "a state message",
+    may_be_absent=("validity", "waiting_for", "operation"),
+    fields=_state_fields,
+    held=False,
 )
 codec.travels(AlarmMessage, "an alarm message", held=False)

@@ -1,4 +1,4 @@
-"""How a program of ``pyrcal`` ends and logs; the arguments of ``run`` and ``key``.
+"""How a program of ``pyrcal`` ends, logs, is found; the arguments of ``run`` and ``key``.
 
 Quick to import. What the program calls modes and scopes stands here as text; a test compares it.
 """
@@ -6,18 +6,22 @@ Quick to import. What the program calls modes and scopes stands here as text; a 
 from __future__ import annotations
 
 import argparse
+import fcntl
+import json
 import logging
 import os
 import re
 import signal
+import stat
 import sys
+import tempfile
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from typing_extensions import override
 
@@ -177,6 +181,93 @@ def log_to_terminal(*, quiet: bool = False) -> None:
     )
 
 
+# --- which services run on this machine: each leaves a note for as long as it does, locked: what is
+#     locked by nobody is of one that has ended, however it did
+
+
+class RunningService(NamedTuple):
+    """A running service, by its note."""
+
+    data_dir: Path
+    url: str
+
+
+def notes_folder() -> Path:
+    """Return where the services of this user leave their notes."""
+    own = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(own) / "pyrcal" if own else Path(tempfile.gettempdir()) / f"pyrcal-{os.getuid()}"
+
+
+@contextmanager
+def announced(data_dir: Path, url: str) -> Iterator[None]:
+    """Leave a note while the block lasts; log if the machine takes none."""
+    import structlog
+
+    folder = notes_folder()
+    path = folder / f"{os.getpid()}.json"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_own(folder):
+            raise PermissionError(f"{folder}: others may write there")
+        note = path.with_suffix(".part").open("w", encoding="utf-8")
+    except OSError as error:
+        structlog.get_logger().info("service.not-announced", text=str(error))
+        yield
+        return
+    with note:
+        fcntl.flock(note, fcntl.LOCK_EX)
+        json.dump({"data_dir": str(data_dir.absolute()), "url": url}, note)
+        note.flush()
+        Path(note.name).rename(path)  # whoever finds it finds it locked
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def running_services() -> tuple[RunningService, ...]:
+    """Return the services of this user that run now, and remove what others have left behind."""
+    folder, found = notes_folder(), []
+    if not _is_own(folder):
+        return ()
+    for path in sorted(folder.glob("*.json")):
+        with suppress(OSError, ValueError, KeyError), path.open() as note:
+            try:
+                fcntl.flock(note, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                told = json.load(note)
+                found.append(RunningService(Path(told["data_dir"]), told["url"]))
+            else:
+                path.unlink(missing_ok=True)
+    return tuple(found)
+
+
+def data_dir_of_the_one() -> Path | None:
+    """Return the folder of the only service that runs; None: none does.
+
+    Raises
+    ------
+    ConfigurationError
+        If there are several: somebody has to say which is meant.
+    """
+    every = running_services()
+    if len({one.data_dir for one in every}) > 1:
+        which = "; ".join(f"{one.data_dir} ({one.url})" for one in every)
+        raise ConfigurationError(
+            f"found {len(every)} services that run here, expected --data-dir to say which: {which}"
+        )
+    return every[0].data_dir if every else None
+
+
+def _is_own(folder: Path) -> bool:
+    """Return whether a folder exists that only this user can write into."""
+    try:
+        known = folder.stat()
+    except OSError:
+        return False
+    return known.st_uid == os.getuid() and not known.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
 # --- what run and key understand
 
 
@@ -193,7 +284,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
 
 
 def _describe_run(run: argparse.ArgumentParser) -> None:
-    run.set_defaults(module="service.cli.run")
+    run.set_defaults(module="service.cli.commands")
     run.description = (
         "Run the service. Precedence: command line > environment (PYRCAL_<SECTION>__<KEY>) > "
         "TOML file > defaults."
@@ -214,7 +305,7 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
 
 
 def _describe_key(key: argparse.ArgumentParser) -> None:
-    key.set_defaults(module="service.cli.key")
+    key.set_defaults(module="service.cli.commands")
     key.description = (
         "Make, list and revoke the keys of those who may ask a service, in its data_dir. A running "
         "service goes by them at once. docs/operate/operating.md says how a key is shown."

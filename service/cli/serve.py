@@ -20,8 +20,7 @@ from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from service.archive import Archive
-from service.cli.program import leave
-from service.cli.running import announced
+from service.cli.program import announced, leave
 from service.config import Settings
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown

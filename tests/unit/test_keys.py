@@ -12,8 +12,8 @@ import pytest
 from pyrcal.__main__ import main
 from pyrcal.terminal import login
 from service.archive import Archive
-from service.cli import key as key_command
-from service.cli.running import announced, running_services
+from service.cli.commands import DATA_DIR
+from service.cli.program import announced, running_services
 from service.config import Settings
 from service.errors import ConfigurationError, UnknownIdError
 from service.web.keys import KeyFile, KeyScope, is_loopback
@@ -212,7 +212,7 @@ def test_the_audit_trail_of_a_service_that_runs_has_who_made_and_revoked_a_key(t
 
 
 def test_keys_are_where_the_service_looks_for_them(monkeypatch, tmp_path, capsys):
-    assert Settings().service.data_dir.as_posix() == key_command.DATA_DIR
+    assert Settings().service.data_dir.as_posix() == DATA_DIR
     config = tmp_path / "pyrcal.toml"
     config.write_text('[service]\ndata_dir = "of-the-file"\n')
     add = ["key", "add", "ada", "--scope", "read"]

@@ -1,4 +1,7 @@
-"""``pyrcal key``: make, list and revoke API keys."""
+"""The service's own commands: ``run`` it; make, list and revoke the ``key`` of whoever asks it.
+
+Each imports only what it needs, and what is large when nothing can be refused any more.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,101 @@ import os
 import time
 import tomllib
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from service.cli.running import data_dir_of_the_one
+from service.cli.program import data_dir_of_the_one
 from service.errors import ArchiveError, ConfigurationError, say
-from service.web.keys import KeyFile, KeyScope
+from service.web.keys import KeyFile, KeyScope, is_loopback
+
+if TYPE_CHECKING:
+    from service.config import Settings
 
 DONE = 0
+
+
+def main(options: argparse.Namespace) -> int:
+    """Do what a command line asks for; return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        If it cannot be done; nothing is changed then.
+    """
+    return (_run if options.command == "run" else _key)(options)
+
+
+# --- run
+
+
+_OPTIONS = {
+    "instrument": "service.instrument",
+    "mode": "service.mode",
+    "data_dir": "service.data_dir",
+    "listen": "zenoh.listen",
+    "connect": "zenoh.connect",
+    "host": "api.host",
+    "port": "api.port",
+    "log_format": "service.log_format",
+}
+"""Command-line options that stand for a settings key."""
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run the service until it is asked to stop; return the exit status."""
+    from service.config import load_settings
+
+    given = {
+        key: getattr(options, option)
+        for option, key in _OPTIONS.items()
+        if getattr(options, option) is not None
+    }
+    for key in ("zenoh.listen", "zenoh.connect"):
+        if key in given:
+            given[key] = [given[key]]
+    settings = load_settings(options.config, os.environ, given)
+    from service.config.instrument_schema import read_instrument_file
+
+    read_instrument_file(settings.service.instrument)
+    _check_that_a_key_can_operate(settings)
+    # from here on each import takes its time: the worker's first, so that it imports beside them
+    from service.runtime.processes import Worker
+
+    early = Worker().begin() if options.own_process else Worker()
+    from service.config import load_instrument
+    from service.config.policy import compute_of
+    from service.runtime.worker import start_worker
+
+    instrument, compute = load_instrument(settings.service.instrument), compute_of(settings)
+    start_worker(instrument, compute, early)
+    from service.cli.serve import run
+    from service.runtime.workers import WorkerPool
+
+    workers = WorkerPool(partial(start_worker, instrument, compute), early)
+    return run(settings, instrument, workers)
+
+
+def _check_that_a_key_can_operate(settings: Settings) -> None:
+    """Refuse to serve other machines before there is a key to give orders with.
+
+    Raises
+    ------
+    ConfigurationError
+        If it would be, or the keys there are cannot be read.
+    """
+    host, keys = settings.api.host, KeyFile(settings.service.data_dir)
+    can_operate = any(key.scope.covers(KeyScope.OPERATE) for key in keys.all())
+    if not can_operate and not is_loopback(host):
+        raise ConfigurationError(
+            f"api.host: found {host}, which other machines can reach, and in {keys.path} no key "
+            f"of scope operate or admin; make one first: pyrcal key add NAME --scope operate "
+            f"--data-dir {settings.service.data_dir}"
+        )
+
+
+# --- key
+
 
 DATA_DIR = "var"
 """The settings' own default; reading all of them would take three times as long."""
@@ -29,7 +120,7 @@ _WITHOUT = {
 """What that means, by whether there is a file."""
 
 
-def main(options: argparse.Namespace) -> int:
+def _key(options: argparse.Namespace) -> int:
     """Do what is asked with the file of keys; return the exit status.
 
     Raises

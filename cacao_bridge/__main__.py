@@ -22,8 +22,7 @@ from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
 from pyrcal.terminal import print_lines
 from service.cli.program import leave, log_to_terminal, status_of, stop_signal
-from service.wire import FrameHeader, Keys, encode
-from service.wire.frames import encode_frames
+from service.wire import FrameHeader, Keys, encode, encode_frames
 from sim_rtc.computer.feed import Background
 from sim_rtc.link.matrices import Matrices
 from sim_rtc.link.replies import Replies

@@ -19,6 +19,7 @@ from cacao_bridge.streams import GoneError, Stream, StreamError, path_of, settle
 from service.wire import (
     Command,
     DitherRequest,
+    DitherStatus,
     DitherStop,
     FrameHeader,
     Loop,
@@ -27,7 +28,6 @@ from service.wire import (
     Status,
 )
 from service.wire.codec import TEXT_LIMIT
-from service.wire.status import DitherStatus
 from sim_rtc.computer.measure import Measurement
 from sim_rtc.computer.reconstructors import Terms
 from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session

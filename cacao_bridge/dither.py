@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from cacao_bridge.streams import Stream, StreamError
-from service.wire import DitherRequest
-from service.wire.status import DitherStatus
+from service.wire import DitherRequest, DitherStatus
 from sim_rtc.computer.feed import Background
 
 Array32 = NDArray[np.float32]

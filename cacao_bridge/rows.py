@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire.frames import BATCH_LIMIT, FRAMES_PER_BATCH
+from service.wire import BATCH_LIMIT, FRAMES_PER_BATCH
 
 Array32 = NDArray[np.float32]
 

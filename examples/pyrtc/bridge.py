@@ -7,6 +7,7 @@ import numpy as np
 
 from service.wire import (
     DitherRequest,
+    DitherStatus,
     DitherStop,
     FrameHeader,
     Keys,
@@ -18,7 +19,6 @@ from service.wire import (
     encode,
     encode_frames,
 )
-from service.wire.status import DitherStatus
 from sim_rtc.computer.reconstructors import Terms
 from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session
 from sim_rtc.link.matrices import Matrices

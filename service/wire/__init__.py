@@ -25,18 +25,11 @@ from service.wire.commands import (
     command_kind,
     decode_command,
 )
-from service.wire.frames import (
-    ATTACHMENT_LIMIT,
-    BATCH_LIMIT,
-    FRAMES_PER_BATCH,
-    FrameBatch,
-    FrameHeader,
-    decode_frames,
-    encode_frames,
-)
 from service.wire.keys import Encodings, Keys, Role, checked_id, chunk_index
 from service.wire.matrices import (
     CHUNK_LIMIT,
+    Acknowledgement,
+    AckState,
     ChunkAssembler,
     Manifest,
     MatrixLayout,
@@ -45,15 +38,20 @@ from service.wire.matrices import (
     layout_of,
     split,
 )
-from service.wire.status import (
+from service.wire.telemetry import (
+    ATTACHMENT_LIMIT,
+    BATCH_LIMIT,
+    FRAMES_PER_BATCH,
     STATUS_LIMIT,
-    Acknowledgement,
-    AckState,
     AlarmMessage,
     ControlLaw,
     DitherStatus,
+    FrameBatch,
+    FrameHeader,
     Pointing,
     StateMessage,
     Status,
+    decode_frames,
+    encode_frames,
     essentials,
 )

@@ -1,4 +1,4 @@
-"""Matrices as manifests and parts."""
+"""Matrices: manifests, parts, acknowledgements."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from typing import Annotated, Final
 
 import numpy as np
@@ -135,6 +136,37 @@ class MeasuredManifest:
     """When it was measured, nanoseconds since the Unix epoch, UTC."""
 
 
+class AckState(StrEnum):
+    """Progress of a reconstructor in the RTC."""
+
+    STAGED = "staged"
+    APPLIED = "applied"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acknowledgement:
+    """The RTC's word on one reconstructor."""
+
+    session: codec.Opaque
+    """The RTC's, as in the frames: an acknowledgement of another session is ignored."""
+
+    id: codec.Id | None
+    """None: the commit that is rejected could not be read."""
+
+    sha256: codec.Sha256 | None
+    """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
+
+    state: AckState
+    """How far it has come."""
+
+    reason: codec.Text
+    """Why it was rejected; empty otherwise."""
+
+    frame_seq: codec.Count | None
+    """First frame whose slopes the new matrix multiplies; None unless applied."""
+
+
 def _with_keys_of_layout(keys: codec.Map) -> codec.Map:
     layout = asdict(keys.pop("layout"))
     return {**keys, "dtype": DTYPE, **layout}
@@ -160,6 +192,13 @@ def _check_measured(manifest: MeasuredManifest, where: str) -> None:
     if len(manifest.amplitude_m) != n_modes or (layout.n_chunks and n_modes != layout.shape[1]):
         expected = f"one for each of {layout.shape[1]} measured modes"
         raise codec.refusal("amplitude_m", manifest.amplitude_m, expected, where)
+
+
+def _check_acknowledgement(ack: Acknowledgement, where: str) -> None:
+    if (ack.frame_seq is not None) != (ack.state is AckState.APPLIED):
+        raise codec.refusal("frame_seq", ack.frame_seq, "a number if and only if applied", where)
+    if ack.state is not AckState.REJECTED and (ack.id is None or ack.sha256 is None):
+        raise codec.refusal("id, sha256", (ack.id, ack.sha256), "both, unless rejected", where)
 
 
 def _with_layout(values: codec.Map, where: str, *, may_fail: bool = False) -> codec.Map:
@@ -192,6 +231,9 @@ codec.travels(
     may_be_absent=("reason",),
     fields=_measured_fields,
     check=_check_measured,
+)
+codec.travels(
+    Acknowledgement, "an acknowledgement", fields=codec.reason_or_none, check=_check_acknowledgement
 )
 
 

@@ -1,11 +1,13 @@
-"""Status of RTC, reconstructors and service."""
+"""What is told again and again: frames and status by the RTC, state and alarms by the service.
+
+A batch of frames is a msgpack attachment and raw float32 rows; the others are msgpack maps.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from enum import StrEnum
 from itertools import compress
 from typing import Annotated, Final
 
@@ -15,10 +17,166 @@ from numpy.typing import NDArray
 from service.errors import WireError
 from service.wire import codec, commands
 
+# --- frames
+
+
+BATCH_LIMIT: Final = 4_000_000
+"""Bytes: a longer payload is refused unread."""
+
+ATTACHMENT_LIMIT: Final = 4096
+"""Bytes: a longer attachment is refused unread."""
+
+FRAMES_PER_BATCH: Final = 50
+"""Most frames in one batch."""
+
+COLUMN_LIMIT: Final = BATCH_LIMIT // 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameHeader:
+    """Description of a batch's rows."""
+
+    session: codec.Opaque
+    """New when the RTC starts, or its sequence or integrator starts over."""
+
+    seq0: Annotated[int, codec.integer(high=2**62)]
+    """Sequence number of row 0; row i is ``seq0 + i``."""
+
+    n: Annotated[int, codec.integer(1, FRAMES_PER_BATCH)]
+    """Rows, 1..50."""
+
+    t0_ns: Annotated[int, codec.integer(high=2**62)]
+    """End of exposure of row 0, nanoseconds since the Unix epoch, UTC."""
+
+    dt_ns: Annotated[int, codec.integer(1, 10**12)]
+    """Nominal frame period, nanoseconds."""
+
+    n_slopes: Annotated[int, codec.integer(1, COLUMN_LIMIT)]
+    """Slopes of a row."""
+
+    n_modes: Annotated[int, codec.integer(1, COLUMN_LIMIT)]
+    """Commands of a row: the whole basis, controlled or not."""
+
+    dither: bool
+    """Whether each row ends with the dither's share of its commands."""
+
+    cm_id: codec.Id | None
+    """The reconstructor that multiplies these slopes; None when the RTC does not know."""
+
+    basis_id: codec.Opaque
+    """Of the modal basis; changes with modes, order and scale."""
+
+    config_id: codec.Opaque
+    """Of the sensor; changes with mask, slope recipe, reference slopes, binning, modulation."""
+
+    @property
+    def n_columns(self) -> int:
+        """Floats of a row: slopes, commands and, if there, the dither."""
+        return self.n_slopes + self.n_modes * (2 if self.dither else 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameBatch:
+    """Consecutive frames as they travel.
+
+    Row k holds the slopes and the command that was on the mirror during the exposure that made
+    them; the arrays are read-only views of the received bytes.
+    """
+
+    header: FrameHeader
+    """What the rows mean."""
+
+    rows: NDArray[np.float32]
+    """``(n, n_columns)``: slopes | commands | dither, if there."""
+
+    @property
+    def slopes(self) -> NDArray[np.float32]:
+        """``(n, n_slopes)``, in the RTC's own order and sign."""
+        return self.rows[:, : self.header.n_slopes]
+
+    @property
+    def commands_m(self) -> NDArray[np.float32]:
+        """``(n, n_modes)``: total modal command, dither included, metres OPD."""
+        return self.rows[:, self.header.n_slopes : self.header.n_slopes + self.header.n_modes]
+
+    @property
+    def dither_m(self) -> NDArray[np.float32] | None:
+        """``(n, n_modes)``: the dither's share, metres OPD; None without dither."""
+        if not self.header.dither:
+            return None
+        return self.rows[:, self.header.n_slopes + self.header.n_modes :]
+
+
+def encode_frames(header: FrameHeader, rows: NDArray[np.float32]) -> tuple[bytes, bytes]:
+    """Return payload and attachment of one batch.
+
+    Parameters
+    ----------
+    header
+        What the rows mean.
+    rows
+        ``(n, n_columns)``: slopes | commands in metres | the dither's share if ``header.dither``.
+
+    Raises
+    ------
+    WireError
+        If the rows are not what the header says, or the batch is longer than the limit.
+    """
+    if rows.shape != (header.n, header.n_columns):
+        raise WireError(
+            f"range: frame rows have shape {rows.shape}, expected {(header.n, header.n_columns)}"
+        )
+    payload = np.ascontiguousarray(rows, dtype="<f4").tobytes()
+    attachment = codec.encode(header)
+    _check_sizes(payload, header)
+    return payload, attachment
+
+
+def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
+    """Return the batch; its rows are a view of ``payload``, nothing is copied.
+
+    The values are not looked at: a frame with a NaN costs one frame, not its batch.
+
+    Raises
+    ------
+    WireError
+        If attachment or payload break the contract or do not fit together.
+    """
+    if attachment is None:
+        raise WireError("missing: attachment of a frame batch")
+    if len(payload) > BATCH_LIMIT:
+        raise WireError(
+            f"range: a frame batch has {len(payload)} bytes, expected at most {BATCH_LIMIT}"
+        )
+    header = codec.decode(FrameHeader, attachment)
+    _check_sizes(payload, header)
+    rows = np.frombuffer(payload, dtype="<f4").reshape(header.n, header.n_columns)
+    return FrameBatch(header=header, rows=rows)
+
+
+codec.travels(
+    FrameHeader,
+    "the attachment of a frame batch",
+    opened=lambda data, where: codec.unpack(data, where, ATTACHMENT_LIMIT),
+)
+
+
+def _check_sizes(payload: bytes, header: FrameHeader) -> None:
+    expected = 4 * header.n * header.n_columns
+    if len(payload) != expected or expected > BATCH_LIMIT:
+        raise WireError(
+            f"range: a frame batch has {len(payload)} bytes, expected {expected} for {header.n} "
+            f"rows of {header.n_columns} float32, at most {BATCH_LIMIT}"
+        )
+
+
+# --- status, state, alarms
+
+
 STATUS_LIMIT: Final = codec.MESSAGE_LIMIT + 16 * 512**2
 """Bytes: a longer status is refused unread; its images come on top of what a message may have."""
 
-WHERE: Final = "a status"
+A_STATUS: Final = "a status"
 
 ESSENTIAL: Final = (
     "session",
@@ -152,37 +310,6 @@ class Status(ControlLaw):
         return np.frombuffer(self.flux, dtype="<f4").reshape(4, side, side)
 
 
-class AckState(StrEnum):
-    """Progress of a reconstructor in the RTC."""
-
-    STAGED = "staged"
-    APPLIED = "applied"
-    REJECTED = "rejected"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Acknowledgement:
-    """The RTC's word on one reconstructor."""
-
-    session: codec.Opaque
-    """The RTC's, as in the frames: an acknowledgement of another session is ignored."""
-
-    id: codec.Id | None
-    """None: the commit that is rejected could not be read."""
-
-    sha256: codec.Sha256 | None
-    """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
-
-    state: AckState
-    """How far it has come."""
-
-    reason: codec.Text
-    """Why it was rejected; empty otherwise."""
-
-    frame_seq: codec.Count | None
-    """First frame whose slopes the new matrix multiplies; None unless applied."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateMessage:
     """The service's state for all subscribers; an RTC ignores it."""
@@ -245,7 +372,7 @@ def essentials(data: bytes) -> tuple[object, ...]:
     WireError
         If the message is no map, or too long.
     """
-    values = _opened(data, WHERE)
+    values = _opened(data, A_STATUS)
     return tuple(values.get(key) for key in ESSENTIAL)
 
 
@@ -291,13 +418,6 @@ def _check_status(status: Status, where: str) -> None:
         raise codec.refusal("flux", flux, "bytes of four square float32 images", where)
 
 
-def _check_acknowledgement(ack: Acknowledgement, where: str) -> None:
-    if (ack.frame_seq is not None) != (ack.state is AckState.APPLIED):
-        raise codec.refusal("frame_seq", ack.frame_seq, "a number if and only if applied", where)
-    if ack.state is not AckState.REJECTED and (ack.id is None or ack.sha256 is None):
-        raise codec.refusal("id, sha256", (ack.id, ack.sha256), "both, unless rejected", where)
-
-
 def _state_fields(values: codec.Map, where: str) -> codec.Map:
     four = {key: codec.read_four(values, key, where) for key in ("alpha", "sigma")}
     return {**values, **four, "waiting_for": values.get("waiting_for") or ()}
@@ -305,16 +425,13 @@ def _state_fields(values: codec.Map, where: str) -> codec.Map:
 
 codec.travels(
     Status,
-    WHERE,
+    A_STATUS,
     first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
     may_be_absent=("pointing", "trouble"),
     opened=_opened,
     keys=_status_keys,
     fields=_status_fields,
     check=_check_status,
-)
-codec.travels(
-    Acknowledgement, "an acknowledgement", fields=codec.reason_or_none, check=_check_acknowledgement
 )
 codec.travels(
     StateMessage,

@@ -18,15 +18,12 @@ from service.web import (
     archive,
     authentication,
     commands,
-    fits,
-    health,
     history,
     matrices,
-    numbers,
+    measured,
     page,
     problems,
-    reading,
-    stream,
+    state,
 )
 from service.web.authentication import Authentication, Hosts
 from service.web.connections import Idempotency, RequestId, Server, Unchanged
@@ -95,8 +92,8 @@ def create_app(
     app.state.service = service
     app.state.keys = keys
     app.state.bodies = set()
-    app.state.slopes = numbers.SlopesCache()
-    app.state.stream = stream.Stream(service, over or asyncio.Event())
+    app.state.slopes = page.SlopesCache()
+    app.state.stream = page.Stream(service, over or asyncio.Event())
     problems.install(app)
     page.install(app)
     if desk is not None:
@@ -109,21 +106,19 @@ def _routes(*, with_fits: bool) -> list[BaseRoute]:
     """Return what is answered where; FastAPI takes a tenth of a second to work that out."""
     shared = APIRouter(generate_unique_id_function=_operation_id, responses=problems.EVERYWHERE)
     routers = [
-        reading.router,
-        numbers.router,
+        state.router,
+        matrices.router,
         archive.router,
         history.router,
         history.notes,
-        stream.router,
         page.router,
-        matrices.refits,
         commands.router,
-        matrices.router,
-        matrices.noisy,
-        health.router,
+        measured.router,
+        measured.noisy,
+        state.health,
         authentication.router,
     ]
-    for router in [*routers, fits.router] if with_fits else routers:
+    for router in [*routers, measured.fits] if with_fits else routers:
         shared.include_router(router)
     return shared.routes
 

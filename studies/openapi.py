@@ -28,7 +28,7 @@ from service.api import create_app
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime import telemetry_recorder
 from service.tracking import commands
-from service.web import numbers, problems
+from service.web import matrices, problems
 from service.web.authentication import OPEN, SCHEMES, needs, scope_of
 from service.web.commands import JSON, Body
 from service.web.connections import NOT_MODIFIED
@@ -108,7 +108,7 @@ def _tell_operation(method: str, operation: dict[str, Any], known: dict[str, Any
         answers["304"] = NOT_MODIFIED
 
 
-_HAVE_TAGS = {"application/json", *numbers.MEDIA_TYPES.values()}
+_HAVE_TAGS = {"application/json", *matrices.MEDIA_TYPES.values()}
 """Kinds of answers with an ETag."""
 
 _LOCATION = {

@@ -24,12 +24,13 @@ from starlette.datastructures import MutableHeaders
 
 from service.archive import Actor
 from service.errors import StaleError, UntaggedError
+from service.runtime.command_results import RefitJob
 from service.runtime.supervisor import Supervisor
 from service.tracking import commands as instructions
 from service.tracking.commands import Instruction
 from service.tracking.events import new_id
 from service.tracking.state import TrackerState
-from service.web import keys, numbers, views
+from service.web import keys, matrices, measured, views
 from service.web.authentication import actor_of, needs
 from service.web.problems import COMMAND, DECISION, INVALID, UNKNOWN
 
@@ -337,17 +338,15 @@ _SHOWN: Mapping[str, Callable[[TrackerState, str], Response]] = {
 # --- the routes
 
 
-MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
-NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
 RefitId = Annotated[str, Path(alias="id", max_length=128, description="Id of a refit")]
 _AlarmName = Annotated[str, Path(alias="name", max_length=128)]
 
 _NAMED: Mapping[str, Any] = {
-    "reconstructors": numbers.MatrixId,
+    "reconstructors": matrices.MatrixId,
     "alarms": _AlarmName,
     "values": _AlarmName,
-    "measurements": MeasurementId,
-    "noisy-matrix": NoisyId,
+    "measurements": measured.MeasurementId,
+    "noisy-matrix": measured.NoisyId,
 }
 """How a path names what an order is about, by what that is."""
 
@@ -392,3 +391,12 @@ def _add(name: str, order: OrderRoute) -> None:
 
 for _name, _order in ORDERS.items():
     _add(_name, _order)
+
+
+REFIT = views.define_view("RefitView", RefitJob)
+
+
+@router.get("/v1/refits/{id}", tags=["orders"], responses={200: views.shows(REFIT), **UNKNOWN})
+async def refit_job(service: views.ServiceDep, refit_id: RefitId) -> Response:
+    """Return the progress of a refit, and the reconstructor it has made."""
+    return views.answer(service.refits.job(refit_id))

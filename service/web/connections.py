@@ -12,7 +12,7 @@ import hashlib
 import re
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
@@ -20,6 +20,7 @@ from uuid import uuid4
 
 import uvicorn
 from fastapi import Request, Response
+from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars
@@ -387,6 +388,16 @@ def not_modified(request: Request, tag: str) -> Response | None:
         return None
     headers = {"ETag": tag, "Cache-Control": _KEPT}
     return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+
+
+async def unless_kept(request: Request, tag: str, make: Callable[[], Response]) -> Response:
+    """Return what a thread makes, with its ETag; nothing is made for a client that has it."""
+    same = not_modified(request, tag)
+    if same is not None:
+        return same
+    made = await run_in_threadpool(make)
+    made.headers["ETag"] = tag
+    return made
 
 
 class Unchanged(Middleware):

@@ -16,7 +16,7 @@ from service.archive.nights import FOREVER_NS, TREND_S, Annotation, TrendSample
 from service.runtime.supervisor import Supervisor
 from service.runtime.telemetry_recorder import AnnotationChoice
 from service.tracking.registration import HistoryEntry
-from service.web import commands, connections, numbers, problems, views
+from service.web import commands, connections, problems, views
 from service.web.views import ServiceDep, answer, define_view, shows
 
 router = APIRouter(prefix="/v1", tags=["state"], responses={**problems.INVALID})
@@ -35,7 +35,7 @@ def _said_as_a_clock_does(value: object) -> object:
 Clock = Annotated[AwareDatetime, BeforeValidator(_said_as_a_clock_does)]
 
 
-class TimeParameters(numbers.Parameters):
+class TimeParameters(views.Parameters):
     """A time, from its beginning to its end."""
 
     since_ns: Nanoseconds | None = None
@@ -185,8 +185,8 @@ class MarkList:
     """Oldest first."""
 
 
-class MarkParameters(TimeParameters):
-    """Which marks to return."""
+class NewestParameters(TimeParameters):
+    """A time, and how much of it to return."""
 
     limit: int = Field(default=500, ge=1, le=2000)
     """At most so many, the newest ones."""
@@ -206,7 +206,7 @@ async def nights(service: ServiceDep, parameters: Annotated[TimeParameters, Quer
 
 
 @router.get("/marks", responses={200: shows(MARKS)})
-async def marks(service: ServiceDep, parameters: Annotated[MarkParameters, Query()]) -> Response:
+async def marks(service: ServiceDep, parameters: Annotated[NewestParameters, Query()]) -> Response:
     """Return swaps, jumps, alarms and starts of a time."""
     found = await run_in_threadpool(
         service.archive.nights.marks, *parameters.between, parameters.limit
@@ -261,13 +261,6 @@ class AnnotationList:
     """Oldest first."""
 
 
-class AnnotationParameters(TimeParameters):
-    """Which notes to return."""
-
-    limit: int = Field(default=500, ge=1, le=2000)
-    """At most so many, the newest ones."""
-
-
 define_view("AnnotationView", Annotation)
 ANNOTATIONS = define_view("AnnotationsView", AnnotationList)
 
@@ -281,7 +274,7 @@ class AnnotationAcceptedView(commands.AcceptedView):
 
 @notes.get("/annotations", responses={200: shows(ANNOTATIONS)})
 async def list_annotations(
-    service: ServiceDep, parameters: Annotated[AnnotationParameters, Query()]
+    service: ServiceDep, parameters: Annotated[NewestParameters, Query()]
 ) -> Response:
     """Return operators' notes about a time, oldest first."""
     found = await run_in_threadpool(

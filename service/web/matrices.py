@@ -1,135 +1,387 @@
-"""Routes of refits, measured and noisy matrices.
-
-A reconstructor for the registration of now is a job that can be followed to its end. The RTC
-measures an interaction matrix, or the service sums a noisy one on sky from a random dither. A noisy
-one can never become a reconstructor: no route, and nothing behind one, publishes it.
-"""
+"""Routes of reconstructors: records, numbers, gains, comparisons; how any matrix leaves."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
-from typing import Annotated
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request, Response
-from fastapi.concurrency import run_in_threadpool
+import numpy as np
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from numpy.typing import NDArray
 
-from service.runtime.command_results import RefitJob
-from service.tracking.operation_records import MeasurementRecord, NoisyFinding
-from service.tracking.state import TrackerState
+from service.control.gains import ModeGain, gain_table
+from service.errors import CommandError
+from service.runtime.snapshot import ModeGainTable
+from service.runtime.supervisor import Supervisor
+from service.tracking.products import MatrixState
 from service.web import views
-from service.web.commands import MeasurementId, NoisyId, RefitId
-from service.web.connections import not_modified, tag_of
-from service.web.numbers import MatrixParameters, describes_numbers, numbers_of
-from service.web.problems import INVALID, UNKNOWN
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows
-
-router = APIRouter(prefix="/v1", tags=["measured matrices"], responses={**INVALID})
-refits = APIRouter(prefix="/v1", tags=["orders"], responses={**INVALID})
-noisy = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
-
-REFIT = define_view("RefitView", RefitJob)
-define_view(
-    "NoisyFindingView",
-    NoisyFinding,
-    "n_slopes n_frames n_missing snr alpha sigma optical_gain misfit cm_id session created_ns_utc "
-    "sha256",
-)
-NOISY = define_view(
-    "NoisyView",
-    MeasurementRecord,
-    "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
-    "asked_ns_utc basis_id config_id finding",
-)
-NOISY_MATRICES = define_view(
-    "NoisyListView",
-    TrackerState,
-    "noisy_matrices=noisy",
-    "Noisy interaction matrices.",
-    noisy_matrices=NOISY,
+from service.web.connections import tag_of, unless_kept
+from service.web.problems import COMMAND, INVALID, UNKNOWN
+from service.web.views import (
+    Parameters,
+    ServiceDep,
+    answer,
+    define_view,
+    found_or_refuse,
+    shows,
+    tagged,
 )
 
+router = APIRouter(prefix="/v1", tags=["state"], responses={**INVALID})
 
-_MEASURED_NUMBERS = describes_numbers(
-    "The measured interaction matrix, slope per metre OPD",
-    "Rows (slopes) and columns (modes)",
-    "1384,400",
-)
+Numbers = NDArray[np.float32]
 
-
-async def _file(request: Request, file_of: Callable[[str], bytes], matrix_id: str) -> Response:
-    """Return the archived product, unless the client has it."""
-    tag = tag_of(matrix_id)
-    return not_modified(request, tag) or Response(
-        await run_in_threadpool(file_of, matrix_id),
-        media_type="application/x-hdf5",
-        headers={"Content-Disposition": f'attachment; filename="{matrix_id}.h5"', "ETag": tag},
-    )
+# --- which matrix is meant
 
 
-@refits.get("/refits/{id}", responses={200: shows(REFIT), **UNKNOWN})
-async def refit_job(service: ServiceDep, refit_id: RefitId) -> Response:
-    """Return the progress of a refit, and the reconstructor it has made."""
-    return answer(service.refits.job(refit_id))
+_ALIASES = {
+    "in-use": "no reconstructor is known to be in use",
+    "previous": "no earlier reconstructor has been in use",
+    "candidate": "no reconstructor is proposed",
+}
+"""Names for what changes, and what is said where there is none."""
 
 
-@router.get("/measurements", responses={200: shows(views.MEASUREMENTS)})
-async def measurements(service: ServiceDep) -> Response:
-    """Return the measured interaction matrices, oldest first."""
-    return answer(service.snapshot().tracker, views.MEASUREMENTS)
+async def _named(
+    service: ServiceDep,
+    matrix_id: Annotated[
+        str,
+        Path(alias="id", description="Id of a reconstructor, or in-use, previous, candidate"),
+    ],
+) -> str:
+    """Return the id that is meant."""
+    if matrix_id not in _ALIASES:
+        return matrix_id
+    state = service.snapshot().tracker
+    proposed = [r.id for r in state.matrices.reconstructors if r.state is MatrixState.PROPOSED]
+    found = {
+        "in-use": state.matrices.in_use,
+        "previous": state.previous,
+        "candidate": proposed[-1] if proposed else None,
+    }[matrix_id]
+    return found_or_refuse(found or None, f"{matrix_id}: {_ALIASES[matrix_id]}")
 
 
-@router.get("/measurements/{id}", responses={200: shows(views.MEASUREMENT), **UNKNOWN})
-async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
-    """Return how a matrix was measured, or its progress."""
-    record = service.snapshot().tracker.measurement(measurement_id)
-    return answer(found_or_refuse(record, f"unknown measurement {measurement_id}"))
+MatrixId = Annotated[str, Depends(_named)]
+"""Of a reconstructor that a path names."""
+
+
+async def _other(
+    service: ServiceDep,
+    other: Annotated[str, Path(description="Id of another, or in-use, previous, candidate")],
+) -> str:
+    return await _named(service, other)
+
+
+OtherId = Annotated[str, Depends(_other)]
+"""Of another one in the same path."""
+
+
+# --- the formats in which its numbers leave
+
+
+class MatrixFormat(StrEnum):
+    """Formats of an exported matrix."""
+
+    NPY = "npy"
+    """NumPy's own file format."""
+
+    RAW = "raw"
+    """C-ordered little-endian float32, the bytes ``sha256`` is of."""
+
+    HDF5 = "hdf5"
+    """The archived product, with what it was made from, or how it was measured."""
+
+    FITS = "fits"
+    """An image of float32."""
+
+
+class MatrixParameters(Parameters):
+    """Format of the returned matrix."""
+
+    format: MatrixFormat = MatrixFormat.NPY
+    """"npy", "raw", "hdf5" or "fits"."""
+
+
+MEDIA_TYPES = {
+    MatrixFormat.NPY: "application/octet-stream",
+    MatrixFormat.RAW: "application/octet-stream",
+    MatrixFormat.HDF5: "application/x-hdf5",
+    MatrixFormat.FITS: "application/fits",
+}
+_EXTENSIONS = {MatrixFormat.RAW: "f4", MatrixFormat.HDF5: "h5"}
+
+
+async def numbers_of(
+    request: Request,
+    matrix_id: str,
+    form: MatrixFormat,
+    matrix_of: Callable[[str], Numbers],
+    file_of: Callable[[str], bytes],
+) -> Response:
+    """Return a matrix as it is asked for; the shape is in the headers, but with HDF5.
+
+    An id is never reused: whoever has its numbers in this format need not have them again.
+
+    Raises
+    ------
+    CommandError
+        If it cannot leave like that from here.
+    """
+
+    def made() -> Response:
+        extension = _EXTENSIONS.get(form, form.value)
+        headers = {"Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"'}
+        if form is MatrixFormat.HDF5:
+            content = file_of(matrix_id)
+        else:
+            numbers = np.ascontiguousarray(matrix_of(matrix_id), "<f4")
+            headers |= {"X-Shape": ",".join(str(n) for n in numbers.shape), "X-Dtype": "<f4"}
+            content = _written(numbers, form, matrix_id)
+        return Response(content, media_type=MEDIA_TYPES[form], headers=headers)
+
+    return await unless_kept(request, tag_of(matrix_id, form), made)
+
+
+def _written(numbers: Numbers, form: MatrixFormat, matrix_id: str) -> bytes:
+    buffer = io.BytesIO()
+    match form:
+        case MatrixFormat.RAW:
+            return numbers.tobytes()
+        case MatrixFormat.FITS:
+            try:
+                from astropy.io import fits
+            except ImportError:
+                text = "FITS: found no astropy, expected it beside pyrcal: pip install astropy"
+                raise CommandError(text) from None
+            image = fits.PrimaryHDU(numbers)
+            image.header["OBJECT"] = matrix_id
+            image.writeto(buffer)
+        case _:
+            np.save(buffer, numbers, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def describes_numbers(description: str, rows_and_columns: str, example: str) -> dict[str, Any]:
+    """Return the OpenAPI description of such an answer."""
+    binary = {"schema": {"type": "string", "format": "binary"}}
+    return {
+        "description": description,
+        "content": dict.fromkeys(MEDIA_TYPES.values(), binary),
+        "headers": {
+            "X-Shape": {
+                "description": f"{rows_and_columns}; not with hdf5",
+                "schema": {"type": "string", "example": example},
+            },
+            "X-Dtype": {
+                "description": "float32; little-endian but in FITS, C-ordered",
+                "schema": {"type": "string", "example": "<f4"},
+            },
+        },
+    }
+
+
+# --- the reconstructors
+
+
+@router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})
+async def reconstructors(service: ServiceDep) -> Response:
+    """Return the reconstructors, oldest first."""
+    return tagged(service.snapshot().tracker, views.RECONSTRUCTORS)
+
+
+@router.get("/reconstructors/{id}", responses={200: shows(views.RECONSTRUCTOR), **UNKNOWN})
+async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
+    """Return the record of a reconstructor."""
+    record = service.snapshot().tracker.reconstructor(matrix_id)
+    return tagged(found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
 
 
 @router.get(
-    "/measurements/{id}/matrix",
-    response_class=Response,
-    responses={200: _MEASURED_NUMBERS, **UNKNOWN},
-)
-async def measured_matrix(
-    request: Request,
-    service: ServiceDep,
-    measurement_id: MeasurementId,
-    parameters: Annotated[MatrixParameters, Query()],
-) -> Response:
-    """Return a measured matrix ``(n_slopes, n_modes)``, slope per metre OPD.
-
-    ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes whose SHA-256 is the
-    measurement's ``sha256``, ``hdf5`` the archived product with how it was measured, ``fits`` an
-    image.
-    """
-    kept = service.archive.measured
-    return await numbers_of(request, measurement_id, parameters.format, kept.matrix, kept.file)
-
-
-@noisy.get("/noisy-matrix", responses={200: shows(NOISY_MATRICES)})
-async def noisy_matrices(service: ServiceDep) -> Response:
-    """Return the noisy interaction matrices, oldest first."""
-    return answer(service.snapshot().tracker, NOISY_MATRICES)
-
-
-@noisy.get("/noisy-matrix/{id}", responses={200: shows(NOISY), **UNKNOWN})
-async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
-    """Return the record of a noisy matrix, or its progress."""
-    record = service.snapshot().tracker.measurement(noisy_id)
-    return answer(found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
-
-
-@noisy.get(
-    "/noisy-matrix/{id}/file",
+    "/reconstructors/{id}/matrix",
     response_class=Response,
     responses={
-        200: {
-            "description": "HDF5: the matrix, the noise of each element, the synthetic matrix",
-            "content": {"application/x-hdf5": {"schema": {"type": "string", "format": "binary"}}},
-        },
+        200: describes_numbers(
+            "The reconstructor, metres OPD per slope",
+            "Rows (modes) and columns (slopes)",
+            "400,1384",
+        ),
         **UNKNOWN,
     },
 )
-async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
-    """Return the HDF5 file of a noisy matrix."""
-    return await _file(request, service.archive.noisy.file, noisy_id)
+async def reconstructor_matrix(
+    request: Request,
+    service: ServiceDep,
+    matrix_id: MatrixId,
+    parameters: Annotated[MatrixParameters, Query()],
+) -> Response:
+    """Return a reconstructor ``(n_modes, n_slopes)``, metres OPD per slope.
+
+    ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes as they travel to the RTC,
+    whose SHA-256 is the reconstructor's ``sha256``, ``hdf5`` the archived product, ``fits`` an
+    image.
+    """
+    return await numbers_of(
+        request,
+        matrix_id,
+        parameters.format,
+        service.matrix,
+        lambda name: service.archive.reconstructors.file(name),
+    )
+
+
+@router.get("/gains", responses={200: shows(views.GAINS), **COMMAND})
+async def gains(service: ServiceDep) -> Response:
+    """Return the optical gains of all modes now.
+
+    ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
+    """
+    tracker = service.snapshot().tracker
+    if tracker.loop.rtc is None:
+        raise CommandError("gains: no RTC is there: the number of modes is not known")
+    current = tracker.alpha.registration
+    measured = () if current is None else current.optical_gains
+    return _gain_table(None, measured, tracker.loop.rtc.n_modes)
+
+
+@router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})
+async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
+    """Return the optical gains when a reconstructor was made."""
+    found = service.snapshot().tracker.reconstructor(matrix_id)
+    record = found_or_refuse(found, f"unknown reconstructor {matrix_id}")
+    return _gain_table(record.id, record.optical_gains, record.n_modes)
+
+
+def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int) -> Response:
+    table = gain_table(measured, n_modes)
+    return answer(
+        ModeGainTable(
+            reconstructor=matrix_id,
+            measured=measured,
+            optical_gain=table.optical_gain.tolist(),
+            relative_sigma=table.relative_sigma.tolist(),
+            factor=table.factors.tolist(),
+        )
+    )
+
+
+# --- what the page draws of them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SingularValues:
+    """Singular values of a reconstructor's modes: weak ones amplify noise."""
+
+    id: str
+    """Of the reconstructor."""
+
+    values: list[float]
+    """One over each singular value of the reconstructor, largest first, slope per metre OPD: those
+    of the interaction matrix it inverts, where none were left out."""
+
+    nominal: list[float] | None
+    """Of the model's interaction matrix of as many modes, the mirror where the instrument file has
+    it; null: the model is being prepared."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatrixComparison:
+    """Difference of two reconstructors, mode by mode: of as many modes as both have."""
+
+    id: str
+    other: str
+    modes: list[int]
+    """Basis indices."""
+
+    gain: list[float]
+    """By how much stronger the first one answers: norm of its row over that of the other's."""
+
+    cosine: list[float]
+    """Of the angle between both rows: 1: they answer to the same slopes, -1: of opposite sign."""
+
+    difference: float
+    """Norm of what they differ by over that of the other, all of these modes together."""
+
+
+SINGULAR = define_view("SingularValuesView", SingularValues)
+COMPARISON = define_view("MatrixComparisonView", MatrixComparison)
+
+
+@router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
+async def singular_values(request: Request, service: ServiceDep, matrix_id: MatrixId) -> Response:
+    """Return the singular values of a reconstructor."""
+    known = service.description
+    products = None if known is None else known.products
+
+    def made() -> Response:
+        found = answer(_singular_values(matrix_id, service.matrix(matrix_id), products))
+        if products is not None:
+            found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
+        return found
+
+    return await unless_kept(request, tag_of(matrix_id, products is None), made)
+
+
+def _singular_values(
+    matrix_id: str, matrix: NDArray[np.float32], products: NDArray[np.float32] | None
+) -> SingularValues:
+    """Return those that are not lost in rounding, of a reconstructor and of as many modes."""
+    numbers = matrix.astype(np.float64)
+    power = np.linalg.eigvalsh(numbers @ numbers.T)
+    inverted = power[power > power[-1] * 1e-13] ** -0.5
+    nominal = None
+    if products is not None:
+        modelled = np.linalg.eigvalsh(products[: len(matrix), : len(matrix)].astype(np.float64))
+        nominal = _rounded(np.sqrt(np.maximum(modelled[::-1], 0.0)))
+    return SingularValues(id=matrix_id, values=_rounded(inverted), nominal=nominal)
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [float(f"{value:.4g}") for value in values]
+
+
+@router.get(
+    "/reconstructors/{id}/compared-with/{other}",
+    responses={200: shows(COMPARISON), **UNKNOWN, **COMMAND},
+)
+async def compare(
+    request: Request, service: ServiceDep, matrix_id: MatrixId, other: OtherId
+) -> Response:
+    """Return the difference of two reconstructors, mode by mode."""
+    return await unless_kept(
+        request, tag_of(matrix_id, other), lambda: answer(_compared(service, matrix_id, other))
+    )
+
+
+def _compared(service: Supervisor, matrix_id: str, other: str) -> MatrixComparison:
+    """Compare two reconstructors; waits for the disk.
+
+    Raises
+    ------
+    CommandError
+        If they are of different slopes.
+    """
+    first, second = (service.matrix(name).astype(np.float64) for name in (matrix_id, other))
+    if first.shape[1] != second.shape[1]:
+        raise CommandError(
+            f"found {first.shape[1]} slopes in {matrix_id} and {second.shape[1]} in {other}, "
+            "expected as many in both"
+        )
+    n_modes = min(len(first), len(second))
+    first, second = first[:n_modes], second[:n_modes]
+    sizes, others = (np.linalg.norm(rows, axis=1) for rows in (first, second))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = sizes / others
+        cosine = np.sum(first * second, axis=1) / (sizes * others)
+        difference = np.linalg.norm(first - second) / np.linalg.norm(second)
+    return MatrixComparison(
+        id=matrix_id,
+        other=other,
+        modes=list(range(n_modes)),
+        gain=_rounded(gain),
+        cosine=_rounded(cosine),
+        difference=float(difference),
+    )

@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 from fastapi import Depends, Request, Response
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 
 from service import archive, errors, wire
 from service.control.expected_gain import ExpectedGain
@@ -216,6 +217,12 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
 
 
 _LASTING = (HistoryEntry, LogEntry, archive.AuditEntry)
+
+
+class Parameters(BaseModel):
+    """Query parameters; an unknown one is refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 # a plain function would be called in a thread, which takes as long as most answers

@@ -10,7 +10,7 @@ from service.control.reconstructor import invert
 from service.errors import UnknownIdError
 from service.estimation.frames import FrameBlock
 from service.model.pupil import rtc_valid_subapertures
-from service.web import numbers
+from service.web import page
 from tests.unit.test_api_fits import assert_problem
 
 
@@ -60,7 +60,7 @@ def frames(slopes, t0_ns_utc=5):
 async def test_one_picture_of_the_slopes_serves_all_who_ask_soon(
     client, service, monkeypatch, shown_s, t_ns
 ):
-    monkeypatch.setattr(numbers, "SHOWN_S", shown_s)
+    monkeypatch.setattr(page, "SHOWN_S", shown_s)
     slopes = np.zeros((2, 2 * int(rtc_valid_subapertures(service.instrument).sum())), np.float32)
     for t0_ns in (5, 6):
         service.newest_frames = frames(slopes, t0_ns)

@@ -10,7 +10,7 @@ import pytest
 from fastapi import Request
 
 from service.api import create_app
-from service.web import authentication, stream
+from service.web import authentication, page
 from service.web.authentication import COOKIE, Hosts, Refusal, Refusals
 from service.web.keys import KeyFile, KeyScope
 from studies.openapi import document
@@ -368,7 +368,7 @@ async def test_to_revoke_the_last_key_opens_no_door(client, service, keys, secre
 
 
 async def test_a_stream_ends_when_its_key_is_revoked(service, keys, secrets, monkeypatch):
-    monkeypatch.setattr(stream, "HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(page, "HEARTBEAT_S", 0.5)
     async with serving(service, keys) as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         head = (
@@ -383,7 +383,7 @@ async def test_a_stream_ends_when_its_key_is_revoked(service, keys, secrets, mon
 
 
 async def test_a_stream_that_needed_no_key_ends_when_there_is_one(service, keys, monkeypatch):
-    monkeypatch.setattr(stream, "HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(page, "HEARTBEAT_S", 0.5)
     async with serving(service, keys) as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")

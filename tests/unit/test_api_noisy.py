@@ -49,6 +49,9 @@ RUNNING = replace(STORED, id="noisy-2", state=MeasureState.RUNNING, finding=None
 class FakeMatrices:
     """The archive's noisy matrices."""
 
+    def matrix(self, noisy_id):
+        raise AssertionError(f"{noisy_id}: its numbers leave with their noise alone")
+
     def file(self, noisy_id):
         if noisy_id != "noisy-1":
             raise UnknownIdError(f"noisy matrix {noisy_id}: no such matrix in the archive")

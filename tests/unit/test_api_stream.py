@@ -12,7 +12,7 @@ import pytest
 from service.api import create_app
 from service.tracking.state import Level, LogEntry
 from service.tracking.step_context import LOG_LENGTH
-from service.web import connections, stream
+from service.web import connections, page
 from service.web.connections import Server
 from tests.system.pace import patience
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.timeout(60)
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(stream, "LOOK_S", 0.05)
-    monkeypatch.setattr(stream, "HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(page, "LOOK_S", 0.05)
+    monkeypatch.setattr(page, "HEARTBEAT_S", 0.5)
 
 
 @pytest.fixture
@@ -189,7 +189,7 @@ async def test_all_who_listen_share_one_look(service):
         looks, loop = 0, asyncio.get_running_loop()
         began = loop.time()
         await asyncio.sleep(1.0)
-        assert 0 < looks <= (loop.time() - began) / stream.LOOK_S + 2
+        assert 0 < looks <= (loop.time() - began) / page.LOOK_S + 2
 
 
 async def test_a_stream_ends_at_once_with_the_service(service):
@@ -222,7 +222,7 @@ async def test_one_that_takes_nothing_is_dropped_and_leaves_no_place_taken(servi
 
 
 async def test_more_than_there_may_be_are_told_to_come_later(service, monkeypatch):
-    monkeypatch.setattr(stream, "MAX_LISTENERS", 1)
+    monkeypatch.setattr(page, "MAX_LISTENERS", 1)
     async with serving(service) as listening, listening() as listener:
         await listener.event("state")
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{listening.port}") as client:

@@ -1,4 +1,8 @@
-"""Routes of fits of uploaded matrices."""
+"""Routes of measured matrices: the RTC's own, noisy ones on sky, and fits of uploaded ones.
+
+The RTC measures an interaction matrix, or the service sums a noisy one on sky from a random dither.
+A noisy one can never become a reconstructor: no route, and nothing behind one, publishes it.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +20,113 @@ from starlette.requests import ClientDisconnect
 from service import errors, files
 from service.model.kinds import Method
 from service.runtime.uploads import FitJob, FitQueue, FitState
+from service.tracking.operation_records import MeasurementRecord, NoisyFinding
+from service.tracking.state import TrackerState
 from service.web import views
+from service.web.matrices import MatrixFormat, MatrixParameters, describes_numbers, numbers_of
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
+from service.web.views import Parameters, ServiceDep, answer, define_view, found_or_refuse, shows
 
-router = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
+router = APIRouter(prefix="/v1", tags=["measured matrices"], responses={**INVALID})
+noisy = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
+fits = APIRouter(prefix="/v1", tags=["fits of uploaded matrices"], responses={**INVALID})
+
+MeasurementId = Annotated[str, Path(alias="id", description="Id of a measured matrix")]
+NoisyId = Annotated[str, Path(alias="id", description="Id of a noisy interaction matrix")]
+
+define_view(
+    "NoisyFindingView",
+    NoisyFinding,
+    "n_slopes n_frames n_missing snr alpha sigma optical_gain misfit cm_id session created_ns_utc "
+    "sha256",
+)
+NOISY = define_view(
+    "NoisyView",
+    MeasurementRecord,
+    "id state reason n_modes modes total_m amplitude_m=each_m duration_s window_s seed "
+    "asked_ns_utc basis_id config_id finding",
+)
+NOISY_MATRICES = define_view(
+    "NoisyListView",
+    TrackerState,
+    "noisy_matrices=noisy",
+    "Noisy interaction matrices.",
+    noisy_matrices=NOISY,
+)
+
+
+_MEASURED_NUMBERS = describes_numbers(
+    "The measured interaction matrix, slope per metre OPD",
+    "Rows (slopes) and columns (modes)",
+    "1384,400",
+)
+
+
+@router.get("/measurements", responses={200: shows(views.MEASUREMENTS)})
+async def measurements(service: ServiceDep) -> Response:
+    """Return the measured interaction matrices, oldest first."""
+    return answer(service.snapshot().tracker, views.MEASUREMENTS)
+
+
+@router.get("/measurements/{id}", responses={200: shows(views.MEASUREMENT), **UNKNOWN})
+async def measurement(service: ServiceDep, measurement_id: MeasurementId) -> Response:
+    """Return how a matrix was measured, or its progress."""
+    record = service.snapshot().tracker.measurement(measurement_id)
+    return answer(found_or_refuse(record, f"unknown measurement {measurement_id}"))
+
+
+@router.get(
+    "/measurements/{id}/matrix",
+    response_class=Response,
+    responses={200: _MEASURED_NUMBERS, **UNKNOWN},
+)
+async def measured_matrix(
+    request: Request,
+    service: ServiceDep,
+    measurement_id: MeasurementId,
+    parameters: Annotated[MatrixParameters, Query()],
+) -> Response:
+    """Return a measured matrix ``(n_slopes, n_modes)``, slope per metre OPD.
+
+    ``?format=npy`` (the default) is a NumPy file, ``raw`` the bytes whose SHA-256 is the
+    measurement's ``sha256``, ``hdf5`` the archived product with how it was measured, ``fits`` an
+    image.
+    """
+    kept = service.archive.measured
+    return await numbers_of(request, measurement_id, parameters.format, kept.matrix, kept.file)
+
+
+@noisy.get("/noisy-matrix", responses={200: shows(NOISY_MATRICES)})
+async def noisy_matrices(service: ServiceDep) -> Response:
+    """Return the noisy interaction matrices, oldest first."""
+    return answer(service.snapshot().tracker, NOISY_MATRICES)
+
+
+@noisy.get("/noisy-matrix/{id}", responses={200: shows(NOISY), **UNKNOWN})
+async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
+    """Return the record of a noisy matrix, or its progress."""
+    record = service.snapshot().tracker.measurement(noisy_id)
+    return answer(found_or_refuse(record, f"unknown noisy matrix {noisy_id}"), NOISY)
+
+
+@noisy.get(
+    "/noisy-matrix/{id}/file",
+    response_class=Response,
+    responses={
+        200: {
+            "description": "HDF5: the matrix, the noise of each element, the synthetic matrix",
+            "content": {"application/x-hdf5": {"schema": {"type": "string", "format": "binary"}}},
+        },
+        **UNKNOWN,
+    },
+)
+async def noisy_file(request: Request, service: ServiceDep, noisy_id: NoisyId) -> Response:
+    """Return the HDF5 file of a noisy matrix."""
+    kept = service.archive.noisy
+    return await numbers_of(request, noisy_id, MatrixFormat.HDF5, kept.matrix, kept.file)
+
+
+# --- fits of uploads
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,15 +137,15 @@ class FitJobs:
     """Oldest first."""
 
 
-FIT_JOB = views.define_view(
+FIT_JOB = define_view(
     "FitJobView", FitJob, "id state stage name asked_ns_utc n_bytes sha256 reason"
 )
-FIT_JOBS = views.define_view("FitJobsView", FitJobs)
+FIT_JOBS = define_view("FitJobsView", FitJobs)
 
 
 async def _fits_of(request: Request) -> FitQueue:
-    fits: FitQueue = request.app.state.fits
-    return fits
+    desk: FitQueue = request.app.state.fits
+    return desk
 
 
 FitsDep = Annotated[FitQueue, Depends(_fits_of)]
@@ -67,10 +174,8 @@ def _packaged(name: str) -> None:
         )
 
 
-class FitParameters(BaseModel):
+class FitParameters(Parameters):
     """Parameters of a fit, in the words of ``pyrcal fit``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     dataset: str | None = Field(default=None, min_length=1, max_length=_TEXT)
     """Name of the matrix in its file; default interaction_matrix."""
@@ -131,7 +236,7 @@ _UPLOAD: dict[str, Any] = {
 }
 
 
-@router.post(
+@fits.post(
     "/fits",
     status_code=202,
     openapi_extra=_UPLOAD,
@@ -143,8 +248,8 @@ _UPLOAD: dict[str, Any] = {
 )
 async def fit(
     request: Request,
-    service: views.ServiceDep,
-    fits: FitsDep,
+    service: ServiceDep,
+    desk: FitsDep,
     response: Response,
     parameters: Annotated[FitParameters, Query()],
     content_length: Annotated[int | None, Header(ge=0)] = None,
@@ -162,23 +267,23 @@ async def fit(
         content = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
         body, content_length = _kept(content), len(content)
     name = parameters.name or parameters.measurement or ""
-    job = await fits.take(parameters.asked(), body, content_length, name)
+    job = await desk.take(parameters.asked(), body, content_length, name)
     links = {"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"}
     response.headers["Location"] = links["fit"]
     return FitAcceptedView(id=job.id, links=links)
 
 
-@router.get("/fits", responses={200: views.shows(FIT_JOBS)})
-async def fits_known(fits: FitsDep) -> Response:
+@fits.get("/fits", responses={200: shows(FIT_JOBS)})
+async def fits_known(desk: FitsDep) -> Response:
     """Return the last fits, oldest first."""
-    return views.answer(FitJobs(fits=tuple(fits.jobs())))
+    return answer(FitJobs(fits=tuple(desk.jobs())))
 
 
 _FOUND = {"anyOf": [{"$ref": f"{views.SCHEMAS}{one}"} for one in ("FitDocument", FIT_JOB.name)]}
 _DRAWN = {"$ref": f"{views.SCHEMAS}FitFigures"}
 
 
-@router.get(
+@fits.get(
     "/fits/{id}",
     responses={
         200: {
@@ -186,24 +291,24 @@ _DRAWN = {"$ref": f"{views.SCHEMAS}FitFigures"}
             "its `state` and the `reason`",
             "content": {"application/json": {"schema": _FOUND}},
         },
-        202: views.shows(FIT_JOB) | {"description": "Not finished yet"},
+        202: shows(FIT_JOB) | {"description": "Not finished yet"},
         **UNKNOWN,
     },
 )
-async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
+async def fit_found(desk: FitsDep, fit_id: FitId) -> Response:
     """Return the result of a fit; 202 while it runs.
 
     What was found has a ``verdict``; a fit that failed, or was given up, has ``state`` and
     ``reason`` instead.
     """
-    job = fits.job(fit_id)
+    job = desk.job(fit_id)
     if job.document is not None:
         return JSONResponse(dict(job.document))
     ended = job.state in {FitState.FAILED, FitState.GIVEN_UP}
     return JSONResponse(views.to_json(job), HTTPStatus.OK if ended else HTTPStatus.ACCEPTED)
 
 
-@router.get(
+@fits.get(
     "/fits/{id}/figures",
     responses={
         200: {
@@ -213,19 +318,19 @@ async def fit_found(fits: FitsDep, fit_id: FitId) -> Response:
         **UNKNOWN,
     },
 )
-async def fit_figures(fits: FitsDep, fit_id: FitId) -> Response:
+async def fit_figures(desk: FitsDep, fit_id: FitId) -> Response:
     """Return the numbers behind a fit's figures; 404 while there are none."""
-    job = fits.job(fit_id)
+    job = desk.job(fit_id)
     return Response(
-        views.found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
+        found_or_refuse(job.figures, f"fit {fit_id} is {job.state} and has no figures"),
         media_type="application/json",
     )
 
 
-@router.delete("/fits/{id}", responses={200: views.shows(FIT_JOB), **UNKNOWN, **COMMAND})
-async def give_up_fit(fits: FitsDep, fit_id: FitId) -> Response:
+@fits.delete("/fits/{id}", responses={200: shows(FIT_JOB), **UNKNOWN, **COMMAND})
+async def give_up_fit(desk: FitsDep, fit_id: FitId) -> Response:
     """End a fit; 409 if it is over."""
-    return views.answer(await fits.give_up(fit_id))
+    return answer(await desk.give_up(fit_id))
 
 
 async def _kept(content: bytes) -> AsyncIterator[bytes]:

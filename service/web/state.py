@@ -1,19 +1,21 @@
-"""Routes for orchestrators and Prometheus."""
+"""Routes of the state: as JSON, as health for orchestrators, as metrics for Prometheus."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from enum import StrEnum
 from http import HTTPStatus
+from typing import Annotated
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from service import __version__
 from service.link.statistics import LinkStatistics
@@ -24,12 +26,65 @@ from service.tracking.operations.running import CurrentOperation, ServiceState
 from service.tracking.products import MatrixState
 from service.tracking.registration import Source, Validity
 from service.tracking.state import Mode, TrackerState
+from service.web import views
 from service.web.authentication import OPEN
-from service.web.problems import problem, problem_response
-from service.web.views import ServiceDep
+from service.web.problems import INVALID, problem, problem_response
+from service.web.views import Parameters, ServiceDep, answer, shows
 from service.wire import Pattern
 
-router = APIRouter(tags=["health"])
+router = APIRouter(prefix="/v1", tags=["state"], responses={**INVALID})
+health = APIRouter(tags=["health"])
+
+
+class LimitParameters(Parameters):
+    """Length of the returned list."""
+
+    limit: int = Field(default=200, ge=1, le=100_000)
+    """At most so many entries, the newest ones."""
+
+
+@router.get("/state", responses={200: shows(views.STATE)})
+async def state(service: ServiceDep) -> Response:
+    """Return the whole state."""
+    return answer(service.snapshot())
+
+
+@router.get(
+    "/alpha",
+    responses={
+        200: shows(views.ALPHA),
+        404: problem_response("No window of telemetry has been accepted yet"),
+    },
+)
+async def alpha(request: Request, service: ServiceDep) -> Response:
+    """Return the registration now: estimate, 1 σ, covariance and age."""
+    snapshot = service.snapshot()
+    tracker = snapshot.tracker
+    current = snapshot.alpha
+    if current is None:
+        detail = (
+            f"no estimate yet: {tracker.windows.accepted} windows accepted, "
+            f"{tracker.windows.refused} refused; {snapshot.ready_reason}"
+        )
+        return problem(request, HTTPStatus.NOT_FOUND, "no-estimate", detail)
+    return answer(current)
+
+
+@router.get("/alarms", responses={200: shows(views.ALARMS)})
+async def alarms(service: ServiceDep) -> Response:
+    """Return the alarms: lasting, ended unseen, muted."""
+    return answer(service.snapshot(), views.ALARMS)
+
+
+@router.get("/events", responses={200: shows(views.EVENTS)})
+async def events(service: ServiceDep, parameters: Annotated[LimitParameters, Query()]) -> Response:
+    """Return the log, oldest first, and the alarms."""
+    tracker = service.snapshot().tracker
+    return answer(replace(tracker, log=tracker.log[-parameters.limit :]), views.EVENTS)
+
+
+# --- whether all is well
+
 
 FRESH_S = 3.0
 """Telemetry whose last frame is older has stopped, seconds."""
@@ -50,14 +105,14 @@ class ReadyView(BaseModel):
     reason: str
 
 
-@router.get("/healthz", openapi_extra=OPEN)
+@health.get("/healthz", openapi_extra=OPEN)
 async def healthz(service: ServiceDep) -> HealthView:
     """Answer as long as the process lives."""
     snapshot = service.snapshot()
     return HealthView(status="ok", version=__version__, uptime_s=snapshot.uptime_s)
 
 
-@router.get(
+@health.get(
     "/readyz",
     openapi_extra=OPEN,
     response_model=ReadyView,
@@ -94,7 +149,7 @@ def find_problems(snapshot: Snapshot) -> dict[str, str]:
     }
 
 
-@router.get(
+@health.get(
     "/metrics",
     response_class=Response,
     responses={

@@ -64,29 +64,10 @@ def run_command(
     serves
         Whether the command runs until it is told to stop, and hears signals by itself.
     """
-    try:
-        try:
-            return _commanded(read, check, own_process=own_process, serves=serves)
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:  # whoever reads has seen enough, and Python would complain at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-
-
-def _commanded(
-    read: Callable[[], argparse.Namespace],
-    check: Callable[[argparse.Namespace], None],
-    *,
-    own_process: bool,
-    serves: bool,
-) -> int:
     if own_process:
         _leave_when_asked(0 if serves else INTERRUPTED)
-    options = read()
-    options.own_process = own_process
 
-    def run_command() -> int:
+    def performed(options: argparse.Namespace) -> int:
         check(options)
         command = import_module(options.module)
         if own_process and not serves:
@@ -95,10 +76,19 @@ def _commanded(
         status: int = command.main(options)
         return status
 
-    status = status_of(run_command)
-    if own_process and serves:
-        leave(status)
-    return status
+    try:
+        try:
+            options = read()
+            options.own_process = own_process
+            status = status_of(lambda: performed(options))
+            if own_process and serves:
+                leave(status)
+            return status
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # whoever reads has seen enough, and Python would complain at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 def _leave_when_asked(status: int) -> None:
@@ -125,7 +115,7 @@ def imported_and_run(
         cut in two.
     own_process
         Whether signals are this program's to hear.
-    heard
+    received
         Those that the task sees as ``KeyboardInterrupt``.
     """
     if own_process:

@@ -9,17 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from service.config import instrument_schema as schema
 from service.config import packaged_file
-from service.config.instrument_schema import (
-    AboutTable,
-    InstrumentFile,
-    MirrorTable,
-    Section,
-    SlopesTable,
-    read_instrument_file,
-    refused_at,
-    unknown_values,
-)
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.sources import refuse
 from service.errors import ConfigurationError
@@ -41,30 +32,30 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         One line with the file and the key: unknown, missing, of the wrong type, out of range, or
         in contradiction to another.
     """
-    said = read_instrument_file(name_or_path)
+    said = schema.read_instrument_file(name_or_path)
     section, kind = said.section, said.kind
-    about, wfs = section(AboutTable).said, section(kind.table)
+    about, wfs = section(schema.AboutTable).said, section(kind.table)
     pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
     sensor = _sensor(wfs, kind)
-    mirror, about_mirror = read_mirror(section(MirrorTable), pupil)
+    mirror, about_mirror = read_mirror(section(schema.MirrorTable), pupil)
     modes = _modes(section(KarhunenLoeve), mirror)
-    with refused_at(wfs.path, wfs.name):
+    with schema.refused_at(wfs.path, wfs.name):
         frames = kind.frames(wfs.said, wfs.given)
     return Instrument(
         **asdict(about),
         wfs=sensor,
         mirror=mirror,
         modes=modes,
-        slopes=_slopes(section(SlopesTable), kind, has_frames=frames is not None),
+        slopes=_slopes(section(schema.SlopesTable), kind, has_frames=frames is not None),
         frames=frames,
         loop=_loop(section(LoopFacts), modes.n_modes),
-        unknown=tuple(one for one in unknown_values(kind) if one in said.unknown),
+        unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
         remarks=(*about_mirror, *_assumed(said, sensor, mirror)),
     )
 
 
 def _assumed(
-    said: InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
+    said: schema.InstrumentFile, sensor: SensorDescription, mirror: Mirror | TabulatedModes
 ) -> Iterator[str]:
     """Yield what the file does not say, and what is taken instead."""
     wfs = said.section(said.kind.table)
@@ -90,7 +81,7 @@ def packaged_instrument(name: str) -> Instrument:
     return load_instrument(packaged_file(name))
 
 
-def _modes(file: Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
+def _modes(file: schema.Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> KarhunenLoeve:
     """Return the turbulence, and as many modes as the user's basis or ``[modes]`` has."""
     where, own, table = file.where("n_modes"), own_modes(mirror), file.said
     if own is not None:
@@ -110,7 +101,9 @@ def _modes(file: Section[KarhunenLoeve], mirror: Mirror | TabulatedModes) -> Kar
     return table
 
 
-def _slopes(file: Section[SlopesTable], sensor: SensorKind, *, has_frames: bool) -> SlopeRecipe:
+def _slopes(
+    file: schema.Section[schema.SlopesTable], sensor: SensorKind, *, has_frames: bool
+) -> SlopeRecipe:
     table = file.said
     if table.kind not in sensor.signals:
         refuse(file.where("kind"), f"{table.kind} of a {sensor.name}", " or ".join(sensor.signals))
@@ -135,7 +128,7 @@ def _slopes(file: Section[SlopesTable], sensor: SensorKind, *, has_frames: bool)
     return SlopeRecipe(order=order, orientation=orientation, normalisation=table.normalisation)
 
 
-def _loop(file: Section[LoopFacts], n_modes: int) -> LoopFacts | None:
+def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     if not file.given:
         return None
     table = file.said
@@ -148,8 +141,8 @@ def _loop(file: Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     return table
 
 
-def _sensor(file: Section[SensorTable], kind: SensorKind) -> SensorDescription:
-    with refused_at(file.path, file.name):
+def _sensor(file: schema.Section[SensorTable], kind: SensorKind) -> SensorDescription:
+    with schema.refused_at(file.path, file.name):
         sensor = kind.described(file.said, file.given)
     if file.said.valid_subapertures == "auto":
         return sensor
@@ -161,7 +154,7 @@ def _sensor(file: Section[SensorTable], kind: SensorKind) -> SensorDescription:
     return replace(sensor, valid_subapertures=_mask(file))
 
 
-def _mask(file: Section[SensorTable]) -> NDArray[np.bool_]:
+def _mask(file: schema.Section[SensorTable]) -> NDArray[np.bool_]:
     where, n = file.where("valid_subapertures"), file.said.n_subapertures
     values = file.array("valid_subapertures")
     if values.shape != (n, n):

@@ -14,18 +14,7 @@ from pydantic import BeforeValidator, Field, create_model
 from service.config import instrument_path
 from service.config.sources import Id, Table, in_file, read_dataset, read_toml, refuse, validated
 from service.errors import ConfigurationError, ModelError
-from service.model.kinds import (
-    BasisKind,
-    Count,
-    InfluenceShape,
-    KarhunenLoeve,
-    LoopFacts,
-    Normalisation,
-    Positive,
-    SignalKind,
-    SlopeOrder,
-    Telescope,
-)
+from service.model import kinds
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 
@@ -47,7 +36,7 @@ def _signs(value: object) -> object:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AboutTable(Telescope):
+class AboutTable(kinds.Telescope):
     """``[instrument]``: the telescope as a whole."""
 
     name: Id
@@ -59,16 +48,16 @@ class AboutTable(Telescope):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MirrorTable(InfluenceShape):
+class MirrorTable(kinds.InfluenceShape):
     """``[mirror]``: analytic (``layout``) or measured (``modes``, ``influence_functions``)."""
 
     layout: Literal["rings", "grid", "positions"] | None = None
     """Placement of an analytic mirror's actuators."""
 
-    pitch_m: Positive | None = None
+    pitch_m: kinds.Positive | None = None
     """Distance between neighbours, metres; None: 0.30 for rings, measured for positions."""
 
-    first_ring: Count = 2
+    first_ring: kinds.Count = 2
     """Rings only."""
 
     last_ring: Annotated[int, Field(ge=1, le=500)] = 14
@@ -77,7 +66,7 @@ class MirrorTable(InfluenceShape):
     n_across: Annotated[int, Field(ge=2, le=1000)] | None = None
     """Grid only: actuators along a diameter."""
 
-    diameter_m: Positive | None = None
+    diameter_m: kinds.Positive | None = None
     """Grid only: actuators beyond this circle do not exist."""
 
     positions: str | None = None
@@ -86,7 +75,7 @@ class MirrorTable(InfluenceShape):
     mode_to_actuator: str | None = None
     """``path:/dataset`` of the user's modes, ``(n_actuators, n_modes)``."""
 
-    basis: BasisKind = BasisKind.KARHUNEN_LOEVE
+    basis: kinds.BasisKind = kinds.BasisKind.KARHUNEN_LOEVE
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
     nominal_rotation_deg: float | None = None
@@ -101,7 +90,7 @@ class MirrorTable(InfluenceShape):
     modes: str | None = None
     """``path:/dataset`` of measured modes, ``(n_modes, ny, nx)``."""
 
-    modes_pitch_m: Positive | None = None
+    modes_pitch_m: kinds.Positive | None = None
     """Grid step of the measured modes."""
 
     modes_kind: Literal["opd", "surface"] = "opd"
@@ -124,14 +113,14 @@ class OrientationTable(Table):
 class SlopesTable(Table):
     """``[slopes]``: the RTC's own signals: kind, order, sign and recipe."""
 
-    kind: SignalKind = SignalKind.XY
+    kind: kinds.SignalKind = kinds.SignalKind.XY
     """Two slopes for each subaperture, or its four normalised pixels."""
 
-    order: SlopeOrder | None = None
+    order: kinds.SlopeOrder | None = None
     """`xy`, `yx`, `interleaved` of slopes, the others of pixels; None: `xy`, or `images`."""
 
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
-    normalisation: Normalisation = Normalisation.GLOBAL
+    normalisation: kinds.Normalisation = kinds.Normalisation.GLOBAL
     """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
 
 
@@ -142,9 +131,9 @@ def whole_of(kind: SensorKind) -> type[Table]:
         "instrument": AboutTable,
         "wfs": kind.table,
         "mirror": MirrorTable,
-        "modes": (KarhunenLoeve, Field(default_factory=KarhunenLoeve)),
+        "modes": (kinds.KarhunenLoeve, Field(default_factory=kinds.KarhunenLoeve)),
         "slopes": (SlopesTable, Field(default_factory=SlopesTable)),
-        "loop": (LoopFacts, Field(default_factory=LoopFacts)),
+        "loop": (kinds.LoopFacts, Field(default_factory=kinds.LoopFacts)),
     }
     return create_model("InstrumentFile", __base__=Table, **tables)
 

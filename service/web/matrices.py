@@ -20,15 +20,6 @@ from service.tracking.products import MatrixState
 from service.web import views
 from service.web.connections import tag_of, unless_kept
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.views import (
-    Parameters,
-    ServiceDep,
-    answer,
-    define_view,
-    found_or_refuse,
-    shows,
-    tagged,
-)
 
 router = APIRouter(prefix="/v1", tags=["state"], responses={**INVALID})
 
@@ -46,7 +37,7 @@ _ALIASES = {
 
 
 async def _named(
-    service: ServiceDep,
+    service: views.ServiceDep,
     matrix_id: Annotated[
         str,
         Path(alias="id", description="Id of a reconstructor, or in-use, previous, candidate"),
@@ -62,7 +53,7 @@ async def _named(
         "previous": state.previous,
         "candidate": proposed[-1] if proposed else None,
     }[matrix_id]
-    return found_or_refuse(found or None, f"{matrix_id}: {_ALIASES[matrix_id]}")
+    return views.found_or_refuse(found or None, f"{matrix_id}: {_ALIASES[matrix_id]}")
 
 
 MatrixId = Annotated[str, Depends(_named)]
@@ -70,7 +61,7 @@ MatrixId = Annotated[str, Depends(_named)]
 
 
 async def _other(
-    service: ServiceDep,
+    service: views.ServiceDep,
     other: Annotated[str, Path(description="Id of another, or in-use, previous, candidate")],
 ) -> str:
     return await _named(service, other)
@@ -99,7 +90,7 @@ class MatrixFormat(StrEnum):
     """An image of float32."""
 
 
-class MatrixParameters(Parameters):
+class MatrixParameters(views.Parameters):
     """Format of the returned matrix."""
 
     format: MatrixFormat = MatrixFormat.NPY
@@ -187,17 +178,17 @@ def describes_numbers(description: str, rows_and_columns: str, example: str) -> 
 # --- the reconstructors
 
 
-@router.get("/reconstructors", responses={200: shows(views.RECONSTRUCTORS)})
-async def reconstructors(service: ServiceDep) -> Response:
+@router.get("/reconstructors", responses={200: views.shows(views.RECONSTRUCTORS)})
+async def reconstructors(service: views.ServiceDep) -> Response:
     """Return the reconstructors, oldest first."""
-    return tagged(service.snapshot().tracker, views.RECONSTRUCTORS)
+    return views.tagged(service.snapshot().tracker, views.RECONSTRUCTORS)
 
 
-@router.get("/reconstructors/{id}", responses={200: shows(views.RECONSTRUCTOR), **UNKNOWN})
-async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
+@router.get("/reconstructors/{id}", responses={200: views.shows(views.RECONSTRUCTOR), **UNKNOWN})
+async def reconstructor(service: views.ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the record of a reconstructor."""
     record = service.snapshot().tracker.reconstructor(matrix_id)
-    return tagged(found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
+    return views.tagged(views.found_or_refuse(record, f"unknown reconstructor {matrix_id}"))
 
 
 @router.get(
@@ -214,7 +205,7 @@ async def reconstructor(service: ServiceDep, matrix_id: MatrixId) -> Response:
 )
 async def reconstructor_matrix(
     request: Request,
-    service: ServiceDep,
+    service: views.ServiceDep,
     matrix_id: MatrixId,
     parameters: Annotated[MatrixParameters, Query()],
 ) -> Response:
@@ -233,8 +224,8 @@ async def reconstructor_matrix(
     )
 
 
-@router.get("/gains", responses={200: shows(views.GAINS), **COMMAND})
-async def gains(service: ServiceDep) -> Response:
+@router.get("/gains", responses={200: views.shows(views.GAINS), **COMMAND})
+async def gains(service: views.ServiceDep) -> Response:
     """Return the optical gains of all modes now.
 
     ``POST /v1/loop`` with ``effective_gain`` sets the loop gains by it, if the gate agrees.
@@ -247,17 +238,17 @@ async def gains(service: ServiceDep) -> Response:
     return _gain_table(None, measured, tracker.loop.rtc.n_modes)
 
 
-@router.get("/reconstructors/{id}/gains", responses={200: shows(views.GAINS), **UNKNOWN})
-async def reconstructor_gains(service: ServiceDep, matrix_id: MatrixId) -> Response:
+@router.get("/reconstructors/{id}/gains", responses={200: views.shows(views.GAINS), **UNKNOWN})
+async def reconstructor_gains(service: views.ServiceDep, matrix_id: MatrixId) -> Response:
     """Return the optical gains when a reconstructor was made."""
     found = service.snapshot().tracker.reconstructor(matrix_id)
-    record = found_or_refuse(found, f"unknown reconstructor {matrix_id}")
+    record = views.found_or_refuse(found, f"unknown reconstructor {matrix_id}")
     return _gain_table(record.id, record.optical_gains, record.n_modes)
 
 
 def _gain_table(matrix_id: str | None, measured: tuple[ModeGain, ...], n_modes: int) -> Response:
     table = gain_table(measured, n_modes)
-    return answer(
+    return views.answer(
         ModeGainTable(
             reconstructor=matrix_id,
             measured=measured,
@@ -306,18 +297,22 @@ class MatrixComparison:
     """Norm of what they differ by over that of the other, all of these modes together."""
 
 
-SINGULAR = define_view("SingularValuesView", SingularValues)
-COMPARISON = define_view("MatrixComparisonView", MatrixComparison)
+SINGULAR = views.define_view("SingularValuesView", SingularValues)
+COMPARISON = views.define_view("MatrixComparisonView", MatrixComparison)
 
 
-@router.get("/reconstructors/{id}/singular-values", responses={200: shows(SINGULAR), **UNKNOWN})
-async def singular_values(request: Request, service: ServiceDep, matrix_id: MatrixId) -> Response:
+@router.get(
+    "/reconstructors/{id}/singular-values", responses={200: views.shows(SINGULAR), **UNKNOWN}
+)
+async def singular_values(
+    request: Request, service: views.ServiceDep, matrix_id: MatrixId
+) -> Response:
     """Return the singular values of a reconstructor."""
     known = service.description
     products = None if known is None else known.products
 
     def made() -> Response:
-        found = answer(_singular_values(matrix_id, service.matrix(matrix_id), products))
+        found = views.answer(_singular_values(matrix_id, service.matrix(matrix_id), products))
         if products is not None:
             found.headers["Cache-Control"] = "private, max-age=86400"  # an id is never reused
         return found
@@ -345,14 +340,16 @@ def _rounded(values: NDArray[np.float64]) -> list[float]:
 
 @router.get(
     "/reconstructors/{id}/compared-with/{other}",
-    responses={200: shows(COMPARISON), **UNKNOWN, **COMMAND},
+    responses={200: views.shows(COMPARISON), **UNKNOWN, **COMMAND},
 )
 async def compare(
-    request: Request, service: ServiceDep, matrix_id: MatrixId, other: OtherId
+    request: Request, service: views.ServiceDep, matrix_id: MatrixId, other: OtherId
 ) -> Response:
     """Return the difference of two reconstructors, mode by mode."""
     return await unless_kept(
-        request, tag_of(matrix_id, other), lambda: answer(_compared(service, matrix_id, other))
+        request,
+        tag_of(matrix_id, other),
+        lambda: views.answer(_compared(service, matrix_id, other)),
     )
 
 

@@ -97,17 +97,14 @@ def _check_keys(file: MirrorSection) -> None:
     table, given = file.said, file.given
     kinds = [kind for kind in _KINDS if getattr(table, kind) is not None]
     if len(kinds) != 1:
-        refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", f"one of {_listed()}")
+        expected = f"one of {', '.join(_KINDS)}"
+        refuse(f"{file.path}: mirror", " and ".join(kinds) or "none of them", expected)
     for key in sorted(_FOREIGN[kinds[0]] & given):
         raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.{kinds[0]}")
     if table.mode_to_actuator is not None and "basis" in given:
         refuse(file.where("basis"), "it beside mirror.mode_to_actuator", "only one of the two")
     if "modes_kind" in given and table.layout is not None and table.mode_to_actuator is None:
         refuse(file.where("modes_kind"), "it", "it beside modes of one's own only")
-
-
-def _listed() -> str:
-    return ", ".join(_KINDS)
 
 
 def _mount(table: MirrorTable) -> dict[str, Any]:
@@ -324,8 +321,7 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     if cube.ndim != 3 or min(cube.shape) < 1:
         refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
     known = known_samples(cube)
-    _check_table(file, pupil, key, known, file.said.modes_pitch_m)
-    remarks = _remarks(file, pupil, key, known, file.said.modes_pitch_m)
+    remarks = _judged(file, pupil, key, known, file.said.modes_pitch_m)
     cube = np.where(known, cube, cube.dtype.type(0))
     if key == "influence_functions":
         cube = _combined(file, cube)
@@ -351,9 +347,10 @@ def _combined(file: MirrorSection, cube: NDArray[np.floating]) -> NDArray[np.flo
     return np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
 
 
-def _check_table(
+def _judged(
     file: MirrorSection, pupil: Pupil, key: str, known: NDArray[np.bool_], pitch_m: float
-) -> None:
+) -> tuple[str, ...]:
+    """Refuse a table that cannot be of this pupil; return notes on one that is poor."""
     density = pupil.subaperture_m / pitch_m
     if density < MIN_POINTS_PER_SUBAPERTURE:
         refuse(
@@ -376,13 +373,7 @@ def _check_table(
             f"(table of {known.shape[0]} x {known.shape[1]} points, {pitch_m:g} m apart)",
             "at least half of it",
         )
-
-
-def _remarks(
-    file: MirrorSection, pupil: Pupil, key: str, known: NDArray[np.bool_], pitch_m: float
-) -> tuple[str, ...]:
     remarks = []
-    density = pupil.subaperture_m / pitch_m
     if density < ENOUGH_POINTS_PER_SUBAPERTURE:
         remarks.append(
             f"{file.where('modes_pitch_m')}: {density:.2g} table points per subaperture; below "

@@ -27,7 +27,7 @@ from service.errors import ConfigurationError, UnknownIdError
 from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
 from service.web.problems import INVALID, UNKNOWN, problem
-from service.web.views import answer, define_view, shows
+from service.web.views import answer, define_view, held, shows
 
 COOKIE = "pyrcal_key"
 """Under which a browser keeps the key."""
@@ -356,6 +356,8 @@ def _same(origin: str, host: str) -> bool:
 
 router = APIRouter(prefix="/v1", tags=["access"], responses={**INVALID})
 
+KeysDep = Annotated[KeyFile, held("keys")]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Session:
@@ -414,22 +416,19 @@ async def log_out(response: Response) -> None:
 
 
 @router.get("/keys", openapi_extra=needs(KeyScope.ADMIN), responses={200: shows(KEYS)})
-async def keys(request: Request) -> Response:
+async def keys(request: Request, file: KeysDep) -> Response:
     """Return the names and scopes of all keys."""
-    return answer(Holders(keys=_file(request).all() if request.user is not None else ()))
+    return answer(Holders(keys=file.all() if request.user is not None else ()))
 
 
 @router.delete(
     "/keys/{name}", status_code=204, openapi_extra=needs(KeyScope.ADMIN), responses=UNKNOWN
 )
-async def revoke(request: Request, name: Annotated[str, Path(description="Of the key")]) -> None:
+async def revoke(
+    request: Request, file: KeysDep, name: Annotated[str, Path(description="Of the key")]
+) -> None:
     """Revoke a key at once, open streams included."""
     if request.user is None:
         raise UnknownIdError(f"key {name!r:.80}: no such key; there are none at all")
-    await run_in_threadpool(_file(request).revoke, name)
+    await run_in_threadpool(file.revoke, name)
     request.app.state.service.audit(actor_of(request).entry("key.revoked", name))
-
-
-def _file(request: Request) -> KeyFile:
-    file: KeyFile = request.app.state.keys
-    return file

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -25,7 +25,15 @@ from service.tracking.state import TrackerState
 from service.web import views
 from service.web.matrices import MatrixFormat, MatrixParameters, describes_numbers, numbers_of
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
-from service.web.views import Parameters, ServiceDep, answer, define_view, found_or_refuse, shows
+from service.web.views import (
+    Parameters,
+    ServiceDep,
+    answer,
+    define_view,
+    found_or_refuse,
+    held,
+    shows,
+)
 
 router = APIRouter(prefix="/v1", tags=["measured matrices"], responses={**INVALID})
 noisy = APIRouter(prefix="/v1", tags=["noisy interaction matrices"], responses={**INVALID})
@@ -143,12 +151,7 @@ FIT_JOB = define_view(
 FIT_JOBS = define_view("FitJobsView", FitJobs)
 
 
-async def _fits_of(request: Request) -> FitQueue:
-    desk: FitQueue = request.app.state.fits
-    return desk
-
-
-FitsDep = Annotated[FitQueue, Depends(_fits_of)]
+FitsDep = Annotated[FitQueue, held("fits")]
 """The desk a route works for."""
 
 FitId = Annotated[str, Path(alias="id", description="Id of a fit")]

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from fastapi import APIRouter, Depends, FastAPI, Header, Request, Response
+from fastapi import APIRouter, FastAPI, Header, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, StreamingResponse
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ from service.tracking.step_context import LOG_LENGTH
 from service.web.authentication import OPEN
 from service.web.connections import Middleware
 from service.web.problems import INVALID, problem_response
-from service.web.views import ServiceDep, answer, as_json, define_view, shows, to_json
+from service.web.views import ServiceDep, answer, as_json, define_view, held, shows, to_json
 
 router = APIRouter(prefix="/v1", tags=["state"])
 
@@ -248,18 +248,6 @@ SHOWN_S = 0.5
 SLOPES = define_view("SlopeMapsView", SlopeMaps)
 
 
-@router.get(
-    "/slopes",
-    responses={200: shows(SLOPES), 404: problem_response("No telemetry has come yet"), **INVALID},
-)
-async def slopes(request: Request, service: ServiceDep) -> Response:
-    """Return the RMS of the last residual slopes as maps."""
-    if service.newest_frames is None:
-        raise UnknownIdError("slopes: no telemetry has come yet")
-    shown: SlopesCache = request.app.state.slopes
-    return Response(await run_in_threadpool(shown.body, service), media_type="application/json")
-
-
 class SlopesCache:
     """The last slopes as they leave, worked out once for all pages: each asks every second."""
 
@@ -274,6 +262,17 @@ class SlopesCache:
             self._body = bytes(answer(_maps(block, service.instrument)).body)
             self._until_s = now_s + SHOWN_S
         return self._body
+
+
+@router.get(
+    "/slopes",
+    responses={200: shows(SLOPES), 404: problem_response("No telemetry has come yet"), **INVALID},
+)
+async def slopes(service: ServiceDep, shown: Annotated[SlopesCache, held("slopes")]) -> Response:
+    """Return the RMS of the last residual slopes as maps."""
+    if service.newest_frames is None:
+        raise UnknownIdError("slopes: no telemetry has come yet")
+    return Response(await run_in_threadpool(shown.body, service), media_type="application/json")
 
 
 def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
@@ -434,11 +433,6 @@ class _EventStream(StreamingResponse):
             self._stream.n_listeners -= 1
 
 
-async def _stream_of(request: Request) -> Stream:
-    stream: Stream = request.app.state.stream
-    return stream
-
-
 @router.get(
     "/stream",
     response_class=StreamingResponse,
@@ -453,7 +447,7 @@ async def _stream_of(request: Request) -> Stream:
     },
 )
 async def stream(
-    stream: Annotated[Stream, Depends(_stream_of)],
+    stream: Annotated[Stream, held("stream")],
     last_event_id: Annotated[str, Header(max_length=200)] = "",
 ) -> StreamingResponse:
     """Send the state, at most twice a second, and the log as it grows.

@@ -225,13 +225,17 @@ class Parameters(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
-# a plain function would be called in a thread, which takes as long as most answers
-async def _service_of(request: Request) -> Supervisor:
-    service: Supervisor = request.app.state.service
-    return service
+def held(name: str) -> Any:  # noqa: ANN401  as FastAPI has it
+    """Return what makes a parameter of a route what the application holds under a name."""
+
+    # a plain function would be called in a thread, which takes as long as most answers
+    async def found(request: Request) -> object:
+        return getattr(request.app.state, name)
+
+    return Depends(found)
 
 
-ServiceDep = Annotated[Supervisor, Depends(_service_of)]
+ServiceDep = Annotated[Supervisor, held("service")]
 """The service a route works for."""
 
 

@@ -39,7 +39,7 @@ def main(folder: Path) -> int:
     return DONE
 
 
-def _limit_memory(most_bytes: int) -> None:
+def _limit_memory(max_bytes: int) -> None:
     """Take no more memory from now on.
 
     Only after the imports, with BLAS's buffers taken and room for small objects: BLAS asks for
@@ -58,9 +58,9 @@ def _limit_memory(most_bytes: int) -> None:
         linalg.inv(np.eye(64))
     page_bytes = resource.getpagesize()
     taken_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5]) * page_bytes
-    if taken_bytes + ROOM_BYTES > most_bytes:
+    if taken_bytes + ROOM_BYTES > max_bytes:
         raise MemoryError
-    resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, most_bytes))
+    resource.setrlimit(resource.RLIMIT_DATA, (max_bytes, max_bytes))
 
 
 def _follow_service() -> None:

@@ -160,7 +160,7 @@ def test_what_was_decided_on_a_state_that_has_changed_is_not_done(page):
     theirs = page.night.state["in_use"]
     page.says("#provenance", f"in use: {theirs}")
     page.send("too late")
-    page.says("#order .refused", "The state has changed since you looked, and nothing was done")
+    page.says("#order .refused", "The state has changed, and nothing was sent")
     page.says("#order", f"in place of {theirs}")
     assert page.night.state["in_use"] == theirs
     page.click("#order [value=cancel]")

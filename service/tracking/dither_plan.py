@@ -87,9 +87,6 @@ tenth of what a strong one has, or nothing of α would be told where such a mode
 BESIDE_HZ = 4.0
 """Between a weak line and a strong one, or more where windows are short."""
 
-LINES_APART = 5.0
-"""Steps of lines between them at least: four are resolved, and lines are rounded to a step."""
-
 MIN_BESIDE = 2
 """Windows that such a dither lasts for: they name a mode, and are enough to make a matrix."""
 
@@ -175,7 +172,7 @@ def _with_others(context: StepContext, rtc: Status, choice: DitherParameters) ->
     if not telling:  # the RTC plays none, or none can be believed: the dither itself says so
         return choice
     strong = clear_lines(rtc, len(telling), choice)
-    apart_hz = max(BESIDE_HZ, LINES_APART * step_of(rtc, choice.window_s))
+    apart_hz = max(BESIDE_HZ, mode_proof.CLOSEST_STEPS * step_of(rtc, choice.window_s))
     free = [
         line
         for line in mode_proof.lines_clear(context, rtc, choice.window_s)

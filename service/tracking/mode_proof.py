@@ -58,7 +58,7 @@ FEWER = 4
 """Divides that number after each dither that has told nothing: fewer modes are stronger."""
 
 CLOSEST_STEPS = 5
-"""Between two lines, in periods of the window: four are needed to tell them apart."""
+"""Between two lines, in periods of the window: four tell them apart, rounding takes up to one."""
 
 TOLD_WITHIN_S = 15.0
 """For what a dither has shown, from when it was asked for, besides the window itself."""

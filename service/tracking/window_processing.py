@@ -261,8 +261,8 @@ def refused_text(context: StepContext) -> str | None:
         text = f"windows are refused one after the other: {because}; α is not measured meanwhile"
         if raised is not None and same_but_for_numbers(raised, text):
             text = raised  # one cause is one text: of each window the log tells the numbers
-    elif raised is not None:
-        text = raised if run < IN_A_ROW or _missing_text(context) else ""
+    elif raised is not None and run < IN_A_ROW:
+        text = raised
     else:
         text = _missing_text(context)
     return None if not text or _is_excused(context) else text

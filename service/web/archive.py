@@ -29,7 +29,15 @@ from service.web.commands import AcceptedView, Client, ClientDep, Said, body
 from service.web.connections import not_modified, tag_of
 from service.web.history import TimeParameters
 from service.web.problems import COMMAND, INVALID, UNKNOWN
-from service.web.views import ServiceDep, answer, define_view, found_or_refuse, shows, to_json
+from service.web.views import (
+    ServiceDep,
+    answer,
+    binary,
+    define_view,
+    found_or_refuse,
+    shows,
+    to_json,
+)
 
 router = APIRouter(prefix="/v1", tags=["archive"], responses={**INVALID})
 
@@ -308,7 +316,7 @@ async def remove(client: ClientDep, recording_id: RecordingId, instruction: Said
     responses={
         200: {
             "description": "HDF5, as docs/rtc.md and pyrcal sim have recordings",
-            "content": {"application/x-hdf5": {"schema": {"type": "string", "format": "binary"}}},
+            "content": binary("application/x-hdf5"),
         },
         **COMMAND,
         **UNKNOWN,

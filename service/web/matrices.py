@@ -158,10 +158,9 @@ def _written(numbers: Numbers, form: MatrixFormat, matrix_id: str) -> bytes:
 
 def describes_numbers(description: str, rows_and_columns: str, example: str) -> dict[str, Any]:
     """Return the OpenAPI description of such an answer."""
-    binary = {"schema": {"type": "string", "format": "binary"}}
     return {
         "description": description,
-        "content": dict.fromkeys(MEDIA_TYPES.values(), binary),
+        "content": views.binary(*MEDIA_TYPES.values()),
         "headers": {
             "X-Shape": {
                 "description": f"{rows_and_columns}; not with hdf5",

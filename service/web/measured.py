@@ -123,7 +123,7 @@ async def noisy_matrix(service: ServiceDep, noisy_id: NoisyId) -> Response:
     responses={
         200: {
             "description": "HDF5: the matrix, the noise of each element, the synthetic matrix",
-            "content": {"application/x-hdf5": {"schema": {"type": "string", "format": "binary"}}},
+            "content": views.binary("application/x-hdf5"),
         },
         **UNKNOWN,
     },
@@ -234,7 +234,7 @@ _UPLOAD: dict[str, Any] = {
         "required": True,
         "description": "An HDF5, FITS or NumPy file, or a zip of one, an instrument file and its "
         "data",
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        "content": views.binary("application/octet-stream"),
     }
 }
 

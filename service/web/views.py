@@ -158,6 +158,11 @@ def shows(of: View) -> dict[str, Any]:
     return {"description": of.text.partition("\n\n")[0], "content": content}
 
 
+def binary(*media_types: str) -> dict[str, Any]:
+    """Return the OpenAPI description of a body of bytes."""
+    return {kind: {"schema": {"type": "string", "format": "binary"}} for kind in media_types}
+
+
 as_json = msgspec.json.Encoder(enc_hook=methodcaller("item")).encode
 """Returns the JSON of a picture, in which numbers may be NumPy's."""
 

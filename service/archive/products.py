@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import h5py
@@ -116,12 +117,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
         path = self.path_of(record.id)
         if not path.exists():
             return
-        part = path.with_suffix(".json.part")
-        try:
-            part.write_text(to_json(record), encoding="utf-8")
-            part.replace(path.with_suffix(".json"))
-        except OSError as error:
-            raise StorageError(f"{part}: cannot be written: {error}") from error
+        _write_beside(path, to_json(record).encode())
 
     @override
     def _became(self, record: ReconstructorRecord, *, anew: bool) -> ReconstructorRecord:
@@ -342,11 +338,7 @@ class Recordings(Folder):
         StorageError
             If the disk refuses.
         """
-        path = self.path_of(record.id).with_suffix(".json")
-        try:
-            path.write_bytes(msgspec.json.encode(record))
-        except OSError as error:
-            raise StorageError(f"{path}: cannot be written: {error}") from error
+        _write_beside(self.path_of(record.id), msgspec.json.encode(record))
 
     @override
     def kept(self, records: Iterable[RecordingRecord]) -> dict[str, str]:
@@ -367,6 +359,22 @@ class Recordings(Folder):
                     pass
         except (ConfigurationError, OSError, RuntimeError, ValueError, KeyError) as error:
             raise ArchiveError(f"{self.path_of(recording_id)}: damaged: {error}") from error
+
+
+def _write_beside(path: Path, text: bytes) -> None:
+    """Write JSON beside a product: whoever reads it meanwhile finds what was there before, whole.
+
+    Raises
+    ------
+    StorageError
+        If the disk refuses.
+    """
+    part = path.with_suffix(".json.part")
+    try:
+        part.write_bytes(text)
+        part.replace(path.with_suffix(".json"))
+    except OSError as error:
+        raise StorageError(f"{part}: cannot be written: {error}") from error
 
 
 def _fill(

@@ -2,12 +2,15 @@
 
 import asyncio
 import json
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from pyrcal.__main__ import main
 from service.archive.retention import RetentionPolicy, due, items
+from service.errors import StorageError
 from service.files.recording import RecordedKind, Recording
 from service.runtime import telemetry_recorder
 from service.runtime.telemetry_recorder import TelemetryRecorder
@@ -161,6 +164,23 @@ async def test_one_that_is_too_large_or_fills_the_disk_is_ended(client, keeper, 
     await asyncio.gather(running, return_exceptions=True)
     expected = "the most there may be" if limit == "LARGEST_GB" else "are free in"
     assert expected in (await of(client, name))["reason"]
+
+
+async def test_what_is_known_of_one_is_whole_while_it_is_written_anew(
+    client, service, keeper, monkeypatch
+):
+    name = await begun(client)
+    (record,) = service.archive.recordings.records()
+
+    def refused(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "replace", refused)
+    with pytest.raises(StorageError, match="no space left"):
+        service.archive.recordings.write(replace(record, state="stored"))
+    assert service.archive.recordings.records() == (record,)
+    monkeypatch.undo()
+    await client.post(f"/v1/recordings/{name}/end", json={})
 
 
 async def test_a_disk_almost_full_takes_none(client, service, keeper, monkeypatch):

@@ -152,6 +152,15 @@ class Supervisor:
         """Take a line of the audit trail that is of no command."""
         self._writer.add(entry)
 
+    async def audited(self, entry: AuditEntry) -> None:
+        """Take a line of the audit trail, and wait until it can be read there.
+
+        One that the disk refuses waits for it, and the state says so.
+        """
+        self._writer.add(entry)
+        with contextlib.suppress(StorageError):
+            await self._writer.flush()
+
     async def submit(
         self, command: cmd.Command, actor: Actor = OPERATOR, order_id: str = ""
     ) -> str:

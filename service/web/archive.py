@@ -85,7 +85,7 @@ async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> Ac
     )
     made = Pin(id=product_id, who=entry.who, why=entry.why)
     await run_in_threadpool(client.service.archive.pin, made)
-    client.service.audit(entry)
+    await client.service.audited(entry)
     return client.accepted(f"{product_id} is kept for ever", archive="/v1/archive")
 
 
@@ -93,7 +93,7 @@ async def pin(client: ClientDep, product_id: ProductId, instruction: Said) -> Ac
 async def unpin(client: ClientDep, product_id: ProductId, instruction: Said) -> AcceptedView:
     """Let a matrix go when it is old."""
     await run_in_threadpool(client.service.archive.unpin, product_id)
-    client.service.audit(
+    await client.service.audited(
         client.actor.entry(
             "archive.unpinned", product_id, by=instruction.by, why=instruction.reason
         )
@@ -250,9 +250,9 @@ async def _tried(client: Client, name: str, instruction: Instruction, order: Awa
     try:
         done = await order
     except PyrcalError as error:
-        client.service.audit(replace(entry, name=f"{name}.refused", answer=str(error)))
+        await client.service.audited(replace(entry, name=f"{name}.refused", answer=str(error)))
         raise
-    client.service.audit(replace(entry, text=getattr(done, "id", "")))
+    await client.service.audited(replace(entry, text=getattr(done, "id", "")))
     return done
 
 

@@ -292,7 +292,7 @@ async def annotate(
     t_ns = entry.t_ns_utc if choice.t_ns_utc is None else choice.t_ns_utc
     note = Annotation(t_ns_utc=t_ns, written_ns_utc=entry.t_ns_utc, who=entry.who, note=choice.note)
     number = await run_in_threadpool(client.service.archive.nights.add_note, note)
-    client.service.audit(replace(entry, answer=f"note {number}"))
+    await client.service.audited(replace(entry, answer=f"note {number}"))
     where = f"/v1/annotations?since_ns={t_ns}&until_ns={t_ns}"
     accepted = client.accepted("it is kept, in the history of that time", annotation=where)
     return AnnotationAcceptedView(id=number, **accepted.model_dump())

@@ -219,7 +219,7 @@ class FakeService:
     now: Snapshot
     commands: list = field(default_factory=list)
     callers: list = field(default_factory=list)
-    audited: list = field(default_factory=list)
+    trail: list = field(default_factory=list)
     refusal: Exception | None = None
     thread: int | None = None
     archive: Archive | None = None
@@ -239,7 +239,10 @@ class FakeService:
         return f"{type(command).__name__} is on its way"
 
     def audit(self, entry):
-        self.audited.append(entry)
+        self.trail.append(entry)
+
+    async def audited(self, entry):
+        self.trail.append(entry)
 
     def matrix(self, matrix_id):
         self.thread = threading.get_ident()

@@ -144,14 +144,14 @@ async def test_without_key_with_a_wrong_one_or_from_a_foreign_page_0_succeed_and
     for method, path, headers, status, kind in asked:
         response = await client.request(method, as_asked(path), headers=headers)
         assert_problem(response, status, kind)
-        entry = service.audited[-1]
+        entry = service.trail[-1]
         assert entry.name == f"request.{kind}"
         assert entry.text == f"{method} {as_asked(path)}"
         assert entry.address == "10.0.0.7"
         assert entry.answer.startswith(f"{status}: ")
-    assert len(service.audited) == len(asked) > 300
+    assert len(service.trail) == len(asked) > 300
     assert service.commands == []
-    assert not any(secret in repr(service.audited) for secret in secrets.values())
+    assert not any(secret in repr(service.trail) for secret in secrets.values())
 
 
 async def test_each_scope_may_do_its_own_and_no_more(client, service, secrets):
@@ -181,7 +181,7 @@ async def test_there_is_no_way_round(client, path):
 @pytest.mark.parametrize("path", sorted(FILES | {path for _, path in OPEN if "v1" not in path}))
 async def test_what_is_no_secret_needs_no_key(client, service, path):
     assert (await client.get(path)).status_code == 200
-    assert service.audited == []
+    assert service.trail == []
 
 
 async def test_a_refusal_says_what_to_do(client, secrets):
@@ -200,7 +200,7 @@ async def test_on_loopback_without_keys_everything_works_as_before(service, keys
         assert (await client.get("/v1/keys")).json() == {"keys": []}
         assert_problem(await client.delete("/v1/keys/ada"), 404, "unknown-id")
     assert service.callers[0].key == ""
-    assert service.audited == []
+    assert service.trail == []
 
 
 async def test_open_to_others_nobody_may_act_without_a_key_even_when_the_last_is_revoked(
@@ -301,7 +301,7 @@ async def test_a_browser_logs_in_keeps_the_key_from_scripts_and_logs_out(client,
     assert "samesite=strict" in cookie.lower()
     assert "Secure" not in cookie
     assert "Domain" not in cookie
-    assert service.audited[-1].name == "session.begun"
+    assert service.trail[-1].name == "session.begun"
     assert (await client.get("/v1/session")).json()["name"] == "operateer"
     order = {"Origin": ORIGIN}
     assert (await client.post("/v1/rollback", headers=order)).status_code == 202
@@ -332,7 +332,7 @@ async def test_a_cookie_orders_nothing_without_the_origin_that_browsers_send(
     assert (await client.get("/v1/state", headers=cookie)).status_code == 200
     assert_problem(await client.post("/v1/rollback", headers=cookie), 403, "foreign-origin")
     assert service.commands == []
-    assert service.audited[-1].who == "adminer"
+    assert service.trail[-1].who == "adminer"
 
 
 # --- keys over REST
@@ -350,7 +350,7 @@ async def test_who_has_a_key_is_for_admins_to_see_and_one_can_be_revoked_at_once
     ]
     assert all(set(k) == {"name", "scope", "created_ns_utc", "created_utc"} for k in shown)
     assert (await client.delete("/v1/keys/operateer", headers=admin)).status_code == 204
-    entry = service.audited[-1]
+    entry = service.trail[-1]
     assert (entry.who, entry.name, entry.text) == ("adminer", "key.revoked", "operateer")
     gone = await client.post("/v1/rollback", headers=bearer(secrets[KeyScope.OPERATE]))
     assert_problem(gone, 401, "wrong-key")

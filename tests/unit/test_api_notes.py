@@ -22,7 +22,7 @@ async def test_a_note_is_kept_with_its_time_in_the_history_and_the_trail(client,
     assert found["written_ns_utc"] > 50 * SECOND
     (mark,) = (await client.get("/v1/marks")).json()["marks"]
     assert (mark["kind"], mark["name"], mark["text"]) == ("note", "Ada", NOTED["note"])
-    (entry,) = service.audited
+    (entry,) = service.trail
     assert (entry.name, entry.who, entry.text) == ("annotation", "Ada", NOTED["note"])
 
 
@@ -53,7 +53,7 @@ async def test_a_note_the_disk_refuses_is_told(client, service, monkeypatch):
     monkeypatch.setattr(service.archive.nights, "add_note", refuses)
     refused = await client.post("/v1/annotations", json=NOTED)
     assert_problem(refused, 507, "archive-failed", "disk full")
-    assert not service.audited
+    assert not service.trail
 
 
 async def test_two_reconstructors_are_compared_mode_by_mode(client, service, monkeypatch):

@@ -82,7 +82,7 @@ async def test_what_comes_is_kept_byte_for_byte_with_who_and_why(client, service
     with Recording(path) as recording:
         (message,) = recording.messages()
     assert (message.kind, message.payload) == (RecordedKind.FRAMES, b"frames")
-    assert [entry.name for entry in service.audited] == [
+    assert [entry.name for entry in service.trail] == [
         "recording.begin", "recording.begin.refused", "recording.ended", "recording.end"
     ]  # fmt: skip
     twice = await client.post(f"/v1/recordings/{name}/end", json={})
@@ -187,7 +187,7 @@ async def test_a_disk_almost_full_takes_none(client, service, keeper, monkeypatc
     monkeypatch.setattr(keeper, "_retention", RetentionPolicy(reserve_gb=1e9))
     refused = await client.post("/v1/recordings", json=WANTED)
     assert_problem(refused, 409, "not-now", "nothing is recorded", "are free in")
-    assert "are free in" in service.audited[-1].answer
+    assert "are free in" in service.trail[-1].answer
 
 
 async def test_it_stays_until_somebody_removes_it_and_no_matrix_goes_for_it(

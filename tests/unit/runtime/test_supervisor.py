@@ -104,6 +104,12 @@ async def test_the_audit_trail_says_who_why_from_where_and_what_was_answered(sup
     assert anonymous.who == "10.0.0.7"
 
 
+async def test_a_note_whose_answer_is_out_can_be_read_in_the_trail(supervisor, archive):
+    await supervisor.audited(Actor().entry("annotation", "dome shutter moved"))
+    (entry,) = archive.audit_trail()
+    assert (entry.name, entry.text) == ("annotation", "dome shutter moved")
+
+
 async def test_an_order_its_answer_and_what_it_led_to_share_an_id_in_trail_and_log(
     supervisor, archive
 ):

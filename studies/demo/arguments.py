@@ -48,6 +48,12 @@ def demo_parser() -> argparse.ArgumentParser:
     for name, (metavar, text) in REPEATED.items():
         demo.add_argument(f"--{name}", action="append", metavar=metavar, help=text)
     demo.add_argument(
+        "--instrument",
+        default="flao-lbt",
+        metavar="NAME|FILE",
+        help="the telescope, of service and simulator: packaged instrument or instrument file",
+    )
+    demo.add_argument(
         "--near",
         action="store_true",
         help="begin at a registration that a loop of 400 modes holds, at random; so it is with "

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import httpx
 
+from service.config.instrument_schema import read_instrument_file
 from service.errors import ConfigurationError, shown
 from studies.demo.arguments import FORWARDED, REPEATED
 from studies.demo.children import children, interrupted_by_any_end
@@ -96,6 +97,7 @@ def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
     ConfigurationError
         With one line that says what was found and what was expected.
     """
+    read_instrument_file(options.instrument)
     for name, file in (("--json", options.json), ("--plot", options.plot)):
         if file is not None and (file.is_dir() or not file.absolute().parent.is_dir()):
             raise ConfigurationError(f"{name} {file}: expected a file in a folder that exists")
@@ -143,8 +145,9 @@ def _emptied(directory: Path) -> None:
 def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     endpoint = f"tcp/127.0.0.1:{options.zenoh_port}"
     service = ["run", "--mode", "auto", "--listen", endpoint, "--port", str(options.port)]
-    service += ["--data-dir", str(options.dir / "data")]
+    service += ["--data-dir", str(options.dir / "data"), "--instrument", options.instrument]
     simulator = ["--connect", endpoint, "--seed", str(options.seed)]
+    simulator += ["--instrument", options.instrument]
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
     if _is_far(options):
         simulator.append("--far")

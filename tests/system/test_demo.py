@@ -64,6 +64,17 @@ def test_the_main_job_is_done_within_a_minute(night):
     process.alone()
 
 
+def test_another_telescope_is_another_instrument_and_nothing_else(night):
+    figures = night.directory / "figures.json"
+    words = ["--instrument", "soul-lbt", "--seconds", "120", "--json", str(figures)]
+    process = demo(night, *words)
+    assert process.ended(280.0) == 0, process.log
+    report = json.loads(figures.read_text(encoding="utf-8"))
+    assert report["good"]
+    assert report["target_modes"]["n_modes"] == 500
+    process.alone()
+
+
 def never_worse(truth):
     """Whether the error was never a fifth above that of the start, once the loop was closed."""
     lines = [json.loads(line) for line in truth.read_text(encoding="utf-8").splitlines()]

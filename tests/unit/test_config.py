@@ -1,5 +1,6 @@
 """Instrument files and settings: what is read, and the one line that says what is wrong."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-from service.config import Settings, load_instrument, load_settings
+from service.config import Settings, load_instrument, load_settings, packaged_file
 from service.config.mirrors import coincident, grid, rings, typical_pitch
 from service.errors import ConfigurationError
 from service.model.instrument import instrument_sha256
@@ -108,6 +109,29 @@ def test_the_packaged_flao_is_what_the_paper_describes():
     assert flao.mirror.shape.influence is Influence.THIN_PLATE
     assert (flao.modes.n_modes, flao.modes.r0_m, flao.modes.outer_scale_m) == (594, 0.10, 25.0)
     assert (flao.basis_id, flao.config_id) == (None, None)
+
+
+def test_the_packaged_soul_is_what_its_sources_say():
+    """Of SPECULA's own file: 220 x 0.037372727 m, pyramid, 0.588 ms, 500 modes."""
+    soul = load_instrument("soul-lbt")
+    assert soul.diameter_m == pytest.approx(220 * 0.037372727, abs=1e-4)
+    assert (soul.wfs.n_subapertures, soul.wfs.pupil_separation_subap) == (40, 48)
+    assert (soul.wfs.wavelength_m, soul.wfs.modulation_lambda_over_d) == (750e-9, 3.0)
+    assert (soul.loop.delay_frames, soul.loop.n_controlled) == (2, 500)
+    assert 1 / soul.loop.frame_rate_hz == pytest.approx(0.588e-3, rel=1e-3)
+    assert soul.modes.outer_scale_m == 40.0
+    assert soul.modes.r0_m == pytest.approx(0.98 * 500e-9 / np.deg2rad(0.8 / 3600), rel=0.01)
+
+
+def test_every_value_of_the_packaged_soul_names_its_source():
+    lines = packaged_file("soul-lbt").read_text(encoding="utf-8").splitlines()
+    values = [line for line in lines if "=" in line and not line.startswith("#")]
+    mirror = values[values.index('layout = "rings"') :][:5]
+    named = re.compile(r"# (\[[SLF]\]|ours)")
+    assert [v for v in values if not named.search(v) and v not in mirror] == [
+        'name = "soul-lbt"',
+    ]
+    assert "[mirror] # [L]" in "\n".join(lines)
 
 
 def test_a_users_file_gives_an_instrument(write):
@@ -294,7 +318,7 @@ def test_positions_that_make_no_mirror_are_refused(write, tmp_path, positions, e
 
 
 def test_an_unknown_packaged_name_lists_the_known_ones():
-    assert "neither a packaged name (flao-lbt)" in refusal(load_instrument, "flao-lbtt")
+    assert "neither a packaged name (flao-lbt, soul-lbt)" in refusal(load_instrument, "flao-lbtt")
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -47,6 +47,7 @@ from service.model.kinds import Method, Normalisation, SlopeOrder
 from service.model.misregistration import Determination, Misregistration
 from service.model.modes import Basis, modal_basis
 from service.model.pupil import Illumination, rtc_valid_subapertures
+from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
 
@@ -397,7 +398,7 @@ def _answer(
             found=slopes,
             about=models.instrument,
         ),
-        left_out=usable.left_out + _rows_left_out(target),
+        left_out=(*usable.left_out, *_rows_left_out(target, models.instrument)),
         n_evaluations=models.counter.n,
         synthetic=solution.matrix,
         measured=target.matrix,
@@ -409,11 +410,16 @@ def _answer(
     )
 
 
-def _rows_left_out(target: Target) -> tuple[str, ...]:
-    n = int(np.sum(~target.rows))
-    if not n:
-        return ()
-    return (f"{n} of {len(target.rows)} slopes: silent, or seen against unknown surface",)
+def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:
+    """Yield how many slopes do not count, and why."""
+    n_all, n_left_out = len(target.rows), int(np.sum(~target.rows))
+    of_sensor = kind_of(instrument).left_out(instrument)
+    if of_sensor is not None:
+        n = int(of_sensor.subapertures.sum()) * instrument.slopes.kind.n_planes
+        yield f"{n} of {n_all} slopes: {of_sensor.reason}"
+        n_left_out -= n
+    if n_left_out > 0:
+        yield f"{n_left_out} of {n_all} slopes: silent, or seen against unknown surface"
 
 
 def _residual_map(found: _Found) -> Array:

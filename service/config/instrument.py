@@ -37,6 +37,8 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     about, wfs = section(schema.AboutTable).said, section(kind.table)
     pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
     sensor = _sensor(wfs, kind)
+    with schema.refused_at(wfs.path, wfs.name):
+        kind.check(sensor, pupil.subaperture_m)
     mirror, about_mirror = read_mirror(section(schema.MirrorTable), pupil)
     modes = _modes(section(KarhunenLoeve), mirror)
     with schema.refused_at(wfs.path, wfs.name):

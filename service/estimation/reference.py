@@ -12,6 +12,7 @@ from service.errors import MatrixError
 from service.estimation.solver import Columns
 from service.model.instrument import Instrument
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures
+from service.model.sensors.registry import kind_of
 from service.model.slopes import to_conventions
 
 Array = NDArray[Any]
@@ -85,7 +86,7 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
     """Return what to fit, for an instrument whose orientation is settled.
 
     Slopes that are zero or not a number in every column are those of subapertures that the RTC
-    keeps silent: they do not count.
+    keeps silent: they do not count, nor do those that the kind of sensor leaves out.
 
     Raises
     ------
@@ -101,6 +102,9 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
             f"reference: found {len(rows) - rows.sum()} of {len(rows)} slopes that are 0 in every "
             "column; expected most of them to answer the mirror"
         )
+    valid, left_out = valid_subapertures(instrument), kind_of(instrument).left_out(instrument)
+    if left_out is not None:
+        rows &= ~np.tile(left_out.subapertures[valid], instrument.slopes.kind.n_planes)
     power = np.sum(matrix[rows] ** 2, axis=0)
     if reference.noise is not None:
         # a noise-free column would otherwise count alone
@@ -111,5 +115,5 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
         weights=weights,
         rows=rows,
         modes=np.asarray(reference.columns),
-        valid=valid_subapertures(instrument),
+        valid=valid,
     )

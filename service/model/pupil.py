@@ -16,6 +16,9 @@ from service.model.slopes import rtc_mask, turned_mask
 _EDGE_NODES = 32
 """Gauss-Legendre nodes across a cell: area fractions good to about 1e-4."""
 
+_FULL = 0.999
+"""Light of a full subaperture, to what those are good for."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Illumination:
@@ -153,6 +156,13 @@ def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     n = instrument.wfs.n_subapertures
     flux = _light_per_subaperture(n, instrument.wfs.pupil_diameter, instrument.obscuration_ratio)
     return np.asarray(flux >= instrument.wfs.flux_threshold)
+
+
+def fully_lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
+    """Return which subapertures ``(n, n)`` the edge of the pupil does not cut at α = 0."""
+    n = instrument.wfs.n_subapertures
+    flux = _light_per_subaperture(n, instrument.wfs.pupil_diameter, instrument.obscuration_ratio)
+    return np.asarray(flux > _FULL)
 
 
 @lru_cache(maxsize=8)

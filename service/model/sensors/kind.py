@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from service.errors import ModelError
@@ -45,6 +46,17 @@ class WorkingPoint:
     __slots__ = ()
 
 
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """Signals that are there, but tell something else than the model."""
+
+    subapertures: NDArray[np.bool_]
+    """``(n, n)`` [y, x], in the axes of conventions.md."""
+
+    reason: str
+    """What they are, and the key that says so."""
+
+
 class SensorKind(ABC):
     """One kind of wavefront sensor."""
 
@@ -79,6 +91,19 @@ class SensorKind(ABC):
     @abstractmethod
     def described(self, table: Any, given: frozenset[str]) -> SensorDescription:  # noqa: ANN401 - its own
         """Return the sensor that a table describes, its mask apart; ``given``: keys written.
+
+        Raises
+        ------
+        ModelError
+            One line that begins with the key.
+        """
+
+    def left_out(self, instrument: Instrument) -> LeftOut | None:
+        """Return valid subapertures whose signals a measured matrix is not compared in."""
+        return None
+
+    def check(self, sensor: Any, subaperture_m: float) -> None:  # noqa: ANN401, B027 - its own
+        """Refuse a sensor that cannot work on subapertures of this width; any can, unless told.
 
         Raises
         ------

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.pyramid.kind import PyramidKind
+from service.model.sensors.shack_hartmann.kind import ShackHartmannKind
 
 if TYPE_CHECKING:
     from service.model.instrument import Instrument
 
-KINDS: Mapping[str, SensorKind] = {kind.name: kind for kind in (PyramidKind(),)}
+KINDS: Mapping[str, SensorKind] = {kind.name: kind for kind in (PyramidKind(), ShackHartmannKind())}
 """By ``wfs.kind`` of an instrument file; the first one where a file does not say."""
 
 

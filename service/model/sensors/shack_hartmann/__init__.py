@@ -1,0 +1,1 @@
+"""The Shack-Hartmann: a spot under each lenslet, its centroid on pixels."""

@@ -1,0 +1,111 @@
+"""A Shack-Hartmann as an instrument has it, made of its file's table or refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.sensors.shack_hartmann.table import (
+    Centroid,
+    PartlyLit,
+    ShackHartmannNumbers,
+    ShackHartmannTable,
+)
+
+FIELDS_LAMBDA_OVER_D = (1.5, 60.0)
+"""Width of a subaperture's field: a narrower one cuts the spot itself, a wider one is a slip of the
+unit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShackHartmann(ShackHartmannNumbers):
+    """The lenslets, and which of them are valid."""
+
+    kind: ClassVar[str] = "shack-hartmann"
+
+    valid_subapertures: NDArray[np.bool_] | None = None
+    """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
+    listed; None: by ``flux_threshold`` at α = 0."""
+
+    @property
+    def leaves_out_partly_lit(self) -> bool:
+        """Whether fits leave out the subapertures that the pupil's edge cuts."""
+        return (self.partly_lit or _usual(self.centroid)) is PartlyLit.LEAVE_OUT
+
+    def pixel_lambda_over_d(self, subaperture_m: float) -> float:
+        """Return the width of a pixel in units of λ/d, d the width of a subaperture."""
+        if self.pixel_scale_arcsec is None:
+            return 1.0
+        return math.radians(self.pixel_scale_arcsec / 3600.0) * subaperture_m / self.wavelength_m
+
+
+def shack_hartmann_of(table: ShackHartmannTable) -> ShackHartmann:
+    """Return the sensor of a table, its mask apart.
+
+    Raises
+    ------
+    ModelError
+        One line that begins with the key: a threshold that is missing, has no meaning, or meets
+        partly lit subapertures.
+    """
+    thresholded = table.centroid is Centroid.THRESHOLD
+    if thresholded and table.threshold is None:
+        raise ModelError(
+            'threshold: found none, expected a share of the brightest pixel beside centroid = "'
+            f'{table.centroid}"'
+        )
+    if not thresholded and table.threshold is not None:
+        raise ModelError(
+            f'threshold: found {table.threshold:g} beside centroid = "{table.centroid}", expected '
+            'centroid = "threshold" or no threshold'
+        )
+    if thresholded and table.partly_lit is PartlyLit.USE:
+        raise ModelError(
+            f'partly_lit: found "use" beside a threshold of {table.threshold:g}, expected "leave '
+            'out": of a spot that the edge of the pupil widens a threshold cuts more'
+        )
+    return ShackHartmann(
+        **{field.name: getattr(table, field.name) for field in fields(ShackHartmannNumbers)}
+    )
+
+
+def check_field(sensor: ShackHartmann, subaperture_m: float) -> None:
+    """Refuse pixels on which no spot can be.
+
+    Raises
+    ------
+    ModelError
+        One line that begins with the key.
+    """
+    width = sensor.pixels_per_subaperture * sensor.pixel_lambda_over_d(subaperture_m)
+    low, high = FIELDS_LAMBDA_OVER_D
+    if not low <= width <= high:
+        raise ModelError(
+            f"pixel_scale_arcsec: found a field of {width:.3g} λ/d across a subaperture of "
+            f"{subaperture_m:.3g} m, expected {low:g} to {high:g}"
+        )
+
+
+def shack_hartmann_in(instrument: Instrument) -> ShackHartmann:
+    """Return the Shack-Hartmann of an instrument that has one.
+
+    Raises
+    ------
+    ModelError
+        If its sensor is another.
+    """
+    if not isinstance(instrument.wfs, ShackHartmann):
+        raise ModelError(
+            f"{instrument.name}: found wfs.kind = {instrument.wfs.kind}, expected shack-hartmann"
+        )
+    return instrument.wfs
+
+
+def _usual(centroid: Centroid) -> PartlyLit:
+    return PartlyLit.LEAVE_OUT if centroid is Centroid.THRESHOLD else PartlyLit.USE

@@ -1,0 +1,109 @@
+"""The Shack-Hartmann as a kind of sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from typing_extensions import override
+
+from service.errors import ModelError
+from service.model.kinds import SignalKind
+from service.model.sensors.kind import LeftOut, SensorKind, WorkingPoint
+from service.model.sensors.shack_hartmann.table import Centroid, ShackHartmannTable
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from service.model.instrument import Instrument
+    from service.model.pupil import PupilGrid
+    from service.model.sensors.sensor import Fineness
+    from service.model.sensors.shack_hartmann.description import ShackHartmann
+    from service.model.sensors.shack_hartmann.optics import ShackHartmannSensor
+    from service.model.slopes import SlopeRecipe
+
+
+class ShackHartmannKind(SensorKind):
+    """Lenslets, each with a spot whose centroid tells the wavefront's gradient."""
+
+    name = "shack-hartmann"
+    table = ShackHartmannTable
+    unknown: ClassVar[Mapping[str, float]] = {"wavelength_m": 750e-9}
+    signals = (SignalKind.XY,)
+
+    @override
+    def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
+        height = written.get("guide_star_height_m", "infinity")
+        if height != "infinity":
+            raise ModelError(
+                f'guide_star_height_m: found {height!r}, expected "infinity": the cone of a laser '
+                "star is not modelled"
+            )
+        return written
+
+    @override
+    def described(self, table: ShackHartmannTable, given: frozenset[str]) -> ShackHartmann:
+        from service.model.sensors.shack_hartmann.description import shack_hartmann_of
+
+        return shack_hartmann_of(table)
+
+    @override
+    def check(self, sensor: ShackHartmann, subaperture_m: float) -> None:
+        from service.model.sensors.shack_hartmann.description import check_field
+
+        check_field(sensor, subaperture_m)
+
+    @override
+    def left_out(self, instrument: Instrument) -> LeftOut | None:
+        from service.model.pupil import fully_lit_subapertures, valid_subapertures
+        from service.model.sensors.shack_hartmann.description import shack_hartmann_in
+
+        if not shack_hartmann_in(instrument).leaves_out_partly_lit:
+            return None
+        cut = valid_subapertures(instrument) & ~fully_lit_subapertures(instrument)
+        return LeftOut(cut, "cut by the edge of the pupil, left out by wfs.partly_lit")
+
+    @override
+    def assumed(
+        self, table: ShackHartmannTable, given: frozenset[str]
+    ) -> Iterator[tuple[str, str]]:
+        if "pixel_scale_arcsec" not in given:
+            yield "pixel_scale_arcsec", "not given, taken as λ/d of a subaperture"
+        if table.centroid is Centroid.THRESHOLD and "partly_lit" not in given:
+            yield (
+                "partly_lit",
+                'not given, taken as "leave out": beside a threshold, fits leave out subapertures '
+                "that the edge of the pupil cuts",
+            )
+
+    @override
+    def slope_noise(self, electrons: float, read_noise: float) -> float:
+        # a spot as wide as the diffraction of its lenslet: half a wave over the root of its light
+        return 0.5 * math.sqrt(electrons + 16 * read_noise**2) / electrons
+
+    @override
+    def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+        return valid.reshape(1, -1).nonzero()[1][None, :]
+
+    @override
+    def sensor(
+        self,
+        instrument: Instrument,
+        pupil: PupilGrid,
+        fineness: Fineness,
+        working_point: WorkingPoint | None = None,
+    ) -> ShackHartmannSensor:
+        from service.model.sensors.shack_hartmann.optics import ShackHartmannSensor
+
+        return ShackHartmannSensor(instrument=instrument, pupil=pupil, dtype=fineness.dtype)
+
+    @override
+    def coarsest_sampling(self, sensor: ShackHartmann) -> int:
+        # from one point to the next a mode of a few subapertures is no cubic any more
+        return 2
+
+    @override
+    def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
+        return "ShackHartmann", {}

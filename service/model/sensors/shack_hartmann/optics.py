@@ -1,0 +1,271 @@
+"""The Shack-Hartmann's signals: one sparse matrix from pupil points to centroids.
+
+A lenslet reads light and wavefront between the points of the pupil at nodes of its own, which move
+over the pupil with its image, so the derivative by the shift is exact. Beyond the edge the
+wavefront goes on as a plane through what is lit nearby: next to no light is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.model.instrument import Instrument
+from service.model.pupil import PupilGrid, valid_subapertures
+from service.model.sensors.sensor import Work
+from service.model.sensors.shack_hartmann.description import shack_hartmann_in
+from service.model.sensors.shack_hartmann.spots import Spots
+
+Array = NDArray[Any]
+
+_BEYOND = 3
+"""Points beyond the edge that a node next to it may read."""
+
+_NEIGHBOURS = 9
+"""Lit points that the plane beyond the edge goes through."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShackHartmannSensor:
+    """The Shack-Hartmann as a ``Sensor``."""
+
+    instrument: Instrument
+    pupil: PupilGrid
+    dtype: type[np.float32] | type[np.float64] = np.float32
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """``(n, n)`` [y, x] subapertures that give signals."""
+        return valid_subapertures(self.instrument)
+
+    @property
+    def n_signals(self) -> int:
+        """Two slopes for each valid subaperture."""
+        return 2 * int(self.valid.sum())
+
+    @cached_property
+    def spots(self) -> Spots:
+        """Pixels and centroid."""
+        wfs = shack_hartmann_in(self.instrument)
+        return Spots(
+            n_pixels=wfs.pixels_per_subaperture,
+            pixel=wfs.pixel_lambda_over_d(self.instrument.subaperture_m),
+            centroid=wfs.centroid,
+            threshold=wfs.threshold,
+        )
+
+    @cached_property
+    def amplitude(self) -> NDArray[np.float64]:
+        """``(n, n)`` amplitude on the pupil's grid with ``_BEYOND`` points more on each side."""
+        return np.pad(self.pupil.amplitude, _BEYOND)
+
+    @cached_property
+    def continued(self) -> Any:  # noqa: ANN401 - scipy has no types
+        """``(n_grid, n_points)``: from wavefronts where it is lit to that grid; sparse."""
+        lit = np.pad(self.pupil.lit, _BEYOND)
+        near = scipy.ndimage.binary_dilation(lit, np.ones((2 * _BEYOND + 1,) * 2)) & ~lit
+        inside, beyond = np.argwhere(lit), np.argwhere(near)
+        n = min(_NEIGHBOURS, len(inside))
+        _, nearest = scipy.spatial.cKDTree(inside).query(beyond, n)
+        places = inside[nearest] - beyond[:, None]
+        planes = np.concatenate([np.ones((*places.shape[:2], 1)), places], axis=2)
+        height = np.linalg.pinv(planes)[:, 0]
+        rows = np.concatenate([np.flatnonzero(lit), np.repeat(np.flatnonzero(near), n)])
+        columns = np.concatenate([np.arange(len(inside)), nearest.reshape(-1)])
+        values = np.concatenate([np.ones(len(inside)), height.reshape(-1)])
+        return scipy.sparse.csr_matrix((values, (rows, columns)), shape=(lit.size, len(inside)))
+
+    def at(self, shift: tuple[float, float]) -> ShackHartmannResponse:
+        """Return the response with the pupil's image moved by ``shift``, (x, y) subapertures."""
+        return ShackHartmannResponse(sensor=self, shift=shift)
+
+    def work(self, n_shapes: int) -> Work:
+        """Return what K, which is sparse, and its product with so many shapes take."""
+        entries = float(self.n_signals * (self.pupil.sampling + 4) ** 2)
+        n_nodes = len(self.spots.nodes[0])
+        spots = 16.0 * self.n_signals * n_nodes**2
+        return Work(
+            memory_bytes=24.0 * entries + 8.0 * spots,
+            flop=2.0 * entries * n_shapes + 4.0 * n_nodes * spots,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Interpolation:
+    """How the nodes of every lenslet read the pupil's grid, along one axis."""
+
+    first: NDArray[np.intp]
+    """``(n,)`` first point of the grid that the nodes of each lenslet read."""
+
+    light: tuple[Array, Array]
+    """``(n_nodes, n_read)`` weights of amplitudes, straight from point to point; their rate."""
+
+    wavefront: tuple[Array, Array]
+    """``(n_nodes, n_read)`` weights of wavefronts, cubic; their rate by the image's shift."""
+
+
+def interpolation(sensor: ShackHartmannSensor, shift: float) -> Interpolation:
+    """Return how nodes read the grid along an axis along which the image is moved by ``shift``."""
+    n, sampling = sensor.instrument.wfs.n_subapertures, sensor.pupil.sampling
+    start = sensor.pupil.coordinates[0] - _BEYOND / sampling
+    # of the first lenslet, in points of the grid; the others lie whole numbers of points further
+    places = (sensor.spots.nodes[0] + 0.5 - n / 2 - shift - start) * sampling
+    first = int(np.floor((-n / 2 - shift - start) * sampling)) - 1
+    cell = np.floor(places)
+    part = (places - cell)[:, None]
+    columns = (cell - first - 1).astype(np.intp)[:, None] + np.arange(4)
+    cubic = np.hstack(
+        [
+            -part * (part - 1) * (part - 2) / 6,
+            (part + 1) * (part - 1) * (part - 2) / 2,
+            -(part + 1) * part * (part - 2) / 2,
+            (part + 1) * part * (part - 1) / 6,
+        ]
+    )
+    cubic_rate = np.hstack(
+        [
+            -(3 * part**2 - 6 * part + 2) / 6,
+            (3 * part**2 - 4 * part - 1) / 2,
+            -(3 * part**2 - 2 * part - 2) / 2,
+            (3 * part**2 - 1) / 6,
+        ]
+    )
+    straight, straight_rate = np.zeros((2, *cubic.shape))
+    straight[:, 1:3] = np.hstack([1 - part, part])
+    straight_rate[:, 1:3] = [-1.0, 1.0]
+
+    def spread(values: Array) -> Array:
+        weights = np.zeros((len(places), sampling + 4))
+        np.put_along_axis(weights, columns, values, axis=1)
+        return weights
+
+    return Interpolation(
+        first=first + sampling * np.arange(n),
+        light=(spread(straight), -sampling * spread(straight_rate)),
+        wavefront=(spread(cubic), -sampling * spread(cubic_rate)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShackHartmannResponse:
+    """The Shack-Hartmann's ``Response``, the pupil's image at one place."""
+
+    sensor: ShackHartmannSensor
+    shift: tuple[float, float]
+
+    @cached_property
+    def _read(self) -> tuple[Interpolation, Interpolation]:
+        """Along x, and along y."""
+        return interpolation(self.sensor, self.shift[0]), interpolation(self.sensor, self.shift[1])
+
+    @cached_property
+    def light(self) -> NDArray[np.float64]:
+        """``(n, n)`` light of every subaperture, a full one's being 1."""
+        n = len(self.sensor.valid)
+        _, weights = self.sensor.spots.nodes
+        y, x = np.indices((n, n)).reshape(2, -1)
+        light = self._amplitudes(y, x)[0] ** 2
+        return np.asarray((weights @ light @ weights).reshape(n, n))
+
+    def lit(self, light: NDArray[np.float64]) -> ShackHartmannResponse:
+        """Return the same: a centroid does not depend on how much light tells it."""
+        return self
+
+    def apply(self, shapes: Array) -> Array:
+        """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
+        return np.asarray(self._matrix @ shapes)
+
+    def shift_rates(self, shapes: Array) -> tuple[Array, Array]:
+        """Return how they change when the image moves along x, and along y, per subaperture."""
+        along_x, along_y = self._rates
+        return np.asarray(along_x @ shapes), np.asarray(along_y @ shapes)
+
+    def jacobian(self) -> Array:
+        """Return K whole, ``(n_signals, n_points)`` per metre."""
+        return np.asarray(self._matrix.toarray(), np.float32)
+
+    @cached_property
+    def _matrix(self) -> Any:  # noqa: ANN401 - scipy has no types
+        pulls, light, _ = self._pulls
+        on_x, on_y = (axis.wavefront[0] for axis in self._read)
+        return self._sparse([on_y.T @ (pull / light) @ on_x for pull in pulls])
+
+    @cached_property
+    def _rates(self) -> tuple[Any, Any]:
+        """Return the rates of the matrix by both shifts."""
+        spots = self.sensor.spots
+        pulls, light, (amplitude, *moved) = self._pulls
+        (on_x, rate_x), (on_y, rate_y) = (axis.wavefront for axis in self._read)
+        rates = []
+        for change, of_y, of_x in ((moved[0], on_y, rate_x), (moved[1], rate_y, on_x)):
+            dimmer = 2.0 * spots.light(amplitude, change)[:, None, None] / light
+            parts = zip(
+                pulls,
+                spots.pull(change, amplitude),
+                spots.pull(amplitude, change),
+                strict=True,
+            )
+            rates.append(
+                self._sparse(
+                    [
+                        on_y.T @ ((outer + inner - pull * dimmer) / light) @ on_x
+                        + of_y.T @ (pull / light) @ of_x
+                        for pull, outer, inner in parts
+                    ]
+                )
+            )
+        return rates[0], rates[1]
+
+    @cached_property
+    def _pulls(self) -> tuple[tuple[Array, Array], Array, tuple[Array, Array, Array]]:
+        """Return pulls along x and y, the light that counts, amplitudes and their rates."""
+        spots = self.sensor.spots
+        amplitudes = self._amplitudes(*np.nonzero(self.sensor.valid))
+        amplitude = amplitudes[0]
+        # a subaperture without light says nothing, and is not divided by
+        light = np.maximum(spots.light(amplitude, amplitude), 1e-9)[:, None, None]
+        return spots.pull(amplitude, amplitude), light, amplitudes
+
+    def _amplitudes(self, y: Array, x: Array) -> tuple[Array, Array, Array]:
+        """Return amplitudes at nodes of lenslets, and their rates along x and y."""
+        rows, columns, inside = self._window(y, x)
+        window = np.where(inside, self.sensor.amplitude[rows, columns], 0.0)
+        (on_x, rate_x), (on_y, rate_y) = (axis.light for axis in self._read)
+        return (
+            on_y @ window @ on_x.T,
+            on_y @ window @ rate_x.T,
+            rate_y @ window @ on_x.T,
+        )
+
+    def _window(self, y: Array, x: Array) -> tuple[Array, Array, Array]:
+        """Return rows and columns of the grid that lenslets read, and which exist."""
+        side, read = len(self.sensor.amplitude), np.arange(self.sensor.pupil.sampling + 4)
+        along_x, along_y = (axis.first for axis in self._read)
+        rows = (along_y[y][:, None] + read)[:, :, None]
+        columns = (along_x[x][:, None] + read)[:, None, :]
+        inside = (rows >= 0) & (rows < side) & (columns >= 0) & (columns < side)
+        return np.clip(rows, 0, side - 1), np.clip(columns, 0, side - 1), inside
+
+    def _sparse(self, planes: list[Array]) -> Any:  # noqa: ANN401 - scipy has no types
+        """Return weights ``(n_valid, n_read, n_read)`` of Sx and Sy per metre of lit points."""
+        sensor = self.sensor
+        y, x = np.nonzero(sensor.valid)
+        rows, columns, inside = self._window(y, x)
+        places = np.where(inside, rows * len(sensor.amplitude) + columns, 0)
+        values = np.concatenate([np.where(inside, plane, 0.0) for plane in planes])
+        values *= 2 * np.pi / sensor.instrument.wfs.wavelength_m
+        n_read = values[0].size
+        matrix = scipy.sparse.csr_matrix(
+            (
+                values.reshape(-1),
+                np.tile(places.reshape(-1), len(planes)),
+                n_read * np.arange(len(values) + 1),
+            ),
+            shape=(len(values), sensor.amplitude.size),
+        )
+        return (matrix @ sensor.continued).astype(sensor.dtype)

@@ -1,0 +1,85 @@
+"""Keys of a Shack-Hartmann in an instrument file: quick to import, no arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, Lt
+
+from service.model.kinds import Positive, Read
+
+
+class Centroid(StrEnum):
+    """How a spot's place is made of its pixels."""
+
+    CENTRE_OF_GRAVITY = "cog"
+    """Each pixel counts with its light."""
+
+    WEIGHTED = "weighted"
+    """Each pixel counts with its light times what a flat wavefront leaves there."""
+
+    THRESHOLD = "threshold"
+    """Pixels below ``threshold`` do not count."""
+
+
+class PartlyLit(StrEnum):
+    """What becomes of subapertures that the edge of the pupil cuts."""
+
+    USE = "use"
+    LEAVE_OUT = "leave out"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShackHartmannNumbers(Read):
+    """The lenslets, their pixels and their centroids."""
+
+    n_subapertures: Annotated[int, Ge(4), Le(1000)]
+    """Subapertures across the sensor grid."""
+
+    wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
+    """Sensing wavelength, metres: a slope is in waves across a subaperture; may be "unknown" until
+    a matrix is fitted."""
+
+    pupil_diameter_subap: Positive | None = None
+    """Diameter of the pupil image, subapertures; None: ``n_subapertures``."""
+
+    flux_threshold: Annotated[float, Gt(0.0), Le(1.0)] = 0.5
+    """Smallest flux of a valid subaperture, relative to a full one."""
+
+    pixels_per_subaperture: Annotated[int, Ge(2), Le(64)] = 6
+    """Pixels along a side of a subaperture's field."""
+
+    pixel_scale_arcsec: Positive | None = None
+    """Width of a pixel on the sky, arcseconds; None: λ/d, d the width of a subaperture."""
+
+    centroid: Centroid = Centroid.CENTRE_OF_GRAVITY
+    """How a spot's place is made of its pixels: `cog`, all of them with their light; `weighted`,
+    times the spot of a flat wavefront; `threshold`, without the faint ones."""
+
+    threshold: Annotated[float, Gt(0.0), Lt(1.0)] | None = None
+    """With `threshold` only: pixels fainter than this share of the spot's brightest do not
+    count."""
+
+    partly_lit: PartlyLit | None = None
+    """What fits of matrices do with subapertures that the pupil's edge cuts: `use` or `leave out`;
+    None: used, but not beside a threshold, which makes their centroids lie."""
+
+    @property
+    def pupil_diameter(self) -> float:
+        """Diameter of the pupil image, in subapertures."""
+        return float(self.pupil_diameter_subap or self.n_subapertures)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShackHartmannTable(ShackHartmannNumbers):
+    """``[wfs]``: the Shack-Hartmann sensor."""
+
+    kind: Literal["shack-hartmann"]
+
+    valid_subapertures: str = "auto"
+    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
+
+    guide_star_height_m: Literal["infinity"] = "infinity"
+    """Metres; a laser star, whose light is a cone, is not modelled yet."""

@@ -1,0 +1,145 @@
+"""A geometric Shack-Hartmann: slopes by hand, rates against differences, its instrument file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy
+
+from service.config import load_instrument
+from service.errors import ConfigurationError
+from service.estimation.reference import Reference, target_of
+from service.model.interaction import InteractionModel
+from service.model.kinds import Stop
+from service.model.misregistration import Misregistration
+from service.model.modes import modal_basis
+from service.model.pupil import instrument_pupil, valid_subapertures
+from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import CannotTell, Fineness
+from tests.numerics import SOMEWHERE
+
+FILE = Path(__file__).parents[3] / "data" / "lenslets.toml"
+DOUBLE = Fineness(dtype=np.float64)
+
+
+@pytest.fixture(scope="module")
+def lenslets():
+    return load_instrument(FILE)
+
+
+def sensor_of(instrument, sampling=3):
+    pupil = instrument_pupil(instrument, sampling)
+    return kind_of(instrument).sensor(instrument, pupil, DOUBLE), pupil.points
+
+
+def full_gain():
+    """Return slopes of full lenslets over the gradient: six pixels of λ/d each, by hand.
+
+    A spot sinc² u moves light over the edges of pixels, the whole numbers: it is dark on all but
+    the middle one. Light that moves over that edge counts one pixel, over what is in the field.
+    """
+    inside, _ = scipy.integrate.quad(lambda u: np.sinc(u) ** 2, -3.0, 3.0, limit=200)
+    return 1.0 / inside
+
+
+def test_a_tilt_is_as_many_waves_across_each_full_subaperture(lenslets):
+    sensor, points = sensor_of(lenslets)
+    seen = sensor.at((0.3, -0.2))
+    slopes = seen.apply(np.outer(points[:, 0], [75e-9]))[:, 0].reshape(2, -1)
+    full = seen.light[sensor.valid] > 0.9999
+    np.testing.assert_allclose(slopes[0, full], 0.1 * full_gain(), rtol=1e-3)
+    np.testing.assert_allclose(slopes[1, full], 0.0, atol=1e-6)
+
+
+def test_a_wide_field_tells_the_mean_gradient_however_a_subaperture_is_lit(lenslets):
+    """Centroid and gradient are one where nothing is cut; 2 % are wings beyond 20 λ/d."""
+    wide = replace(lenslets, wfs=replace(lenslets.wfs, pixels_per_subaperture=40))
+    sensor, points = sensor_of(wide)
+    slopes = sensor.at((0.3, -0.2)).apply(np.outer(points[:, 1], [75e-9]))[:, 0].reshape(2, -1)
+    np.testing.assert_allclose(slopes[1], 0.1, rtol=0.03)
+    np.testing.assert_allclose(slopes[0], 0.0, atol=0.003)
+
+
+def test_the_slope_of_a_parabola_is_that_in_the_middle_of_a_lit_subaperture(lenslets):
+    sensor, points = sensor_of(lenslets)
+    seen = sensor.at((0.0, 0.0))
+    slopes = seen.apply((points**2 @ [0.5, 0.5])[:, None] * 750e-9)[:, 0]
+    y, x = np.nonzero(sensor.valid)
+    middle = np.column_stack([x, y]) - 5.5
+    full = (np.hypot(*middle.T) < 4.0) & (np.hypot(*middle.T) > 2.0)
+    found = slopes.reshape(2, -1)[:, full]
+    np.testing.assert_allclose(found, full_gain() * middle[full].T, rtol=1e-3)
+
+
+@pytest.mark.parametrize("stop", Stop)
+def test_derivatives_are_those_of_the_matrix(lenslets, stop):
+    """Nodes that pass a point of the pupil within the step are what is left."""
+    about = replace(lenslets, stop=stop)
+    model = InteractionModel(about, modal_basis(about).subset(np.arange(12)), dtype=np.float64)
+    for derivative, step in zip(model.derivatives(SOMEWHERE), 1e-4 * np.eye(4), strict=True):
+        less, more = (
+            model.interaction_matrix(Misregistration.from_vector(SOMEWHERE.vector + side * step))
+            for side in (-1.0, 1.0)
+        )
+        difference = (more - less) / 2e-4
+        assert np.linalg.norm(derivative - difference) < 1e-5 * np.linalg.norm(difference)
+
+
+def test_k_is_what_is_applied(lenslets):
+    sensor, points = sensor_of(lenslets)
+    shapes = np.random.default_rng(1).normal(size=(len(points), 3))
+    seen = sensor.at((0.1, 0.2))
+    np.testing.assert_allclose(seen.jacobian() @ shapes, seen.apply(shapes), rtol=1e-4, atol=1.0)
+
+
+def test_its_light_tells_nothing_of_the_pupil(lenslets):
+    found = kind_of(lenslets).light(lenslets)
+    assert isinstance(found, CannotTell)
+    assert "a shack-hartmann" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("wavelength_m", 'centroid = "threshold"\nwavelength_m', "threshold: found none"),
+        ("wavelength_m", "threshold = 0.1\nwavelength_m", 'beside centroid = "cog"'),
+        (
+            "wavelength_m",
+            'centroid = "threshold"\nthreshold = 0.1\npartly_lit = "use"\nwavelength_m',
+            'partly_lit: found "use" beside a threshold of 0.1, expected "leave out"',
+        ),
+        ("wavelength_m", "pixel_scale_arcsec = 0.001\nwavelength_m", "expected 1.5 to 60"),
+        ("wavelength_m", "guide_star_height_m = 9e4\nwavelength_m", 'expected "infinity"'),
+        ("wavelength_m", 'centroid = "matched"\nwavelength_m', "wfs.centroid"),
+        ("wavelength_m", "pixels_per_subaperture = 1\nwavelength_m", "pixels_per_subaperture"),
+        ("shack-hartmann", "curvature", "'curvature', expected 'pyramid' or 'shack-hartmann'"),
+        ("n_subapertures", "modulation_lambda_over_d = 3.0\nn_subapertures", "unknown key"),
+        ("[modes]", '[slopes]\nkind = "intensity"\n[modes]', "intensity of a shack-hartmann"),
+        ("[modes]", '[slopes]\nnormalisation = "local"\n[modes]', "no meaning beside wfs.kind"),
+    ],
+)
+def test_what_is_no_lenslets_is_refused_in_one_line(tmp_path, old, new, said):
+    path = tmp_path / "other.toml"
+    path.write_text(FILE.read_text("utf-8").replace(old, new, 1), "utf-8")
+    with pytest.raises(ConfigurationError) as refused:
+        load_instrument(path)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_beside_a_threshold_fits_leave_out_what_the_edge_cuts_and_say_so(tmp_path):
+    path = tmp_path / "threshold.toml"
+    lines = 'centroid = "threshold"\nthreshold = 0.05\nwavelength_m'
+    path.write_text(FILE.read_text("utf-8").replace("wavelength_m", lines, 1), "utf-8")
+    about = load_instrument(path)
+    assert any('partly_lit: not given, taken as "leave out"' in remark for remark in about.remarks)
+    left_out = kind_of(about).left_out(about)
+    valid = valid_subapertures(about)
+    light = kind_of(about).sensor(about, instrument_pupil(about, 4), DOUBLE).at((0.0, 0.0)).light
+    assert np.all(light[valid & ~left_out.subapertures] > 0.98)
+    assert np.all(light[left_out.subapertures] < 0.999)
+    model = InteractionModel(about, modal_basis(about).subset(np.arange(20)))
+    measured = model.interaction_matrix(SOMEWHERE)
+    target = target_of(Reference(matrix=measured), about)
+    np.testing.assert_array_equal(target.rows, np.tile(~left_out.subapertures[valid], 2))

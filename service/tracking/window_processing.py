@@ -128,7 +128,7 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     both = jumps.pair_innovation(registration, measured, context.policy)
     if first is not None and both.is_outlier:
         if jumps.jump_lasts(registration, first, measured, both):
-            _jump(context, registration, first, measured)
+            _jump(context, registration, first, measured, both)
         else:
             _suspect_jump(context, registration, measured, both, first)
         return
@@ -202,11 +202,16 @@ def _suspect_jump(
 
 
 def _jump(
-    context: StepContext, registration: Registration, first: TimedEstimate, measured: WindowEstimate
+    context: StepContext,
+    registration: Registration,
+    first: TimedEstimate,
+    measured: WindowEstimate,
+    both: Innovation,
 ) -> None:
-    """Go to the new place, which two windows have now seen.
+    """Go to the new place, which two windows have now seen, ``both`` together so far.
 
-    The first of them is used if it is wholly of the new place.
+    The first of them is used if it is wholly of the new place. Beyond all turbulence it confirms
+    the second wherever the jump fell in it: the loop suffers, and a third would cost seconds.
     """
     policy = context.policy
     prior = filtering.predict(context, registration, measured.t_ns_utc)
@@ -220,15 +225,15 @@ def _jump(
         joint = kalman.corrected(joint, first.alpha.vector, noise)
     update = FilterUpdate(
         joint=kalman.corrected(joint, measured.alpha.vector, measured.covariance),
-        n_windows=2 if whole else 1,
+        n_windows=2 if whole or both.excess > jumps.FARTHEST else 1,
         innovation=_innovation(prior, measured),
         scatter=registration.scatter,
         jumped=True,
     )
     validity.store_registration(context, registration)
     validity.void_until(context, first.t_ns_utc, BOTH_SIDES, Purpose.PASSIVE)
-    both = whole and registration.suspected_jump is not None
-    filtering.accept(context, update, measured, n_accepted=2 if both else 1)
+    held = whole and registration.suspected_jump is not None
+    filtering.accept(context, update, measured, n_accepted=2 if held else 1)
     context.warn(
         "registration.jump",
         f"jumped by {_distance_text(measured, registration)}, as two windows have seen",

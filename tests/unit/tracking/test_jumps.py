@@ -9,6 +9,7 @@ from service.estimation.estimate import PassiveEstimate
 from service.model.misregistration import Misregistration
 from service.tracking import events as ev
 from service.tracking.state import Mode
+from service.tracking.update_policy import is_settled
 from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, Story, estimate, rtc
 
 PER_MINUTE = np.array([0.05, 0.05, np.deg2rad(0.05), 0.0005])
@@ -157,6 +158,19 @@ def test_a_large_jump_inside_a_window_is_told_by_that_window_and_the_next(share)
     assert [at_s for at_s, name in sky.flags() if name == JUMP] == [40.0 + 2 * WINDOW_S]
     error = sky.story.state.alpha.registration.alpha.vector - sky.mean(45.0, WINDOW_S)
     assert np.all(np.abs(error) < 4 * WINDOW)
+
+
+@pytest.mark.parametrize(("jump", "settled"), [(LARGE, True), (0.12 * LARGE, False)])
+def test_a_jump_beyond_all_turbulence_is_settled_once_two_windows_have_seen_it(jump, settled):
+    """A smaller one waits for a third window where the first has seen but half of the way."""
+    sky = Sky(5, jump=jump, at_s=40.0 + 0.5 * WINDOW_S)
+    k = 0
+    while JUMP not in {name for _, name in sky.flags()}:
+        k += 1
+        sky.window(k * WINDOW_S)
+    assert is_settled(sky.story.state.alpha.registration) is settled
+    sky.window((k + 1) * WINDOW_S)
+    assert is_settled(sky.story.state.alpha.registration)
 
 
 @pytest.mark.parametrize("first", [-LARGE, LARGE[[1, 0, 2, 3]], 1.5 * LARGE])

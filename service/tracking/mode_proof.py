@@ -342,6 +342,15 @@ def restore_proof(context: StepContext, proof: ModeProof, session: str) -> None:
     context.matrices = replace(context.matrices, mode_proof=restored)
 
 
+def forget_session(context: StepContext) -> None:
+    """Believe nothing of what modes have shown in the session before: another RTC may be there.
+
+    What was restored waits for the RTC's status, which says whose it is.
+    """
+    if not context.matrices.mode_proof.session:
+        context.matrices = replace(context.matrices, mode_proof=ModeProof())
+
+
 def believe_restored(context: StepContext, rtc: Status) -> None:
     """Believe what the service before has seen of this RTC in this session; forget it of others."""
     proof = context.matrices.mode_proof

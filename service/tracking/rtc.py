@@ -112,6 +112,7 @@ def _drop_other_basis(context: StepContext) -> None:
 def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
     reconstructors.forget_session(context)
+    mode_proof.forget_session(context)
     validity.invalidate_telemetry(context, "the RTC was in another session")
     dither.forget_dither(context)
     end_ramp(context)

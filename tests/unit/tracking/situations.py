@@ -31,7 +31,7 @@ from service.wire import (
     Reply,
     Status,
 )
-from tests.states import tracker_state
+from tests.states import changed, tracker_state
 
 ORDERS = {request.name for request in REQUESTS} | {"acquisition", "loop", "noisy matrix", "ramp"}
 SECOND = 1_000_000_000
@@ -190,7 +190,7 @@ def turned(state, act, *args, now_ns=START_NS, **kwargs):
 
 
 ALL_SHOWN = ModeProof(proven=frozenset(range(N_MODES)))
-"""Each mode has been seen to answer: what is told is of other things."""
+"""Each mode has been seen to answer."""
 
 
 class Story:
@@ -200,9 +200,12 @@ class Story:
     """
 
     shows = True
+    all_shown = True
+    """Whether each mode of a new session has been seen already: what is told is of other things."""
 
     def __init__(self, mode=Mode.AUTO, policy=POLICY, state=None):
-        self.state = state or tracker_state(system="flao", mode=mode, mode_proof=ALL_SHOWN)
+        proof = ALL_SHOWN if self.all_shown else ModeProof()
+        self.state = state or tracker_state(system="flao", mode=mode, mode_proof=proof)
         self.policy = policy
         self.now_ns = START_NS
         self.effects = []
@@ -217,6 +220,8 @@ class Story:
             if first in {type(event).__name__, *ORDERS}:
                 raise AssertionError(f"who is refused has said what: {refusal}") from refusal
             raise
+        if self.all_shown and isinstance(event, ev.SessionStarted):
+            self.state = changed(self.state, mode_proof=ALL_SHOWN)
         self.effects += effects
         for effect in effects if self.shows else ():
             known = isinstance(effect, ev.FetchMatrix) and self.state.reconstructor(effect.id or "")

@@ -28,14 +28,11 @@ TARGET = replace(POLICY, n_modes_target=450)
 class Shown(World):
     """A world in which every mode answers with 0.6 of the model but those in ``answers``."""
 
+    all_shown = False
+
     def __init__(self, answers=None, mode=Mode.AUTO, offered=True, policy=TARGET, **changes):
         self.answers_of, self.offered, self.sigma_of = answers or {}, offered, {}
         super().__init__(mode, policy, **changes)
-
-    def tell(self, event, after_s=0.0, cause=""):
-        if isinstance(event, ev.SessionStarted):
-            self.state = changed(self.state, mode_proof=ModeProof())
-        return super().tell(event, after_s, cause)
 
     def of_matrices(self, effect):
         if isinstance(effect, ev.FetchMatrix) and not self.offered:
@@ -351,6 +348,14 @@ def test_of_another_session_nothing_is_taken_over():
     world = killed(Shown({430: -0.6}).pass_(60.0), session=2)
     assert world.state.matrices.mode_proof == ModeProof()
     assert alarms.MODES_CONTRARY not in world.alarms
+
+
+def test_an_rtc_that_begins_anew_shows_its_modes_anew():
+    """It may be another one."""
+    world = Shown().pass_(60.0)
+    assert 430 in world.state.matrices.mode_proof.proven
+    world.tell(ev.SessionStarted(session="s2"))
+    assert world.state.matrices.mode_proof == ModeProof()
 
 
 def test_of_another_basis_nothing_is_taken_over():

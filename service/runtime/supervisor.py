@@ -276,7 +276,7 @@ class Supervisor:
             await self._feed()
             for event in self._bridge.events():
                 if isinstance(event, matrices.MeasuredMatrix):
-                    self._start(self._keep_measured(event))
+                    self._start("a measured matrix", self._keep_measured(event))
                     continue
                 with self._surviving("an event of the link"):
                     self._engine.receive(event)
@@ -416,14 +416,20 @@ class Supervisor:
 
     def perform(self, effect: Effect) -> None:
         """Begin what the tracker wants done, as a task."""
-        self._start(self._do(effect, self._engine.state))
+        self._start(type(effect).__name__, self._do(effect, self._engine.state))
 
     def swapped(self, in_use: str | None) -> None:
         """Offer the matrix in use, and watch what it does."""
-        self._start(self._offer(in_use))
+        self._start("the offer of the matrix in use", self._offer(in_use))
 
-    def _start(self, action: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.get_running_loop().create_task(action)
+    def _start(self, what: str, action: Coroutine[Any, Any, None]) -> None:
+        """Begin a task; a bug in it costs what it was about, not the service."""
+
+        async def survived() -> None:
+            with self._surviving(what):
+                await action
+
+        task = asyncio.get_running_loop().create_task(survived())
         self._running.add(task)
         task.add_done_callback(self._running.discard)
 

@@ -1,8 +1,8 @@
-"""How many modes may be controlled for now."""
+"""How many modes may be controlled for now, and modes in words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -188,3 +188,25 @@ class ModeProof:
     def contrary_modes(self) -> tuple[int, ...]:
         """Modes that a dither has shown to answer otherwise: none of them is controlled anew."""
         return tuple(sorted(self.contrary))
+
+
+NAMED = 8
+"""Modes, or runs of them, that a sentence lists; of more it says how many."""
+
+
+def as_subject(modes: Collection[int]) -> str:
+    """Return modes as the subject of a sentence, with its verb."""
+    return f"mode {as_list(modes)} has" if len(modes) == 1 else f"modes {as_list(modes)} have"
+
+
+def as_list(modes: Iterable[int]) -> str:
+    """Return modes in words, lowest first, a run of them by its ends."""
+    runs: list[list[int]] = []
+    for mode in sorted(modes):
+        if runs and mode == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], mode]
+        else:
+            runs.append([mode])
+    parts = [" to ".join(map(str, run)) for run in runs]
+    more = f" and {len(parts) - NAMED} more" if len(parts) > NAMED else ""
+    return ", ".join(parts[:NAMED]) + more

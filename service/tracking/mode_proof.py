@@ -8,7 +8,6 @@ sign and its rough size.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -23,12 +22,15 @@ from service.tracking import events as ev
 from service.tracking.dither_modes import N_LINES, PROVING_RANGE, chosen_modes
 from service.tracking.dither_request import CLEARANCES_HZ, step_of
 from service.tracking.mode_limits import (
+    NAMED,
     NEIGHBOURS,
     UNEVEN,
     ModeAnswer,
     ModeProof,
     ModeRatio,
     add_ratios,
+    as_list,
+    as_subject,
     compare,
 )
 from service.tracking.policy import SECOND_NS
@@ -66,8 +68,6 @@ TOLD_WITHIN_S = 15.0
 TRIES = 3
 """That tell nothing, before modes are left alone for a while."""
 
-_NAMED = 8
-
 
 def proven_modes(state: TrackerState) -> frozenset[int]:
     """Return the modes that are known to answer as the instrument file says.
@@ -104,7 +104,7 @@ def why_tells_nothing(context: StepContext, estimate: DitheredEstimate) -> str |
     odd -= proven_modes(context.state).union(estimate.weak)
     if not odd:
         return None
-    return f"{_as_subject(odd)} not answered as the instrument file says: such a window gives no α"
+    return f"{as_subject(odd)} not answered as the instrument file says: such a window gives no α"
 
 
 def n_proven_modes(state: TrackerState, n_modes: int) -> int:
@@ -123,9 +123,9 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
         return None
     contrary = [mode for mode in missing if mode in state.matrices.mode_proof.contrary]
     if contrary:
-        return f"{_as_subject(contrary)} not answered as the instrument file says"
+        return f"{as_subject(contrary)} not answered as the instrument file says"
     return (
-        f"{_as_subject(missing)} not been seen to answer yet: a dither shows them before they are "
+        f"{as_subject(missing)} not been seen to answer yet: a dither shows them before they are "
         "controlled; let the service dither"
     )
 
@@ -226,7 +226,7 @@ def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
         proof = _after_miss(proof)
     shown = replace(proof, shown=frozenset(modes), shown_ns_utc=context.now_ns)
     context.matrices = replace(context.matrices, mode_proof=shown)
-    context.log("modes.shown", f"modes {_as_list(modes)} are dithered before they are controlled")
+    context.log("modes.shown", f"modes {as_list(modes)} are dithered before they are controlled")
 
 
 def awaits_result(context: StepContext, window_s: float) -> bool:
@@ -396,7 +396,7 @@ def contrary_text(context: StepContext) -> str | None:
 
 def _contrary_in_words(proof: ModeProof, in_the_way: list[int]) -> str:
     return (
-        f"{_as_subject(in_the_way)} not answered the dither as the instrument file says"
+        f"{as_subject(in_the_way)} not answered the dither as the instrument file says"
         f"{_in_words(proof, in_the_way)}: no new matrix controls more than {in_the_way[0]} modes"
     )
 
@@ -411,7 +411,7 @@ def _contrary_in_the_way(context: StepContext, rtc: Status) -> list[int]:
 def _in_words(proof: ModeProof, modes: list[int]) -> str:
     """Return how modes have answered, in brackets."""
     answers = {answer.mode: answer for answer in proof.answers}
-    listed = [answers[mode] for mode in modes[:_NAMED] if mode in answers]
+    listed = [answers[mode] for mode in modes[:NAMED] if mode in answers]
     parts = []
     for answer in listed:
         other = answers.get(answer.like)
@@ -435,7 +435,7 @@ def uneven_text(context: StepContext) -> str | None:
         one = "answers" if len(proof.uneven) == 1 else "answer"
         noun = "mode" if len(proof.uneven) == 1 else "modes"
         found.append(
-            f"{noun} {_as_list(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
+            f"{noun} {as_list(proof.uneven)} {one} the dither more than {UNEVEN:g} times as "
             "strongly or as weakly as the modes beside"
         )
     return "; ".join(found) or None
@@ -455,7 +455,7 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
     given_up = replace(proof, shown=frozenset(), n_tries=0, suspected=suspected)
     context.matrices = replace(context.matrices, mode_proof=given_up)
     text = (
-        f"{_as_subject(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows "
+        f"{as_subject(proof.shown)} not been seen to answer in {TRIES} dithers: see why windows "
         "are refused, or give the dither more budget"
     )
     limit_modes(context, n_proven_modes(context.state, rtc.n_modes), text)
@@ -488,21 +488,3 @@ def _target_modes(context: StepContext, rtc: Status) -> int:
         r.n_modes for r in context.matrices.reconstructors if r.state is MatrixState.PROPOSED
     )
     return max(rtc.n_controlled, min(context.policy.n_modes_target, rtc.n_modes), *proposed, 0)
-
-
-def _as_subject(modes: Collection[int]) -> str:
-    """Return modes as the subject of a sentence, with its verb."""
-    return f"mode {_as_list(modes)} has" if len(modes) == 1 else f"modes {_as_list(modes)} have"
-
-
-def _as_list(modes: Iterable[int]) -> str:
-    """Return modes in words, lowest first, a run of them by its ends."""
-    runs: list[list[int]] = []
-    for mode in sorted(modes):
-        if runs and mode == runs[-1][-1] + 1:
-            runs[-1] = [runs[-1][0], mode]
-        else:
-            runs.append([mode])
-    parts = [" to ".join(map(str, run)) for run in runs]
-    more = f" and {len(parts) - _NAMED} more" if len(parts) > _NAMED else ""
-    return ", ".join(parts[:_NAMED]) + more

@@ -288,6 +288,20 @@ async def test_a_bug_in_an_estimator_costs_what_it_has_gathered(supervisor, brid
         assert supervisor.snapshot().ready
 
 
+async def test_a_bug_in_a_task_is_told_and_ends_no_service(supervisor, monkeypatch):
+    def broken(state):
+        raise ValueError("a shelf that is bent")
+
+    async with running(supervisor):
+        monkeypatch.setattr(supervisor._actions, "offer", broken)
+        supervisor.swapped(None)
+        await until(lambda: "internal.error" in [e.name for e in supervisor._engine.state.log])
+        entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
+        assert "the offer of the matrix in use was dropped" in entry.text
+        assert "a shelf that is bent" in entry.text
+        assert supervisor.snapshot().ready
+
+
 async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, bridge, monkeypatch):
     def broken(**_):
         raise ValueError("a ring that is bent")

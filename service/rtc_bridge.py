@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
@@ -124,9 +124,14 @@ class Bridge:
         if self._closed:  # meanwhile, in another thread
             self.close()
 
-    def expect(self, basis_id: str | None, config_id: str | None) -> None:
-        """Refuse frames of any other basis or sensor configuration; None: adopt the first seen."""
-        self._intake.expect(basis_id, config_id)
+    def expect(
+        self, basis_id: str | None, config_id: str | None, modes: Collection[str] = ()
+    ) -> None:
+        """Refuse frames of any other basis or sensor configuration; None: adopt the first seen.
+
+        ``modes`` are the configurations that the RTC may change between.
+        """
+        self._intake.expect(basis_id, config_id, modes)
 
     def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
         """Call ``callback`` from zenoh's threads when something new has come.

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, ModelError
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import KarhunenLoeve, Normalisation
@@ -84,9 +84,46 @@ class Telescope:
 
 
 def _modes(instrument: Instrument) -> ModalBasis:
-    """Return the modes of an analytic mirror, from the folder that the service keeps its own in."""
+    """Return the modes of an analytic mirror, from the folder that the service keeps its own in.
+
+    They are found on the finest subapertures: coarser ones could not tell them from one another.
+    """
     kept = DiskCache(usual_folder(os.environ)).basis(instrument)
     return kept if isinstance(kept, ModalBasis) else analytic_basis(instrument)
+
+
+def _binned(
+    options: Options, basis: ModalBasis, instrument: Instrument
+) -> tuple[ModalBasis, Instrument]:
+    """Return modes and instrument in the subapertures that a preset bins."""
+    if options.binning == 1:
+        return basis, instrument
+    coarse = binned(instrument, options.binning)
+    surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
+    return basis.of_surface(surface), coarse
+
+
+def in_sensor_mode(options: Options, instrument: Instrument) -> Instrument:
+    """Return the instrument in the mode of its sensor that is asked for; else in its first.
+
+    Raises
+    ------
+    ConfigurationError
+        If it has no such mode.
+    """
+    if options.sensor_mode is None:
+        return instrument
+    try:
+        return instrument.in_mode(options.sensor_mode)
+    except ModelError as error:
+        raise ConfigurationError(f"--sensor-mode: {error}") from error
+
+
+def most_of(instrument: Instrument) -> int | None:
+    """Return how many modes the mode of a sensor lets be controlled; None: nobody says."""
+    if not instrument.sensor_modes or instrument.loop is None:
+        return None
+    return instrument.loop.n_controlled
 
 
 def build_telescope(
@@ -107,11 +144,11 @@ def build_telescope(
         If the instrument is not simulated, or more modes are to be controlled than it has.
     """
     check_supported(instrument)
+    instrument = in_sensor_mode(options, instrument)
     n_modes = instrument.modes.n_modes
-    n_controlled = options.n_controlled(n_modes)
+    n_controlled = options.n_controlled(n_modes, most_of(instrument))
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
-    basis = binned_basis(instrument, _modes(instrument), options.binning)
-    instrument = binned(instrument, options.binning)
+    basis, instrument = _binned(options, _modes(instrument), instrument)
     plant = build_plant(options, instrument, basis, plant_rng)
     sky = build_sky(options, instrument, basis, plant, sky_rng)
 
@@ -190,7 +227,8 @@ def build_plant(
         "influence": None if cube is None else read_influence(cube, instrument, pitch_m),
     }
     if options.plant == "diffractive":
-        return DiffractivePlant(instrument, basis, binning=options.binning, **made)
+        binning = options.binning * instrument.binning
+        return DiffractivePlant(instrument, basis, binning=binning, **made)
     if options.binning > 1:
         raise ConfigurationError(
             "--preset: a binned sensor needs --plant diffractive; found --plant linear"
@@ -241,18 +279,6 @@ def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> 
         rise_s=options.rise_ms * 1e-3,
         limits=options.mirror_limits,
     )
-
-
-def binned_basis(instrument: Instrument, basis: ModalBasis, binning: int) -> ModalBasis:
-    """Return the same modes in the larger subapertures of a binned sensor.
-
-    They are found with the finest ones: coarser, they could not be told from one another.
-    """
-    if binning == 1:
-        return basis
-    surface = mirror_surface(instrument.analytic_mirror, binned(instrument, binning).subaperture_m)
-    coefficients = surface.coefficients(basis.mode_to_actuator)
-    return replace(basis, surface=surface, coefficients=coefficients)
 
 
 def build_feed(

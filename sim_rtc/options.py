@@ -39,6 +39,10 @@ class Options:
         default="flao-lbt",
         chapter="instrument and truth",
     )
+    sensor_mode: str | None = option(
+        "--sensor-mode CONFIG_ID",
+        "mode of the sensor, by its name in the instrument file (default: the first there)",
+    )
     plant: str = option(
         "--plant", "model of the telescope", default="linear", choices=["linear", "diffractive"]
     )
@@ -350,8 +354,10 @@ class Options:
         usual = 0.2 if self._by_day else 0.4
         return usual if self.given_gain is None else self.given_gain
 
-    def n_controlled(self, n_modes: int) -> int:
+    def n_controlled(self, n_modes: int, most: int | None = None) -> int:
         """Return how many of an instrument's modes are in the loop at the start.
+
+        ``most`` are as many as its sensor's mode allows, unless more are asked for.
 
         Raises
         ------
@@ -359,8 +365,8 @@ class Options:
             If more were asked for than there are.
         """
         if self.given_n_controlled is None:
-            most = FAR_MODES if self.far else USUAL_MODES
-            return min(most, max(1, 7 * n_modes // 10))
+            usual = FAR_MODES if self.far else USUAL_MODES
+            return min(usual, max(1, 7 * n_modes // 10), most or n_modes)
         if self.given_n_controlled > n_modes:
             raise ConfigurationError(
                 f"--n-controlled: found {self.given_n_controlled}; {self.instrument} has "

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from itertools import chain
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import OTHER_PROGRAMS, command_line
@@ -86,18 +86,29 @@ def _tables(whole: type[Table]) -> Iterator[str]:
         of_each = place.get("items", place)
         kind = kinds[of_each["$ref"].rpartition("/")[2]]
         yield f"## [{section}]" if of_each is place else f"## [[{section}]]"
-        about = _text(kind).partition(": ")[2]
-        yield about[:1].upper() + about[1:]
-        needed = kind.get("required", ())
         record = whole.model_fields[section].annotation
-        texts = _field_texts(record) if isinstance(record, type) and is_dataclass(record) else {}
-        yield listed(
-            (
-                f"`{key}` ({_type(field, kinds)}{_default(field, needed=key in needed)})",
-                _text({"description": texts.get(key, "")} | field),
-            )
-            for key, field in kind["properties"].items()
+        yield from _keys(kind, record, kinds)
+        for key, field in kind["properties"].items():
+            inner = field.get("items", {}).get("$ref")
+            if inner is not None:
+                yield f"## [[{section}.{key}]]"
+                (each, _) = get_args(get_type_hints(record)[key])
+                yield from _keys(kinds[inner.rpartition("/")[2]], each, kinds)
+
+
+def _keys(kind: Schema, record: object, kinds: Mapping[str, Schema]) -> Iterator[str]:
+    """Yield what a table is about, and its keys."""
+    about = _text(kind).partition(": ")[2]
+    yield about[:1].upper() + about[1:]
+    needed = kind.get("required", ())
+    texts = _field_texts(record) if isinstance(record, type) and is_dataclass(record) else {}
+    yield listed(
+        (
+            f"`{key}` ({_type(field, kinds)}{_default(field, needed=key in needed)})",
+            _text({"description": texts.get(key, "")} | field),
         )
+        for key, field in kind["properties"].items()
+    )
 
 
 def _field_texts(record: type) -> dict[str, str]:
@@ -118,7 +129,9 @@ def _type(field: Schema, kinds: Mapping[str, Schema]) -> str:
     if "const" in field:
         return f"`{field['const']}`"
     if field["type"] == "array":
-        return f"list of {_type(field['items'], kinds)}" if "items" in field else "list"
+        each = field.get("items", {})
+        of = "tables, below" if "$ref" in each else _type(each, kinds) if each else ""
+        return f"list of {of}" if of else "list"
     if field["type"] == "object" and "properties" in field:
         return "table of " + ", ".join(f"`{key}`" for key in field["properties"])
     limits = [f"{sign} {field[limit]:g}" for limit, sign in _LIMITS.items() if limit in field]

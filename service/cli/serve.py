@@ -86,7 +86,8 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
             settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
         )
         with archive, announced(archive.directory, where), Bridge(endpoint, last) as bridge:
-            bridge.expect(instrument.basis_id, instrument.config_id)
+            modes = [mode.config_id for mode in instrument.sensor_modes]
+            bridge.expect(instrument.basis_id, instrument.config_id, modes)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)
             names = (settings.api.host, *settings.api.allowed_hosts)
@@ -206,7 +207,7 @@ def _supervisor(
         ),
         clock_ns=clock.now_ns,
     )
-    policy = policy_of(settings)
+    policy = policy_of(settings, instrument)
     state = TrackerState(
         system=system,
         operator=OperatorState(mode=Mode(settings.service.mode)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,15 @@ from numpy.typing import NDArray
 from service.config import instrument_schema as schema
 from service.config import packaged_file
 from service.config.mirrors import Pupil, own_modes, read_mirror
-from service.config.sources import refuse
+from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError
-from service.model.instrument import Instrument, Mirror, SensorDescription, TabulatedModes
+from service.model.instrument import (
+    Instrument,
+    Mirror,
+    SensorDescription,
+    SensorMode,
+    TabulatedModes,
+)
 from service.model.kinds import KarhunenLoeve, LoopFacts
 from service.model.sensors.kind import SensorKind, SensorTable
 from service.model.slopes import Orientation, SlopeRecipe
@@ -43,7 +50,7 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     modes = _modes(section(KarhunenLoeve), mirror)
     with schema.refused_at(wfs.path, wfs.name):
         frames = kind.frames(wfs.said, wfs.given)
-    return Instrument(
+    instrument = Instrument(
         **asdict(about),
         wfs=sensor,
         mirror=mirror,
@@ -54,6 +61,59 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
         remarks=(*about_mirror, *_assumed(said, sensor, mirror)),
     )
+    return _in_first_mode(instrument, wfs, kind)
+
+
+def _in_first_mode(
+    instrument: Instrument, file: schema.Section[SensorTable], kind: SensorKind
+) -> Instrument:
+    """Return the instrument with the modes of its sensor, in the first of them."""
+    with schema.refused_at(file.path, file.name):
+        modes = kind.in_modes(file.said, instrument.wfs)
+    if not modes:
+        return instrument
+    if instrument.config_id is not None:
+        raise ConfigurationError(
+            f"{file.path}: instrument.config_id: has no meaning beside [[wfs.mode]], each of which "
+            "has its own: remove one of the two"
+        )
+    whole = replace(
+        instrument,
+        sensor_modes=tuple(
+            _completed(mode, mask, f"{file.where('mode')}[{k}]", file.path.parent, instrument)
+            for k, (mode, mask) in enumerate(modes)
+        ),
+    )
+    return whole.sensor_modes[0].of(whole)
+
+
+def _completed(
+    mode: SensorMode, reference: str, where: str, folder: Path, instrument: Instrument
+) -> SensorMode:
+    """Return a mode with its own mask, and what it does not say of the loop as ``[loop]`` has it.
+
+    Raises
+    ------
+    ConfigurationError
+        If it controls more modes than there are, or its mask is missing or not its own.
+    """
+    loop = instrument.loop or LoopFacts()
+    n_controlled = mode.loop.n_controlled or loop.n_controlled
+    rate_hz = mode.loop.frame_rate_hz or loop.frame_rate_hz
+    if (n_controlled or 0) > instrument.modes.n_modes:
+        expected = f"at most the {instrument.modes.n_modes} modes of the basis"
+        refuse(f"{where}.n_controlled", str(n_controlled), expected)
+    wfs, at = mode.wfs, f"{where}.valid_subapertures"
+    if reference != "auto":
+        mask = _mask(read_dataset(reference, folder, at), at, wfs.n_subapertures)
+        wfs = replace(wfs, valid_subapertures=mask)
+    elif mode.binning > 1 and wfs.valid_subapertures is not None:
+        raise ConfigurationError(
+            f"{at}: missing; a mask of the finest subapertures (wfs.valid_subapertures) says "
+            "nothing of binned ones"
+        )
+    told = replace(loop, frame_rate_hz=rate_hz, n_controlled=n_controlled)
+    return replace(mode, wfs=wfs, loop=told)
 
 
 def _assumed(
@@ -153,12 +213,12 @@ def _sensor(file: schema.Section[SensorTable], kind: SensorKind) -> SensorDescri
             f"{file.where('flux_threshold')}: has no meaning beside a mask file "
             "(wfs.valid_subapertures): remove one of the two"
         )
-    return replace(sensor, valid_subapertures=_mask(file))
+    where = file.where("valid_subapertures")
+    mask = _mask(file.array("valid_subapertures"), where, file.said.n_subapertures)
+    return replace(sensor, valid_subapertures=mask)
 
 
-def _mask(file: schema.Section[SensorTable]) -> NDArray[np.bool_]:
-    where, n = file.where("valid_subapertures"), file.said.n_subapertures
-    values = file.array("valid_subapertures")
+def _mask(values: NDArray[Any], where: str, n: int) -> NDArray[np.bool_]:
     if values.shape != (n, n):
         refuse(where, f"shape {values.shape}", f"(n_subapertures, n_subapertures) = ({n}, {n})")
     if not np.isin(values, (0, 1)).all():

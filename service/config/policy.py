@@ -11,10 +11,11 @@ from service.archive.retention import RetentionPolicy
 from service.config.settings import OffloadTable, Settings
 from service.control.reconstructor import InversionMethod
 from service.files.disk_cache import usual_folder
+from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE
 from service.runtime.worker import Compute, Sampling
 from service.tracking.alarms import Interlock, Severity
-from service.tracking.policy import Offloading, Policy, Rule
+from service.tracking.policy import Offloading, Policy, Rule, SensorModePolicy
 
 FLAT = (0.004, 0.01, 0.001)
 """Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid
@@ -41,8 +42,11 @@ def floor_of(settings: Settings) -> NDArray[np.float64]:
     return np.array([shift, shift, rotation, magnification])
 
 
-def policy_of(settings: Settings) -> Policy:
-    """Return the policy in numeric units: radians, rates per square root of a second."""
+def policy_of(settings: Settings, instrument: Instrument | None = None) -> Policy:
+    """Return the policy in numeric units: radians, rates per square root of a second.
+
+    ``instrument`` tells the modes of its sensor; None: it has none.
+    """
     dither, tracking, control = settings.dither, settings.tracking, settings.control
     per_minute = _vector(
         tracking.drift_subap_per_minute,
@@ -98,7 +102,19 @@ def policy_of(settings: Settings) -> Policy:
             for rule in settings.rules
         ),
         offloading=_offloading(settings.offload),
+        sensor_modes={} if instrument is None else _sensor_modes(instrument),
     )
+
+
+def _sensor_modes(instrument: Instrument) -> dict[str, SensorModePolicy]:
+    """Return what the tracker must know of the modes of a sensor, by their ``config_id``."""
+    return {
+        mode.config_id: SensorModePolicy(
+            subaperture_m=mode.of(instrument).subaperture_m,
+            n_controlled=mode.loop.n_controlled,
+        )
+        for mode in instrument.sensor_modes
+    }
 
 
 def _offloading(table: OffloadTable) -> Offloading | None:

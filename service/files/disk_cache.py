@@ -26,6 +26,7 @@ from service.model import instrument as model_code
 from service.model.instrument import Instrument, Mirror, instrument_sha256
 from service.model.kinds import BasisKind
 from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis
+from service.model.sensor_modes import in_subapertures
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -59,8 +60,15 @@ class DiskCache:
     def basis(self, instrument: Instrument) -> Basis:
         """Return the modes of this instrument, as ``modal_basis`` does.
 
-        Only Karhunen-Loeve modes are kept: others are a matter of milliseconds.
+        Only Karhunen-Loeve modes are kept: others are a matter of milliseconds. They are found on
+        the finest subapertures of its sensor: on binned ones they could not be told apart.
         """
+        finest = instrument.finest
+        basis = self._found(finest)
+        same = finest.subaperture_m == instrument.subaperture_m
+        return basis if same else in_subapertures(basis, instrument)
+
+    def _found(self, instrument: Instrument) -> Basis:
         mirror = instrument.mirror
         if (
             not isinstance(mirror, Mirror)

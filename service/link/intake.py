@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from statistics import median
 from typing import Final
@@ -106,6 +106,7 @@ class Intake:
         self._patience_s = endpoint.reorder_s
         self._basis_id: str | None = None
         self._config_id: str | None = None
+        self._modes: Collection[str] = ()
         self._shape: tuple[int, int] | None = None
         self._counts: Counter[str] = Counter()
         self._counted: Counter[str] = Counter()
@@ -119,10 +120,15 @@ class Intake:
         self._coalesced: bytes | None = None
         self._latency_s: deque[float] = deque(maxlen=LATENCIES)
 
-    def expect(self, basis_id: str | None, config_id: str | None) -> None:
-        """Use only what names these; None: adopt the first one seen."""
+    def expect(
+        self, basis_id: str | None, config_id: str | None, modes: Collection[str] = ()
+    ) -> None:
+        """Use only what names these; None: adopt the first one seen.
+
+        ``modes`` are configurations that the RTC may change between.
+        """
         with self._up_to_date():
-            self._basis_id, self._config_id = basis_id, config_id
+            self._basis_id, self._config_id, self._modes = basis_id, config_id, modes
 
     def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
         """Call ``callback``, from zenoh's threads, when something new is there."""
@@ -448,6 +454,8 @@ class Intake:
             self._config_id = self._config_id or config_id
             told = f"basis {self._basis_id}, configuration {self._config_id}"
             self._put(ev.LogEvent(name="ids.adopted", text=told))
+        if basis_id == self._basis_id and config_id in self._modes:
+            self._config_id = config_id
         expected, found = (self._basis_id, self._config_id), (basis_id, config_id)
         if found == expected:
             return None
@@ -456,6 +464,11 @@ class Intake:
                 f"the RTC's basis and configuration are {' and '.join(found)}, expected "
                 f"{' and '.join(expected)}: no estimate, no publication until they agree"
             )
+            if self._modes and config_id not in self._modes:
+                told += (
+                    f"; the instrument file has the modes {', '.join(self._modes)}: set the RTC to "
+                    f"one of them, or add [[wfs.mode]] config_id = {config_id!r} to the file"
+                )
             self._put(ev.ConditionChanged(name=OTHER_BASIS, text=told))
         which = "basis" if basis_id != self._basis_id else "config"
         return which, f"{' and '.join(found)}, expected {' and '.join(expected)}"

@@ -114,6 +114,27 @@ class TabulatedModes(Mount):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SensorMode:
+    """One way in which the RTC reads its sensor: mirror, modes and order of slopes are the same."""
+
+    config_id: str
+    """The RTC's name of it."""
+
+    binning: int
+    """Of the finest subapertures, how many are one along each axis."""
+
+    wfs: SensorDescription
+    """The sensor, so read."""
+
+    loop: LoopFacts
+    """What is known of the loop in this mode."""
+
+    def of(self, instrument: Instrument) -> Instrument:
+        """Return an instrument that has this mode, in it."""
+        return replace(instrument, wfs=self.wfs, config_id=self.config_id, loop=self.loop)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Instrument(Telescope):
     """One telescope, its mirror and its wavefront sensor."""
 
@@ -139,6 +160,37 @@ class Instrument(Telescope):
 
     config_id: str | None = None
     """Pins the RTC's sensor configuration; None: the first seen is adopted."""
+
+    sensor_modes: tuple[SensorMode, ...] = ()
+    """Modes that the RTC may change to; ``config_id`` says which one ``wfs`` is of. Empty: it has
+    one alone."""
+
+    @property
+    def binning(self) -> int:
+        """Of the finest subapertures, how many are one along each axis."""
+        now = (mode.binning for mode in self.sensor_modes if mode.config_id == self.config_id)
+        return next(now, 1)
+
+    @property
+    def finest(self) -> Instrument:
+        """The same in its mode of the smallest subapertures."""
+        if not self.sensor_modes:
+            return self
+        return min(self.sensor_modes, key=lambda mode: mode.binning).of(self)
+
+    def in_mode(self, config_id: str) -> Instrument:
+        """Return the same, its sensor read in another mode.
+
+        Raises
+        ------
+        ModelError
+            If it has no such mode.
+        """
+        mode = next((mode for mode in self.sensor_modes if mode.config_id == config_id), None)
+        if mode is None:
+            known = ", ".join(mode.config_id for mode in self.sensor_modes) or "no mode"
+            raise ModelError(f"{self.name}: found mode {config_id}, expected one of: {known}")
+        return mode.of(self)
 
     @property
     def subaperture_m(self) -> float:
@@ -198,11 +250,11 @@ def _add(digest: hashlib._Hash, value: object) -> None:
 def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
     """Yield fields by name, of an influence function its own: so fits of before know it.
 
-    What is unknown is told where anything is.
+    What is unknown, and what modes there are, is told where anything is.
     """
     for one in fields(record):
         value = getattr(record, one.name)
-        if one.name == "unknown" and not value:
+        if one.name in {"unknown", "sensor_modes"} and not value:
             continue
         if isinstance(value, InfluenceShape):
             yield from _parts(value)

@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
 from service.errors import CommandError, LinkError, UnknownIdError
+from service.estimation.description import Description
 from service.estimation.loop import commanded_gains, extended_gains, same_gains
 from service.link.matrices import MeasuredMatrix
 from service.model.instrument import Instrument
 from service.runtime import estimates, ports
-from service.runtime.worker import Conditions, OpticsWorker
+from service.runtime.worker import Conditions, OpticsWorker, run_job
 from service.tracking import alarms, products
 from service.tracking import events as ev
 from service.tracking.events import Effect, Event
@@ -113,6 +115,19 @@ class Actions:
         kept = self._matrices.get(matrix_id)
         return kept if kept is not None else self._archive.reconstructors.matrix(matrix_id)
 
+    async def enter_sensor_mode(self, config_id: str) -> Description:
+        """Have the worker model another mode of the sensor, and each worker after it.
+
+        Raises
+        ------
+        WorkerError
+            If the worker dies of it.
+        """
+        self._workers.first = partial(run_job, OpticsWorker.adopt, None, None, config_id)
+        self._commanded_modes = None
+        self.instrument = self.instrument.in_mode(config_id)
+        return await self._workers.call(OpticsWorker.enter_mode, config_id)
+
     def offer(self, state: TrackerState) -> None:
         """Let an RTC ask for the matrix in use.
 
@@ -163,6 +178,7 @@ class Actions:
         record = self._record(len(made.matrix), effect.why, registration, parent)
         record = replace(
             record,
+            config_id=state.loop.config_id,
             state=products.MatrixState.PROPOSED if accepted else products.MatrixState.REFUSED,
             condition_number=made.condition_number,
             gate=made.gate,
@@ -195,6 +211,7 @@ class Actions:
             why, gate, judged, refused = f"{why}, though {gate.reason}", None, None, False
         record = replace(
             self._record(len(matrix), why, None, effect.source),
+            config_id=state.loop.config_id if source is None else source.config_id,
             state=products.MatrixState.REFUSED if refused else products.MatrixState.PROPOSED,
             alpha=None if source is None else source.alpha,
             sigma=None if source is None else source.sigma,
@@ -275,7 +292,8 @@ class Actions:
         manifest, matrix = await self._bridge.fetch_applied()
         if matrix_id not in {None, manifest.id}:
             raise LinkError(f"the RTC offers {manifest.id}, its status says it uses {matrix_id}")
-        record = products.ReconstructorRecord.brought(manifest)
+        brought = products.ReconstructorRecord.brought(manifest)
+        record = replace(brought, config_id=state.loop.config_id)
         known = state.reconstructor(record.id)
         if known is not None and known.sha256 not in {"", record.sha256}:
             return ev.MatrixFetched(record=record)  # the tracker says what that means

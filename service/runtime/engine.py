@@ -65,6 +65,9 @@ class Driver(Protocol):
     def swapped(self, in_use: str | None) -> None:
         """Note that the RTC uses another reconstructor, or an unknown one."""
 
+    def sensor_mode_changed(self, config_id: str) -> None:
+        """Have the model of another mode of the sensor made, and hand in its description."""
+
 
 class Engine:
     """State and streaming estimators, driven by events and blocks.
@@ -127,12 +130,22 @@ class Engine:
         now_ns = self._driver.now_ns()
         self.state, effects = self._step(before, event, self.policy, now_ns, cause)
         self._driver.stepped(before, event)
+        self._note_sensor_mode(before)
         self._follow()
         for effect in effects:
             self._driver.perform(effect)
         if self.state.matrices.in_use != before.matrices.in_use:
             self._driver.swapped(self.state.matrices.in_use)
         return effects
+
+    def _note_sensor_mode(self, before: TrackerState) -> None:
+        """Stop listening where the sensor's mode has changed, until its model is there."""
+        config_id = self.state.loop.config_id
+        if config_id is None or config_id == before.loop.config_id:
+            return
+        if config_id in self.policy.sensor_modes:
+            self.bank = self._checked_out = None
+            self._driver.sensor_mode_changed(config_id)
 
     def receive(self, event: Event) -> None:
         """Take in what came over the link besides frames."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from service import rtc_bridge, wire
 from service.archive import Actor, Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
-from service.errors import LinkError, PyrcalError, StorageError, WorkerError
+from service.errors import LinkError, PyrcalError, StorageError
 from service.estimation import dither_windows, frames, lockin, passive_sums, random_dither
 from service.estimation.description import Description
 from service.link import matrices, statistics
@@ -30,7 +31,7 @@ from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_o
 from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
 from service.runtime.snapshot import Snapshot
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
-from service.runtime.workers import WorkerLoadMeter, WorkerPool
+from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_worker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarm_rules import changes_value
@@ -43,9 +44,6 @@ from service.tracking.step_context import new_lines
 
 GATHER_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
-
-DESCRIBE_ATTEMPTS = 3
-"""Workers that may die while the model is prepared before the service gives up."""
 
 ANSWERED_WITHIN_S = 3.0
 """For the RTC, or the gate, to answer while whoever gave an order waits."""
@@ -240,10 +238,7 @@ class Supervisor:
             group.create_task(self._writer.save())
             group.create_task(self.recordings.run())
             group.create_task(self._writer.keep_house(self._retention))
-            description = await self._described()
-            self._engine.set_description(description)
-            text = f"{description.n_slopes} slopes, {description.n_modes} modes"
-            self._post(ev.LogEvent(name="service.ready", text=text))
+            await self._prepare(partial(self._workers.call, worker.OpticsWorker.describe))
             for work in (self._listen, self._tick, self._fit, self._fit_passive, self._trends.run):
                 group.create_task(work())
 
@@ -252,14 +247,16 @@ class Supervisor:
         """The model's expectation of telemetry; None: being prepared."""
         return None if self._engine.bank is None else self._engine.bank.loop.description
 
-    async def _described(self) -> Description:
-        """Return what the model expects of telemetry; a worker that dies is replaced."""
-        for _ in range(DESCRIBE_ATTEMPTS - 1):
-            try:
-                return await self._workers.call(worker.OpticsWorker.describe)
-            except WorkerError as error:
-                self._note("worker.lost", str(error), Level.WARNING)
-        return await self._workers.call(worker.OpticsWorker.describe)
+    async def _prepare(self, describe: Callable[[], Awaitable[Description]]) -> None:
+        """Let the estimators listen to what the model expects; a worker that dies is replaced."""
+        config_id = self._engine.state.loop.config_id
+        lost = partial(self._note, "worker.lost", level=Level.WARNING)
+        description = await with_another_worker(describe, lost)
+        if self._engine.state.loop.config_id == config_id:  # else another mode is prepared
+            self._engine.set_description(description)
+            text = f"{description.n_slopes} slopes, {description.n_modes} modes"
+            self._post(ev.LogEvent(name="service.ready", text=text))
+            self.swapped(self._engine.state.matrices.in_use)
 
     async def _listen(self) -> None:
         """Take what the link has: frames, then the events after them."""
@@ -421,6 +418,11 @@ class Supervisor:
     def swapped(self, in_use: str | None) -> None:
         """Offer the matrix in use, and watch what it does."""
         self._start("the offer of the matrix in use", self._offer(in_use))
+
+    def sensor_mode_changed(self, config_id: str) -> None:
+        """Have the model of another mode of the sensor made."""
+        describe = partial(self._actions.enter_sensor_mode, config_id)
+        self._start("another mode of the sensor", self._prepare(describe))
 
     def _start(self, what: str, action: Coroutine[Any, Any, None]) -> None:
         """Begin a task; a bug in it costs what it was about, not the service."""

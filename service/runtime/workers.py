@@ -8,7 +8,7 @@ import heapq
 import itertools
 import time
 from collections import defaultdict, deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
@@ -37,6 +37,9 @@ UNKNOWN_LIMIT_S = 900.0
 MIN_LIMIT_S = 60.0
 LIMIT_RATIO = 20.0
 """Processor time of a job, over the longest one of its kind so far."""
+
+ATTEMPTS = 3
+"""Workers that may die while the model is prepared before the service gives up."""
 
 LOOK_S = 0.5
 """Between two looks at what a worker takes."""
@@ -189,6 +192,22 @@ class WorkerPool:
         self.close()
         self.problem = text
         return text
+
+
+async def with_another_worker(job: Callable[[], Awaitable[R]], lost: Callable[[str], None]) -> R:
+    """Return what a job brings, done again where the worker has died of it; ``lost`` hears why.
+
+    Raises
+    ------
+    WorkerError
+        If several have died of it.
+    """
+    for _ in range(ATTEMPTS - 1):
+        try:
+            return await job()
+        except WorkerError as error:
+            lost(str(error))
+    return await job()
 
 
 def _run(

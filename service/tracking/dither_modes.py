@@ -116,4 +116,4 @@ def _telling(policy: Policy, first: int, stop: int, shunned: frozenset[int]) -> 
 
 def _first_free(rtc: Status, policy: Policy) -> int:
     """Return the first mode that the loop neither controls nor is going to."""
-    return max(rtc.n_controlled, min(policy.n_modes_target, rtc.n_modes))
+    return max(rtc.n_controlled, policy.wanted_modes(rtc))

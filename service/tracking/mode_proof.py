@@ -487,4 +487,4 @@ def _target_modes(context: StepContext, rtc: Status) -> int:
     proposed = (
         r.n_modes for r in context.matrices.reconstructors if r.state is MatrixState.PROPOSED
     )
-    return max(rtc.n_controlled, min(context.policy.n_modes_target, rtc.n_modes), *proposed, 0)
+    return max(rtc.n_controlled, context.policy.wanted_modes(rtc), *proposed, 0)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
 from service.tracking.alarms import Interlock, Severity
+
+if TYPE_CHECKING:
+    from service.wire import Status
 
 SECOND_NS = 1_000_000_000
 
@@ -54,6 +59,17 @@ class Offloading:
 
     settle_s: float
     """From the reply until the image stands still, where the reply does not say."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorModePolicy:
+    """What the tracker must know of a mode of the sensor."""
+
+    subaperture_m: float
+    """Width of a subaperture in the pupil plane: α's shifts are in it."""
+
+    n_controlled: int | None
+    """Modes to control at most; None: as many as are wanted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -149,5 +165,26 @@ class Policy:
     offloading: Offloading | None
     """None: α is corrected by the matrix alone."""
 
+    sensor_modes: Mapping[str, SensorModePolicy] = field(default_factory=dict)
+    """Modes that the sensor may change to, by their ``config_id``; empty: it has one alone."""
+
     refused_interval_s: float = 30.0
     """The same after one was refused, rejected or not acknowledged."""
+
+    def wanted_modes(self, rtc: Status) -> int:
+        """Return how many modes are to be controlled once the registration is known."""
+        mode = self.sensor_modes.get(rtc.config_id)
+        most = rtc.n_modes if mode is None or mode.n_controlled is None else mode.n_controlled
+        return min(self.n_modes_target, rtc.n_modes, most)
+
+    def alpha_scale(self, before: str | None, now: str | None) -> NDArray[np.float64] | None:
+        """Return what ``(4,)`` numbers of α become in another mode: they are multiplied by this.
+
+        The mirror's image stays where it is, and subapertures have another width. None: one of the
+        two is no mode of the sensor.
+        """
+        modes = self.sensor_modes
+        if before is None or now is None or not {before, now} <= modes.keys():
+            return None
+        shift = modes[before].subaperture_m / modes[now].subaperture_m
+        return np.array([shift, shift, 1.0, 1.0])

@@ -121,6 +121,9 @@ class ReconstructorRecord:
     applied_frame_seq: int | None = None
     """First frame whose slopes it multiplied; None: not applied, or before this service came."""
 
+    config_id: str | None = None
+    """The RTC's configuration that it is for; None: not known, or the RTC has one alone."""
+
     cause: str = field(default="", compare=False)
     """Id of the order or event that has made it, or sent it since."""
 

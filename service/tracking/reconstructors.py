@@ -111,6 +111,13 @@ def forget_session(context: StepContext) -> None:
     )
 
 
+def discard_proposals(context: StepContext, why: str) -> None:
+    """Discard what waits for an operator: it is worth nothing any more."""
+    for record in context.matrices.reconstructors:
+        if record.state is MatrixState.PROPOSED:
+            change_state(context, record.id, MatrixState.DISCARDED, why)
+
+
 def request_applied(context: StepContext, rtc: Status) -> None:
     """Ask the RTC for the matrix it uses."""
     context.matrices = replace(context.matrices, applied_asked_ns_utc=context.now_ns)

@@ -23,6 +23,7 @@ from service.tracking.step_context import StepContext
 from service.tracking.validity import (
     age_registration,
     forget_registration,
+    in_subapertures,
     restore_intervals,
     restore_registration,
 )
@@ -187,7 +188,19 @@ def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> T
     return context.state
 
 
+def _in_present_mode(context: StepContext, saved: Saved) -> Saved:
+    """Return what was saved in another mode of the sensor in the subapertures of the present."""
+    registration, now = saved.registration, context.loop.config_id
+    if registration is None or now is None or registration.config_id == now:
+        return saved
+    scale = context.policy.alpha_scale(registration.config_id, now)
+    if scale is None:
+        return saved
+    return replace(saved, registration=in_subapertures(registration, scale, now), mode_proof=None)
+
+
 def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
+    saved = _in_present_mode(context, saved)
     reason = _why_not(context.state, saved, now_ns)
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"

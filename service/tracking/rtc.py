@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation.loop import loop_numbers, same_loop, same_numbers
-from service.tracking import alarms, dither, mode_proof, reconstructors, validity
+from service.tracking import alarms, dither, mode_proof, reconstructors, update_policy, validity
 from service.tracking import events as ev
 from service.tracking.events import Effect
 from service.tracking.operator import end_ramp
@@ -45,6 +45,8 @@ def on_tick(context: StepContext) -> None:
 
 def on_status(context: StepContext, rtc: Status) -> None:
     """Take over what the RTC says of itself."""
+    if rtc.config_id != context.loop.config_id and rtc.config_id in context.policy.sensor_modes:
+        _enter_sensor_mode(context, rtc.config_id)
     before, registration = context.rtc, context.registration
     if before is not None and not same_loop(before, rtc):
         # the margin is not what it was
@@ -109,11 +111,32 @@ def _drop_other_basis(context: StepContext) -> None:
         context.log("registration.void", text)
 
 
+def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
+    """Keep α in the subapertures of the sensor's new mode; matrices and gains were of the old."""
+    before = context.loop.config_id
+    _begin_anew(context, "the sensor was in another mode")
+    reconstructors.discard_proposals(context, f"the sensor's mode is {config_id} now")
+    update_policy.forget_limit(context)
+    context.loop = replace(context.loop, config_id=config_id)
+    kept, scale = "", context.policy.alpha_scale(before, config_id)
+    if scale is not None:
+        validity.change_subapertures(context, scale, config_id)
+        if context.registration is not None:
+            kept = f"; α is kept, {context.registration.alpha} in its subapertures"
+    context.log("sensor.mode", f"the sensor's mode is {config_id}, it was {before}{kept}")
+
+
 def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     """Void what belonged to the old session; α is the telescope's and stays, to be confirmed."""
+    _begin_anew(context, "the RTC was in another session")
+    context.log("rtc.session", f"the RTC started session {started.session}")
+
+
+def _begin_anew(context: StepContext, because: str) -> None:
+    """Void what belonged to the loop until now."""
     reconstructors.forget_session(context)
     mode_proof.forget_session(context)
-    validity.invalidate_telemetry(context, "the RTC was in another session")
+    validity.invalidate_telemetry(context, because)
     dither.forget_dither(context)
     end_ramp(context)
     validity.require_new_windows(context)
@@ -122,7 +145,6 @@ def on_new_session(context: StepContext, started: ev.SessionStarted) -> None:
     dither.note_found(context)
     context.clear_alarm(alarms.MIRROR_SILENT)
     dither.forget_unwanted(context)
-    context.log("rtc.session", f"the RTC started session {started.session}")
 
 
 def on_vanished(context: StepContext, _: ev.RtcVanished) -> None:

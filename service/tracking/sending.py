@@ -26,6 +26,11 @@ def why_unsendable(
     """
     if state.loop.rtc is None:
         return NO_RTC
+    if record.config_id not in {None, state.loop.config_id}:
+        return (
+            f"it is for the sensor's mode {record.config_id}, which is now "
+            f"{state.loop.config_id}: have another one made, or change the mode back"
+        )
     was_used, registration = _was_in_use(state, record), state.alpha.registration
     if registration is not None and not was_used:  # one must be able to go back
         if registration.suspected_jump is not None:

@@ -339,7 +339,7 @@ class TrackerState:
         used = (
             r.id
             for r in reversed(self.matrices.reconstructors)
-            if r.state is MatrixState.SUPERSEDED
+            if r.state is MatrixState.SUPERSEDED and r.config_id in {None, self.loop.config_id}
         )
         return next(used, None)
 

@@ -289,7 +289,7 @@ def more_modes_to_try(
     """
     if not rtc.gains[rtc.n_controlled - 1]:
         return ()
-    target = min(policy.n_modes_target, rtc.n_modes)
+    target = policy.wanted_modes(rtc)
     limit = state.matrices.mode_limit
     if limit is not None and (now_ns < limit.until_ns_utc or not _comfortable(state)):
         target = min(target, limit.n_modes)
@@ -302,6 +302,11 @@ def _comfortable(state: TrackerState) -> bool:
     if margin is None or not margin.accepted:
         return False
     return 1.0 - margin.worst_pole_radius >= COMFORT * (1.0 - margin.bound)
+
+
+def forget_limit(context: StepContext) -> None:
+    """Forget how many modes could be controlled: the sensor is in another mode."""
+    context.matrices = replace(context.matrices, mode_limit=None)
 
 
 def note_limit(

@@ -144,6 +144,36 @@ def forget_biases(context: StepContext) -> None:
         store_registration(context, replace(context.registration, biases=()))
 
 
+def change_subapertures(context: StepContext, scale: Array, config_id: str) -> None:
+    """Keep α over a change of the sensor's mode; windows must confirm it.
+
+    ``scale`` ``(4,)`` multiplies its numbers. What was learnt of gains and biases was of the mode
+    before.
+    """
+    registration = context.registration
+    if registration is not None:
+        scaled = in_subapertures(registration, scale, config_id)
+        store_registration(context, replace(scaled, n_windows=0))
+        age_registration(context)
+
+
+def in_subapertures(registration: Registration, scale: Array, config_id: str) -> Registration:
+    """Return what is known of α in the subapertures of another mode of the sensor."""
+    return replace(
+        registration,
+        alpha=Misregistration.from_vector(registration.alpha.vector * scale),
+        covariance=registration.covariance * np.outer(scale, scale),
+        floor=registration.floor * scale,
+        grown=registration.grown * scale**2,
+        optical_gain=None,
+        optical_gains=(),
+        biases=(),
+        previous_estimate=None,
+        suspected_jump=None,
+        config_id=config_id,
+    )
+
+
 def require_new_windows(context: StepContext) -> None:
     """Have windows confirm what is known anew."""
     if context.registration is not None:

@@ -235,7 +235,9 @@ def initial_reconstructor(
 ) -> Reconstructor:
     """Return the matrix before any flexure: the nominal model's inverse."""
     aligned = instrument.start
-    interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
+    fineness = 3 * instrument.binning
+    model = InteractionModel(instrument, basis, pupil_sampling=fineness, detector_nodes=fineness)
+    interaction = model.interaction_matrix(aligned)
     matrix = truncated_inverse(interaction[:, :n_controlled])
     name = f"initial-{n_controlled}-{checksum(matrix)[:8]}"
     made_ns, alpha = time.time_ns(), aligned.to_boundary()
@@ -256,8 +258,11 @@ def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:
     sensor.update(repr(kind_of(instrument).identity(wfs)).encode())
     if instrument.slopes.kind is not SignalKind.XY:
         sensor.update(instrument.slopes.kind.encode())
+    config_id = instrument.config_id
+    if not instrument.sensor_modes or config_id is None:
+        config_id = f"{wfs.kind}-{wfs.n_subapertures}-{sensor.hexdigest()[:8]}"
     return Identity(
         system=instrument.name,
         basis_id=f"{kind}-{instrument.modes.n_modes}-{basis.hexdigest()[:8]}",
-        config_id=f"{wfs.kind}-{wfs.n_subapertures}-{sensor.hexdigest()[:8]}",
+        config_id=config_id,
     )

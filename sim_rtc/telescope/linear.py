@@ -78,11 +78,12 @@ class LinearPlant(Plant):
     def __init__(
         self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
     ) -> None:
-        super().__init__(instrument, basis, instrument_pupil(instrument, _SAMPLING), made)
+        sampling, n_nodes = _SAMPLING * instrument.binning, _NODES * instrument.binning
+        super().__init__(instrument, basis, instrument_pupil(instrument, sampling), made)
         self._sensor = kind_of(instrument).sensor(
             replace(instrument, wfs=self._wfs),
             self._pupil,
-            Fineness(n_nodes=_NODES, n_source_points=_SOURCE_POINTS),
+            Fineness(n_nodes=n_nodes, n_source_points=_SOURCE_POINTS),
         )
         imperfections = made.get("imperfections") or Imperfections()
         self._gain = optical_gain(basis.mode_to_actuator.shape[1], imperfections)

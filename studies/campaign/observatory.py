@@ -35,7 +35,7 @@ from service.tracking.commands import Command
 from service.tracking.events import Effect, Event
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.products import MatrixState, ReconstructorRecord
-from service.tracking.state import Mode, OperatorState, TrackerState
+from service.tracking.state import LoopState, Mode, OperatorState, TrackerState
 from service.wire import CHUNK_LIMIT, Manifest, Status, checksum
 from studies.campaign.observatory_checks import Publication, Swap, published, true_radius
 from studies.campaign.observatory_dome import Dome
@@ -124,7 +124,12 @@ class Observatory:
         self.dome = dome or Dome(options)
         self.latencies = latencies or Latencies()
         system = self.dome.computer.identity.system
-        state = TrackerState(system=system, operator=OperatorState(mode=mode))
+        about = self.dome.instrument
+        state = TrackerState(
+            system=system,
+            operator=OperatorState(mode=mode),
+            loop=LoopState(basis_id=about.basis_id, config_id=about.config_id),
+        )
         self._engine = Engine(state, policy, self, step=self.step)
         self._engine.set_description(workbench.describe())
         self.glances: list[Glance] = []
@@ -386,6 +391,22 @@ class Observatory:
         """Watch what a matrix does that has come into use."""
         if in_use is not None:
             self._hear_out(in_use)
+
+    def sensor_mode_changed(self, config_id: str) -> None:
+        """Have the worker model another mode of the sensor, as soon as it has a hand free."""
+
+        def begin() -> _Job:
+            description = asyncio.run(self._actions.enter_sensor_mode(config_id))
+
+            def done() -> None:
+                if self.state.loop.config_id == config_id:
+                    self._engine.set_description(description)
+                    self._post(ev.LogEvent(name="service.ready", text=config_id))
+                    self.swapped(self.state.matrices.in_use)
+
+            return self.latencies.make_s, done
+
+        self._work(OpticsWorker.enter_mode, begin)
 
     def _hear_out(self, in_use: str) -> None:
         """Watch what the matrix in use does, and learn from it how the RTC speaks."""

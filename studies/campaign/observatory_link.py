@@ -29,9 +29,13 @@ class ShortLink:
 
     def __init__(self, dome: Dome) -> None:
         self._dome = dome
-        self._staging = Staging(dome.computer.terms, limit_bytes=dome.computer.largest_matrix_bytes)
+        self._staging = self._new_staging()
         self.sent: list[tuple[Manifest, NDArray[np.float32]]] = []
         """Matrices on their way to the RTC."""
+
+    def _new_staging(self) -> Staging:
+        computer = self._dome.computer
+        return Staging(computer.terms, limit_bytes=computer.largest_matrix_bytes)
 
     async def command(self, command: Command) -> Reply:
         """Return the RTC's answer."""
@@ -67,7 +71,7 @@ class ShortLink:
     def void(self) -> None:
         """Forget what was on its way: the RTC has restarted."""
         self.sent.clear()
-        self._staging.void()
+        self._staging = self._new_staging()
 
     def _carry_out(self, outcome: Outcome) -> list[Acknowledgement]:
         for reconstructor in outcome.staged:

@@ -11,7 +11,7 @@ import pytest
 
 from service.config import Settings, load_instrument, load_settings, packaged_file
 from service.config.mirrors import coincident, grid, rings, typical_pitch
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, ModelError
 from service.model.instrument import instrument_sha256
 from service.model.kinds import Influence, LoopFacts, Normalisation, SignalKind, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
@@ -315,6 +315,86 @@ def test_positions_that_make_no_mirror_are_refused(write, tmp_path, positions, e
     mirror = '[mirror]\nlayout = "positions"\npositions = "act.h5:/xy_m"\n'
     message = refusal(load_instrument, write(ABOUT + WFS + mirror + "[modes]\nn_modes = 3\n"))
     assert expected in message
+
+
+FOUR = "\n".join(f'[[wfs.mode]]\nconfig_id = "b{k}"\nbinning = {k}\n' for k in (1, 2, 4, 5))
+
+
+def test_modes_of_the_sensor_are_its_subapertures_binned(write):
+    bench = load_instrument(write(ABOUT + APART + FOUR + MIRROR + MODES))
+    assert (bench.config_id, bench.binning) == ("b1", 1)
+    coarse = bench.in_mode("b4")
+    assert (coarse.wfs.n_subapertures, coarse.wfs.pupil_separation_subap) == (5, 6)
+    assert coarse.subaperture_m == pytest.approx(4 * bench.subaperture_m)
+    assert (coarse.config_id, coarse.binning, coarse.finest.binning) == ("b4", 4, 1)
+    assert coarse.in_mode("b1").wfs is bench.wfs
+
+
+def test_a_file_with_modes_has_another_digest_and_one_without_the_same_as_ever(write):
+    alone = load_instrument(write(ABOUT + APART + MIRROR + MODES))
+    modes = load_instrument(write(ABOUT + APART + FOUR + MIRROR + MODES, "modes.toml"))
+    assert instrument_sha256(alone) != instrument_sha256(modes)
+    none = replace(modes, wfs=alone.wfs, sensor_modes=(), config_id=None, loop=None)
+    assert instrument_sha256(none) == instrument_sha256(alone)
+
+
+def test_what_a_mode_leaves_open_is_the_loops(write):
+    modes = FOUR.replace("binning = 2\n", "binning = 2\nframe_rate_hz = 500\nn_controlled = 20\n")
+    loop = "[loop]\nframe_rate_hz = 1000\ndelay_frames = 2\nn_controlled = 40\n"
+    bench = load_instrument(write(ABOUT + APART + modes + MIRROR + MODES + loop))
+    assert bench.in_mode("b2").loop == LoopFacts(frame_rate_hz=500, delay_frames=2, n_controlled=20)
+    assert bench.in_mode("b2").in_mode("b4").loop == bench.loop
+    assert bench.loop == LoopFacts(frame_rate_hz=1000, delay_frames=2, n_controlled=40)
+
+
+def test_a_binned_mode_has_a_mask_of_its_own(write, tmp_path):
+    with h5py.File(tmp_path / "mask.h5", "w") as file:
+        file["fine"], file["coarse"] = np.ones((20, 20)), np.eye(10)
+    masked = APART + 'valid_subapertures = "mask.h5:/fine"\n'
+    modes = '[[wfs.mode]]\nconfig_id = "b2"\nbinning = 2\n'
+    assert "bench.toml: wfs.mode[0].valid_subapertures: missing" in refusal(
+        load_instrument, write(ABOUT + masked + modes + MIRROR + MODES)
+    )
+    own = modes + 'valid_subapertures = "mask.h5:/coarse"\n'
+    bench = load_instrument(write(ABOUT + masked + own + MIRROR + MODES))
+    assert bench.wfs.valid_subapertures.sum() == 10
+    wrong = modes + 'valid_subapertures = "mask.h5:/fine"\n'
+    assert "wfs.mode[0].valid_subapertures: found shape (20, 20)" in refusal(
+        load_instrument, write(ABOUT + masked + wrong + MIRROR + MODES)
+    )
+
+
+@pytest.mark.parametrize(
+    ("about", "modes", "expected"),
+    [
+        ("", 'config_id = "b3"\nbinning = 3\n', "wfs.mode[0].binning: found 3 of 20 subapertures"),
+        ("", 'config_id = "b"\nbinning = 2\nn_subapertures = 5\n', "found 5 across a pupil image"),
+        (
+            "",
+            'config_id = "b"\n[[wfs.mode]]\nconfig_id = "b"\n',
+            "mode[1].config_id: found 'b' again",
+        ),
+        ("", "binning = 2\n", "wfs.mode.0.config_id: missing"),
+        ("", 'config_id = "b"\nbinnign = 2\n', "unknown key, did you mean binning?"),
+        ("", 'config_id = "b"\nn_controlled = 51\n', "mode[0].n_controlled: found 51, expected at"),
+        ('config_id = "b"\n', 'config_id = "b"\n', "has no meaning beside [[wfs.mode]]"),
+    ],
+)
+def test_modes_that_cannot_be_are_refused_in_one_line(write, about, modes, expected):
+    text = ABOUT + about + APART + "[[wfs.mode]]\n" + modes + MIRROR + MODES
+    assert expected in refusal(load_instrument, write(text))
+
+
+def test_modes_belong_to_slopes(write):
+    framed = APART + 'input = "frames"\n[[wfs.mode]]\nconfig_id = "b"\n'
+    text = ABOUT + framed + MIRROR + MODES
+    assert 'mode: belongs to input = "slopes"' in refusal(load_instrument, write(text))
+
+
+def test_an_unknown_mode_names_those_that_are_known(write):
+    bench = load_instrument(write(ABOUT + APART + FOUR + MIRROR + MODES))
+    with pytest.raises(ModelError, match="bench: found mode b3, expected one of: b1, b2, b4, b5"):
+        bench.in_mode("b3")
 
 
 def test_an_unknown_packaged_name_lists_the_known_ones():

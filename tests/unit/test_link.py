@@ -609,6 +609,22 @@ def test_batches_do_not_pile_up_where_nobody_asks_for_them(clock):
     assert sum(block.n_frames for block in intake.drain()) == 1000
 
 
+def test_frames_of_a_known_mode_of_the_sensor_are_used_and_of_another_named(clock):
+    intake = Intake(Endpoint(system="bench"), clock)
+    intake.expect("b", "other", ("other", "c"))
+    send(intake, 0)
+    assert spans(intake.drain()) == [("s1", 0, 10)]
+    assert intake.statistics().config_id == "c"
+    intake.expect("b", "other", ("other", "third"))
+    send(intake, 10)
+    assert intake.statistics().frames_refused == {"config": 10}
+    (told,) = [e.text for e in intake.events() if isinstance(e, ev.ConditionChanged)]
+    assert told.endswith(
+        "the instrument file has the modes other, third: set the RTC to one of them, or add "
+        "[[wfs.mode]] config_id = 'c' to the file"
+    )
+
+
 def test_a_batch_is_judged_by_what_was_expected_when_it_came(clock):
     intake = Intake(Endpoint(system="bench"), clock)
     send(intake, 0)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from service.model.instrument import Instrument, SensorDescription
+    from service.model.instrument import Instrument, SensorDescription, SensorMode
     from service.model.kinds import SignalKind
     from service.model.pupil import PupilGrid
     from service.model.sensors.sensor import CannotTell, Fineness, Light, Sensor
@@ -110,6 +110,22 @@ class SensorKind(ABC):
         ModelError
             One line that begins with the key.
         """
+
+    def in_modes(
+        self,
+        table: Any,  # noqa: ANN401 - its own
+        sensor: Any,  # noqa: ANN401 - its own
+    ) -> tuple[tuple[SensorMode, str], ...]:
+        """Return the modes that a table makes of its sensor, each with where its own mask is.
+
+        ``path:/dataset``, or "auto": by ``flux_threshold``. Empty: the sensor has no modes.
+
+        Raises
+        ------
+        ModelError
+            One line that begins with the key.
+        """
+        return ()
 
     def frames(self, table: Any, given: frozenset[str]) -> object | None:  # noqa: ANN401 - its own
         """Return how signals are made of the frames that the RTC sends; None: it sends signals."""

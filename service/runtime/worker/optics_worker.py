@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TypeVar
@@ -44,6 +43,7 @@ from service.runtime.worker.records import (
     Made,
     actuators_of,
     check_controllable,
+    largest_passing,
     outer_of,
     waits,
 )
@@ -84,22 +84,22 @@ class OpticsWorker:
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
         check_controllable(instrument)
         self._disk_cache = DiskCache(compute.cache)
-        self._basis = self._disk_cache.basis(instrument)
         self._threads = ThreadPoolExecutor(compute.threads)
         self._compute = compute
         self._mode_response: NDArray[np.float64] | None = None
+        self._basis = self._disk_cache.basis(instrument)
         self._equip(instrument)
 
     def _equip(self, instrument: Instrument) -> None:
         """Make the models of an instrument, all but its modes."""
-        basis, compute = self._basis, self._compute
+        basis, compute, binning = self._basis, self._compute, instrument.binning
 
         def model(sampling: int, nodes: int, at_work: WorkingPoint | None) -> RtcInteractionModel:
             return RtcInteractionModel(
                 instrument,
                 basis,
-                pupil_sampling=sampling,
-                detector_nodes=nodes,
+                pupil_sampling=sampling * binning,
+                detector_nodes=nodes * binning,
                 working_point=at_work,
                 mapper=self._threads.map,
                 mode_response=self._mode_response,
@@ -110,7 +110,7 @@ class OpticsWorker:
             lambda at_work: model(sampling, nodes, at_work),
             instrument,
             working_point_modes,
-            sampling,
+            sampling * binning,
         )
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
@@ -122,6 +122,25 @@ class OpticsWorker:
         models = (self._coarse, *itertools.chain.from_iterable(self._wide_capture.values()))
         for model in (*self._sensor.models, *models):
             model.forget()
+
+    def enter_mode(self, config_id: str) -> Description:
+        """Make the models of another mode of the sensor; return the expected telemetry.
+
+        Order and signs of the slopes stay as they were found; how strongly modes answer is read
+        anew of the RTC's own matrix of that mode.
+
+        Raises
+        ------
+        ModelError
+            If the instrument has no such mode.
+        """
+        instrument = self._model.instrument
+        if config_id != instrument.config_id:
+            instrument = instrument.in_mode(config_id)
+            self._basis = self._disk_cache.basis(instrument)
+            self._mode_response = None
+            self._equip(instrument)
+        return self.describe()
 
     def describe(self) -> Description:
         """Return the expected telemetry, and prepare for the first fit."""
@@ -212,12 +231,18 @@ class OpticsWorker:
         return replace(dialect, adopted=True)
 
     def adopt(
-        self, slopes: SlopeRecipe | None, mode_response: NDArray[np.float64] | None = None
+        self,
+        slopes: SlopeRecipe | None,
+        mode_response: NDArray[np.float64] | None = None,
+        config_id: str | None = None,
     ) -> None:
         """List slopes in this order from now on, and expect this response ``(n_modes,)`` of modes.
 
-        None leaves what it stands for as it is.
+        ``config_id`` is the sensor's mode that both are of. None leaves what it stands for as it
+        is.
         """
+        if self._model.instrument.sensor_modes and config_id is not None:
+            self.enter_mode(config_id)
         instrument, now = self._model.instrument, self._model.instrument.slopes
         if slopes is not None and replace(now, orientation=now.assumed_orientation) != slopes:
             instrument = replace(instrument, slopes=slopes)
@@ -277,12 +302,13 @@ class OpticsWorker:
         modes = spectra.plan.modes
         if modes not in self._wide_capture:
             basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
+            binning = self._model.instrument.binning
             self._wide_capture[modes] = tuple(
                 RtcInteractionModel(
                     self._model.instrument,
                     basis,
-                    pupil_sampling=sampling,
-                    detector_nodes=sampling,
+                    pupil_sampling=sampling * binning,
+                    detector_nodes=sampling * binning,
                     mapper=self._threads.map,
                     mode_response=None if every is None else every[list(modes)],
                 )
@@ -370,7 +396,7 @@ class OpticsWorker:
                 matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
             )
 
-        return _largest_passing(len(loop.gains), fewer, judged)
+        return largest_passing(len(loop.gains), fewer, judged)
 
     def assess(
         self,
@@ -457,24 +483,6 @@ class OpticsWorker:
             return None
         gains = found.optical_gain * self._sensor.ratio()[: sums.n_modes]
         return replace(found, optical_gain=gains)
-
-
-def _largest_passing(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:
-    """Return what passes with most modes: fewer are never less stable, so halves are enough."""
-    asked = judged(n_modes)
-    if asked.gate.accepted:
-        return asked
-    found, refused, first, end = None, asked, 0, len(fewer)
-    while first < end:
-        middle = (first + end) // 2
-        tried = judged(fewer[middle])
-        if tried.gate.accepted:
-            found, end = tried, middle
-        else:
-            refused, first = tried, middle + 1
-    if found is None:
-        return asked
-    return replace(found, why_fewer=f"{len(refused.matrix)} modes: {refused.gate.reason}")
 
 
 def _unsettled(spectra: Spectra | Correlated) -> WindowRefused:

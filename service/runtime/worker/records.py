@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -146,3 +146,21 @@ def check_controllable(instrument: Instrument) -> None:
             f"{instrument.name}: found wfs.input = frames; expected slopes, which is what an RTC "
             "sends (pyrcal fit takes frames)"
         )
+
+
+def largest_passing(n_modes: int, fewer: tuple[int, ...], judged: Callable[[int], Made]) -> Made:
+    """Return what passes with most modes: fewer are never less stable, so halves are enough."""
+    asked = judged(n_modes)
+    if asked.gate.accepted:
+        return asked
+    found, refused, first, end = None, asked, 0, len(fewer)
+    while first < end:
+        middle = (first + end) // 2
+        tried = judged(fewer[middle])
+        if tried.gate.accepted:
+            found, end = tried, middle
+        else:
+            refused, first = tried, middle + 1
+    if found is None:
+        return asked
+    return replace(found, why_fewer=f"{len(refused.matrix)} modes: {refused.gate.reason}")

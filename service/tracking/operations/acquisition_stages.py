@@ -134,7 +134,7 @@ def loop_found(state: TrackerState, rtc: Status, policy: Policy) -> LoopFound:
     """Return the loop as it is, and as it shall be closed again."""
     closed = rtc.loop != "open"
     out_of_hand = blocking_alarm(state.alarms.active, Interlock.HOLD) is not None
-    goal = rtc.n_controlled or min(policy.n_modes_target, rtc.n_modes)
+    goal = rtc.n_controlled or policy.wanted_modes(rtc)
     gains = rtc.gains if closed else (CLOSING_GAIN,) * goal
     return LoopFound(
         closed=closed,

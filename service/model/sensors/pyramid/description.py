@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument
-from service.model.sensors.pyramid.table import PyramidNumbers, PyramidTable
+from service.model.instrument import Instrument, SensorMode
+from service.model.kinds import LoopFacts
+from service.model.sensors.pyramid.table import PyramidMode, PyramidNumbers, PyramidTable
 
 _SEPARATION_TOLERANCE = 0.1
 
@@ -56,6 +57,56 @@ def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
         )
     optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
     return Pyramid(**optics | {"pupil_separation_subap": separation})
+
+
+def modes_of(table: PyramidTable, sensor: Pyramid) -> tuple[tuple[SensorMode, str], ...]:
+    """Return the modes that a table makes of its sensor, each with where its mask is.
+
+    Raises
+    ------
+    ModelError
+        One line that begins with the key: two of one name, a binning that does not divide, frames.
+    """
+    if table.mode and table.input == "frames":
+        raise ModelError('mode: belongs to input = "slopes", found input = "frames"')
+    names = [mode.config_id for mode in table.mode]
+    for k, mode in enumerate(table.mode):
+        if mode.config_id in names[:k]:
+            raise ModelError(
+                f"mode[{k}].config_id: found {mode.config_id!r} again, expected a name of its own"
+            )
+    return tuple(
+        (_in_mode(sensor, mode, f"mode[{k}]"), mode.valid_subapertures)
+        for k, mode in enumerate(table.mode)
+    )
+
+
+def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
+    n, binning = sensor.n_subapertures, mode.binning
+    if mode.n_subapertures is None and n % binning:
+        raise ModelError(
+            f"{where}.binning: found {binning} of {n} subapertures, which it does not divide; "
+            f"expected n_subapertures beside it, the binned grid's: about {n / binning:.1f}"
+        )
+    across = mode.n_subapertures or n // binning
+    diameter = sensor.pupil_diameter / binning
+    if not diameter - 1.0 < across < 2.0 * diameter:
+        raise ModelError(
+            f"{where}.n_subapertures: found {across} across a pupil image of {diameter:.1f}, "
+            "expected as many as the image is wide, or a few more"
+        )
+    modulation = mode.modulation_lambda_over_d
+    wfs = replace(
+        sensor,
+        n_subapertures=across,
+        pupil_separation_subap=sensor.image_separation_subap / binning,
+        pupil_diameter_subap=diameter,
+        modulation_lambda_over_d=(
+            sensor.modulation_lambda_over_d if modulation is None else modulation
+        ),
+    )
+    loop = LoopFacts(frame_rate_hz=mode.frame_rate_hz, n_controlled=mode.n_controlled)
+    return SensorMode(config_id=mode.config_id, binning=binning, wfs=wfs, loop=loop)
 
 
 def pyramid_in(instrument: Instrument) -> Pyramid:

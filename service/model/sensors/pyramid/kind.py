@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from service.model.instrument import Instrument
+    from service.model.instrument import Instrument, SensorMode
     from service.model.pupil import PupilGrid
     from service.model.sensors.pyramid.description import FrameWindows, Pyramid
     from service.model.sensors.pyramid.light import PyramidLight
@@ -61,6 +61,16 @@ class PyramidKind(SensorKind):
         from service.model.sensors.pyramid.description import pyramid_of
 
         return pyramid_of(table, given)
+
+    @override
+    def in_modes(
+        self,
+        table: PyramidTable,
+        sensor: Pyramid,
+    ) -> tuple[tuple[SensorMode, str], ...]:
+        from service.model.sensors.pyramid.description import modes_of
+
+        return modes_of(table, sensor)
 
     @override
     def frames(self, table: PyramidTable, given: frozenset[str]) -> FrameWindows | None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 
 from service.model.kinds import Count, Positive, Read
 
 USUAL_SEPARATION = 1.2
 """Distance of neighbouring pupil images over their diameter, where nobody tells."""
 
+Across = Annotated[int, Ge(4), Le(1000)]
+Modulation = Annotated[float, Ge(0.0), Le(100.0)]
 Pixel = Annotated[float, Ge(0.0)]
 Centre = tuple[Pixel, Pixel]
 Centres = tuple[Centre, Centre, Centre, Centre]
@@ -21,13 +23,13 @@ Centres = tuple[Centre, Centre, Centre, Centre]
 class PyramidNumbers(Read):
     """The modulated pyramid wavefront sensor and its sampling."""
 
-    n_subapertures: Annotated[int, Ge(4), Le(1000)]
+    n_subapertures: Across
     """Subapertures across the sensor grid."""
 
     wavelength_m: Annotated[float, Gt(1e-7), Lt(1e-4)]
     """Sensing wavelength, metres; may be "unknown" until a matrix is fitted."""
 
-    modulation_lambda_over_d: Annotated[float, Ge(0.0), Le(100.0)]
+    modulation_lambda_over_d: Modulation
     """Radius of the modulation circle, λ/D; may be "unknown" until a matrix is fitted."""
 
     pupil_separation_subap: Positive | None = None
@@ -52,6 +54,33 @@ class PyramidNumbers(Read):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PyramidMode(Read):
+    """``[[wfs.mode]]``: a mode that the RTC may change to at night, as another binning is."""
+
+    config_id: Annotated[str, MinLen(1), MaxLen(128)]
+    """The RTC's name of it: a mode is a configuration of its own."""
+
+    binning: Count = 1
+    """Subapertures of ``[wfs]`` that are one along each axis."""
+
+    n_subapertures: Across | None = None
+    """Subapertures across the binned grid; None: those of ``[wfs]`` over ``binning``, which must
+    divide them."""
+
+    modulation_lambda_over_d: Modulation | None = None
+    """Radius of the modulation circle, λ/D; None: that of ``[wfs]``."""
+
+    valid_subapertures: str = "auto"
+    """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
+
+    frame_rate_hz: Positive | None = None
+    """Frames per second, for work without an RTC; None: that of ``[loop]``."""
+
+    n_controlled: Count | None = None
+    """Modes to control at most; None: as many as the settings want."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PyramidTable(PyramidNumbers):
     """``[wfs]``: the pyramid sensor."""
 
@@ -68,3 +97,6 @@ class PyramidTable(PyramidNumbers):
 
     pixels_per_subaperture: Count = 1
     """Frames only."""
+
+    mode: tuple[PyramidMode, ...] = ()
+    """A table ``[[wfs.mode]]`` for each; the service begins with the first."""

@@ -18,16 +18,20 @@ from typing_extensions import override
 
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
+from service.model.local import LocalShapes, Patch, Shapes, tiles_of
 from service.model.misregistration import Misregistration, rotation
-from service.model.modes import Basis
+from service.model.modes import Basis, ModalBasis
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.registry import kind_of
-from service.model.sensors.sensor import Fineness, Mapper, Response, Sensor, by_rows
+from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Response, Sensor, by_rows
 from service.model.slopes import rtc_mask, to_rtc
 
 Array = NDArray[Any]
 Value = TypeVar("Value")
+
+Way = Callable[[Array], Array]
+"""From points of the mirror ``(n_points, 2)`` to the direction in which each of them moves."""
 
 UNKNOWN_REACH_SUBAP = 1.0
 """Slopes this near to surface that a table does not know are left out of comparisons."""
@@ -75,18 +79,23 @@ class InteractionModel:
         illumination: Illumination | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         mapper: Mapper = map,
+        kept_bytes: float = KEPT_BYTES,
     ) -> None:
         self.instrument = instrument
         self.basis = basis
         pupil = instrument_pupil(instrument, pupil_sampling)
         self.pupil = pupil if illumination is None else pupil.lit_by(illumination)
-        fineness = Fineness(n_nodes=detector_nodes, dtype=dtype, mapper=mapper)
+        fineness = Fineness(
+            n_nodes=detector_nodes, dtype=dtype, mapper=mapper, kept_bytes=kept_bytes
+        )
         kind = kind_of(instrument)
         self.sensor: Sensor = kind.sensor(instrument, self.pupil, fineness, working_point)
         self._map = mapper
         self._dtype = dtype
         self._response: _Last[Response] = _Last()
-        self._modes: _Last[Array] = _Last()
+        self._modes: _Last[Shapes] = _Last()
+        local = isinstance(basis, ModalBasis) and basis.is_local
+        self._tiles = tiles_of(self.pupil) if local else ()
 
     def forget(self) -> None:
         """Give back the memory of the last response and the last rendered modes."""
@@ -121,11 +130,12 @@ class InteractionModel:
         Per unit of stretch along x, and as much shrinking along y; the second along 45 deg and
         135 deg. The size stays, so that neither is a magnification.
         """
-        points = self._mirror_points(alpha)
         turn = rotation(alpha.rotation_rad)
-        on_sensor = points @ turn.T
-        directions = (on_sensor * [-1.0, 1.0] @ turn, -on_sensor[:, ::-1] @ turn)
-        return np.stack([self.seen(alpha, self._moved(points, way)) for way in directions])
+
+        def rate(way: Array) -> Array:
+            return self.seen(alpha, self._moved(alpha, lambda at: at @ way))
+
+        return np.stack([rate(turn.T * [-1.0, 1.0] @ turn), rate(-turn.T[:, ::-1] @ turn)])
 
     def width_derivative(self, alpha: Misregistration) -> Array:
         """Return how D changes with the logarithm of the influence functions' width.
@@ -143,7 +153,7 @@ class InteractionModel:
             derivatives=self.derivatives(alpha).astype(np.float32),
         )
 
-    def seen(self, alpha: Misregistration, shapes: Array) -> Array:
+    def seen(self, alpha: Misregistration, shapes: Shapes) -> Array:
         """Return the signals ``(n_slopes, n_shapes)`` of shapes ``(n_points, n_shapes)``, metres.
 
         In the axes of conventions.md, at the points of ``pupil``.
@@ -177,42 +187,64 @@ class InteractionModel:
 
     def _mirror_points(self, alpha: Misregistration) -> NDArray[np.float64]:
         """Return where each lit pupil point lies on the mirror, ``(n_points, 2)``."""
-        points = self.pupil.points
+        return self._on_mirror(alpha, self.pupil.points)
+
+    def _on_mirror(
+        self, alpha: Misregistration, points: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return where points of the pupil lie on the mirror, ``(n_points, 2)``."""
         if self.instrument.stop is Stop.TELESCOPE:
             points = points - alpha.vector[:2]
         return points @ rotation(alpha.rotation_rad) / alpha.magnification
 
-    def _rendered(self, alpha: Misregistration) -> Array:
-        points = self._mirror_points(alpha)
+    def _rendered(self, alpha: Misregistration) -> Shapes:
         shift = self._image_shift(alpha)
         moved = alpha.vector - np.array([*shift, 0.0, 0.0])
-        return self._modes.get(
-            tuple(moved), lambda: self._by_rows(self.basis.render, points).astype(self._dtype)
-        )
+        return self._modes.get(tuple(moved), lambda: self._moved(alpha, None))
 
     def _shape_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
-        points = self._mirror_points(alpha)
-        turned = np.column_stack([points[:, 1], -points[:, 0]])
         return (
-            self.seen(alpha, self._moved(points, turned)),
-            self.seen(alpha, self._moved(points, -points / alpha.magnification)),
+            self.seen(alpha, self._moved(alpha, lambda at: at[:, ::-1] * [1.0, -1.0])),
+            self.seen(alpha, self._moved(alpha, lambda at: -at / alpha.magnification)),
         )
 
     def _shift_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
         if self.instrument.stop is Stop.TELESCOPE:
-            points = self._mirror_points(alpha)
-            steps = -rotation(alpha.rotation_rad) / alpha.magnification
-            along_x, along_y = (np.broadcast_to(step, points.shape) for step in steps)
+            step_x, step_y = -rotation(alpha.rotation_rad) / alpha.magnification
             return (
-                self.seen(alpha, self._moved(points, along_x)),
-                self.seen(alpha, self._moved(points, along_y)),
+                self.seen(alpha, self._moved(alpha, lambda at: np.broadcast_to(step_x, at.shape))),
+                self.seen(alpha, self._moved(alpha, lambda at: np.broadcast_to(step_y, at.shape))),
             )
         return self._at(self._image_shift(alpha)).shift_rates(self._rendered(alpha))
 
-    def _moved(self, points: NDArray[np.float64], direction: NDArray[np.float64]) -> Array:
-        both = np.hstack([points, direction])
+    def _moved(self, alpha: Misregistration, way: Way | None) -> Shapes:
+        """Return the modes where α puts them or, with a way, their rates along it."""
+        if self._tiles:
+            return self._by_tiles(alpha, way)
+        points = self._mirror_points(alpha)
+        if way is None:
+            return self._by_rows(self.basis.render, points).astype(self._dtype)
+        both = np.hstack([points, way(points)])
         moved = self._by_rows(lambda p: self.basis.render_slope(p[:, :2], p[:, 2:]), both)
         return moved.astype(self._dtype)
+
+    def _by_tiles(self, alpha: Misregistration, way: Way | None) -> Shapes:
+        basis = self.basis
+        if not isinstance(basis, ModalBasis):
+            raise TypeError(f"found {type(basis).__name__}; only functions of actuators end")
+
+        def patch(number: int) -> Patch:
+            tile = self._tiles[number]
+            at = self._on_mirror(alpha, tile.points)
+            functions, weights = basis.patch(at, None if way is None else way(at))
+            return Patch(tile=tile, functions=functions, weights=weights.astype(self._dtype))
+
+        shapes = LocalShapes(
+            patches=tuple(self._map(patch, range(len(self._tiles)))),
+            combination=basis.coefficients.astype(self._dtype),
+            n_points=int(self.pupil.lit.sum()),
+        )
+        return shapes if shapes.is_cheaper else shapes.array()
 
     def _by_rows(self, function: Callable[[Array], Array], rows: Array) -> Array:
         return by_rows(self._map, function, rows)

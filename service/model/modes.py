@@ -79,6 +79,24 @@ class Gaussian:
     coupling: float
     """Height at one pitch, 0..1."""
 
+    def near(self, points: Array) -> NDArray[np.intp]:
+        """Return which functions are higher than ``NOTHING`` at any of some points close together.
+
+        ``points`` is ``(n_points, 2)``.
+        """
+        reach = self.pitch * np.sqrt(np.log(NOTHING) / np.log(self.coupling))
+        middle = points.mean(axis=0)
+        around = np.linalg.norm(points - middle, axis=1).max()
+        apart = np.linalg.norm(self.positions - middle, axis=1)
+        candidates = np.flatnonzero(apart <= around + reach)
+        dx, dy = _offsets(points, self.positions[candidates])
+        reached = (dx**2 + dy**2).min(axis=0, initial=np.inf) <= reach**2
+        return np.asarray(candidates[reached])
+
+    def only(self, functions: NDArray[np.intp]) -> Gaussian:
+        """Return the surface that these functions alone make."""
+        return replace(self, positions=self.positions[functions])
+
     def coefficients(self, strokes: Array) -> Array:
         """Each actuator is its own basis function."""
         return np.asarray(strokes, dtype=np.float64)
@@ -101,6 +119,9 @@ class Gaussian:
         along = dx * direction[:, :1] + dy * direction[:, 1:]
         return np.asarray(rate * along * self.basis(points))
 
+
+NOTHING = 1e-6
+"""Height below which a local function is left out: of slopes as much, and D keeps five digits."""
 
 Surface = ThinPlate | Gaussian
 """Influence functions as combinations of functions that can be evaluated anywhere."""
@@ -184,6 +205,33 @@ class ModalBasis:
         if isinstance(self.surface, Gaussian):
             return self.surface.wider(points * [1.0, self.y_sign]) @ self.coefficients
         return smoothed(self.render, points)
+
+    @property
+    def is_local(self) -> bool:
+        """Whether its functions end near their actuators, so that ``patch`` knows them."""
+        return isinstance(self.surface, Gaussian)
+
+    def patch(
+        self, points: Array, direction: Array | None = None
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Return which functions reach some points close together, and their heights there.
+
+        ``(n_near,)`` and ``(n_points, n_near)``; with a ``direction`` ``(n_points, 2)`` their rates
+        along it. What they weigh in each mode are the ``coefficients``.
+
+        Raises
+        ------
+        ModelError
+            If they do not end.
+        """
+        if not isinstance(self.surface, Gaussian):
+            raise ModelError("modes: found functions that reach everywhere; expected local ones")
+        side = np.array([1.0, self.y_sign])
+        near = self.surface.near(points * side)
+        some = self.surface.only(near)
+        if direction is None:
+            return near, some.basis(points * side)
+        return near, some.slope(points * side, direction * side)
 
     def of_surface(self, surface: Surface) -> ModalBasis:
         """Return the same strokes of other influence functions."""

@@ -15,12 +15,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.local import Shapes
 from service.model.pupil import Illumination
 
 Array = NDArray[Any]
 
 Mapper = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
 """Like the builtin ``map``; an executor's ``map`` spreads the work over rows."""
+
+KEPT_BYTES = 1e9
+"""Enough for K of 40 subapertures at every sampling; of the ELT it takes 3.8 GB."""
 
 _ROW_CHUNK = 512
 """Rows of a product per task: large enough for BLAS, small enough to share between cores."""
@@ -39,13 +43,14 @@ class Response(Protocol):
     def jacobian(self) -> Array:
         """Return K whole, ``(n_signals, n_points)`` per metre: for simulators only."""
 
-    def apply(self, shapes: Array) -> Array:
+    def apply(self, shapes: Shapes) -> Array:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts ``(n_points, n_shapes)``.
 
-        Wavefronts are in metres of OPD, at the lit points of the pupil.
+        Wavefronts are in metres of OPD, at the lit points of the pupil. Local ones stand on the
+        right of a product like any others.
         """
 
-    def shift_rates(self, shapes: Array) -> tuple[Array, Array]:
+    def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
         """Return how they change when the image moves along x, and along y, per subaperture."""
 
 
@@ -93,6 +98,9 @@ class Fineness:
 
     mapper: Mapper = map
     """Spreads rows over threads."""
+
+    kept_bytes: float = KEPT_BYTES
+    """What a response may keep for the shapes that come next; one that needs more keeps nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

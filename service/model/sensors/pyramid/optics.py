@@ -6,6 +6,7 @@ the modulated pupil field and W the one-dimensional "roof" operator. Unit of len
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.kinds import Normalisation, SignalKind
+from service.model.local import LocalShapes, Patch, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.sensors.pyramid.working_point import Halo
@@ -67,7 +69,7 @@ class LightGradient:
     recipe: SlopeRecipe
     """What the signals are, and what normalises them."""
 
-    def to(self, shapes: Array, product: Callable[[Array, Array], Array]) -> LightGradient:
+    def to(self, shapes: Shapes, product: Callable[[Array, Shapes], Array]) -> LightGradient:
         """Return the response to combinations of points, ``shapes`` ``(n_points, n_shapes)``.
 
         What is linear in the phase may be done to a few hundred shapes as well as to thousands of
@@ -127,6 +129,7 @@ class PyramidOptics:
         valid: NDArray[np.bool_],
         shift: tuple[float, float] = (0.0, 0.0),
         *,
+        shapes: Shapes | None = None,
         nodes_y: Nodes | None = None,
         nodes_x: Nodes | None = None,
         mapper: Mapper = map,
@@ -135,26 +138,34 @@ class PyramidOptics:
 
         ``valid`` is ``(n, n)`` [y, x]; ``shift`` is (x, y) in subapertures. Replacing the nodes of
         an axis by ``Nodes.edges()`` gives the derivative with respect to the shift on that axis.
+        With ``shapes`` it is the response to them, and the gradient exists for one row of
+        subapertures at a time.
         """
         roof_y = self._roof(shift[1], nodes_y or Nodes.area(self.n_nodes))
         roof_x = self._roof(shift[0], nodes_x or Nodes.area(self.n_nodes))
         fields = self._fields(roof_y, roof_x)
+        images = self._images(fields, roof_y, roof_x)
         along_y, along_x = self._tilts()
         modulated_x = self._modulated_x(roof_x, along_x)
-        rows = np.flatnonzero(valid.any(axis=1))
-        blocks = list(
-            mapper(
-                lambda row: self._row_gradient(
-                    row, np.flatnonzero(valid[row]), fields, roof_y, along_y, modulated_x
-                ),
-                (int(row) for row in rows),
-            )
-        )
-        n_planes = self.recipe.kind.n_planes
+        finish = self._finish(shapes)
+        ends = np.cumsum(valid.sum(axis=1))
+        n_out = int(self.pupil.lit.sum()) if shapes is None else shapes.shape[1]
+        gradient = np.empty((self.recipe.kind.n_planes, int(valid.sum()), n_out), self.dtype)
+
+        def light_of(row: int) -> Array:
+            """Put the signals of a row into their place; return its light."""
+            columns = np.flatnonzero(valid[row])
+            lines = finish(*self._row_factors(row, columns, fields, roof_y, along_y, modulated_x))
+            n_signals = len(gradient) * len(columns)
+            place = slice(ends[row] - len(columns), ends[row])
+            gradient[:, place] = lines[:n_signals].reshape(len(gradient), -1, n_out)
+            return lines[n_signals:].copy()
+
+        light = list(mapper(light_of, (int(row) for row in np.flatnonzero(valid.any(axis=1)))))
         return LightGradient(
-            images=self._images(fields, roof_y, roof_x),
-            gradient=np.concatenate([b[k] for k in range(n_planes) for b in blocks]),
-            flux_gradient=self._flux_gradient([b[-1] for b in blocks], int(valid.sum())),
+            images=images,
+            gradient=gradient.reshape(-1, n_out),
+            flux_gradient=self._flux_gradient(light, int(valid.sum())),
             recipe=self.recipe,
         )
 
@@ -245,7 +256,7 @@ class PyramidOptics:
         product = weighted[None, :, :, None] * along_x[:, None, None, :, None]
         return np.asarray(product.reshape(*product.shape[:3], -1, product.shape[-1]))
 
-    def _row_gradient(
+    def _row_factors(
         self,
         row: int,
         columns: Array,
@@ -253,55 +264,95 @@ class PyramidOptics:
         roof_y: _Roof,
         along_y: Array,
         modulated_x: Array,
-    ) -> tuple[Array, ...]:
-        """Return gradients of the signals of one row, x and y or the four images, and of its flux.
+    ) -> tuple[Array, Array]:
+        """Return factors ``(n_terms, N)`` along y, ``(n_terms, n_lines, N)`` along x of one row.
 
-        With local normalisation the flux is that of every subaperture; else one line, their sum.
+        The sum of their products over the terms, times the amplitude, is the gradient of each line:
+        the signals plane by plane, then the flux of every subaperture with local normalisation,
+        else their sum. Modulation, nodes and images along y are terms; only the imaginary part is
+        needed: Re | Im of one factor stand against Im | Re of the other.
         """
-        factor_y = (
-            along_y[:, None, None]
-            * roof_y.kernel[:, row]
-            * roof_y.weights[:, None].astype(self.dtype)
+        weights = roof_y.weights[:, None].astype(self.dtype)
+        factor_y = (along_y[:, None, None] * roof_y.kernel[:, row] * weights).reshape(
+            -1, along_y.shape[-1]
         )
-        signed_y = factor_y * _SIGNS[:, None, None].astype(self.dtype)
         # (M/2, image side y, node y, pair, image side x, column, node x)
         conjugate = fields[:, :, row][:, :, :, :, :, columns].conj()
         left = conjugate.transpose(0, 4, 5, 1, 2, 3, 6).reshape(
-            len(along_y), 2, len(columns), 2 * len(roof_y.weights), -1
+            len(along_y), 2, len(columns), 2 * len(weights), -1
         )
         by_image_x = np.matmul(left, modulated_x[:, :, columns])
-        local = self.recipe.normalisation is Normalisation.LOCAL
-        if self.recipe.kind is SignalKind.INTENSITY:
-            n = len(roof_y.weights)
-            images = [
-                self._fold(
-                    factor_y[:, [side]], by_image_x[:, along_x, :, side * n : (side + 1) * n]
-                )
-                for side in (0, 1)
-                for along_x in (0, 1)
-            ]
-            light = np.sum(images, axis=0)
-            return (*images, light if local else light.sum(axis=0, keepdims=True))
-        total = by_image_x[:, 0] + by_image_x[:, 1]
-        difference = by_image_x[:, 0] - by_image_x[:, 1]
-        light = total if local else total.sum(axis=1, keepdims=True)
+        # (image side x, M/2, image side y, node y, column, N)
+        seen = by_image_x.reshape(len(along_y), 2, len(columns), 2, len(weights), -1).transpose(
+            1, 0, 3, 4, 2, 5
+        )
+        factor_x = np.stack([self._lines(seen.imag), self._lines(seen.real)])
         return (
-            self._fold(factor_y, difference),
-            self._fold(signed_y, total),
-            self._fold(factor_y, light),
+            np.concatenate([factor_y.real, factor_y.imag]),
+            factor_x.reshape(-1, *factor_x.shape[-2:]),
         )
 
-    def _fold(self, factor_y: Array, factor_x: Array) -> Array:
-        """Sum over modulation, nodes and images as one real product, ``(n_columns, n_points)``.
+    def _lines(self, seen: Array) -> Array:
+        """Return what images ``(2, M/2, 2, n_nodes, n_columns, N)`` add to every line of a row."""
+        n = seen.shape[-2]
+        local = self.recipe.normalisation is Normalisation.LOCAL
+        n_signals = self.recipe.kind.n_planes * n
+        out = np.zeros(
+            (*seen.shape[1:-2], n_signals + (n if local else 1), seen.shape[-1]), self.dtype
+        )
+        total = seen[0] + seen[1]
+        if self.recipe.kind is SignalKind.INTENSITY:
+            for plane, (side, along_x) in enumerate(itertools.product((0, 1), repeat=2)):
+                out[:, side, :, plane * n : (plane + 1) * n] = seen[along_x][:, side]
+        else:
+            np.subtract(seen[0], seen[1], out=out[..., :n, :])
+            np.multiply(total, _SIGNS[:, None, None, None], out=out[..., n : 2 * n, :])
+        out[..., n_signals:, :] = total if local else total.sum(axis=-2, keepdims=True)
+        return out
 
-        Only the imaginary part is needed: stack Re | Im of one factor against Im | Re.
-        """
-        n_u, lit = len(self.pupil.coordinates), self.pupil.lit
-        x = factor_x.transpose(0, 2, 1, 3).reshape(-1, factor_x.shape[1] * n_u)
-        y = factor_y.reshape(-1, n_u)
-        product = np.concatenate([y.real, y.imag]).T @ np.concatenate([x.imag, x.real])
-        scale = (-2.0 * self.pupil.amplitude[lit]).astype(self.dtype)
-        return np.asarray(product.reshape(n_u, -1, n_u).transpose(1, 0, 2)[:, lit] * scale)
+    def _finish(self, shapes: Shapes | None) -> Callable[[Array, Array], Array]:
+        """Return what makes of a row's factors its gradient, or its response to shapes."""
+        if shapes is None:
+            return self._fold
+        if isinstance(shapes, LocalShapes):
+            return self._tile_by_tile(shapes)
+        return lambda along_y, along_x: self._fold(along_y, along_x) @ shapes
+
+    @property
+    def _scale(self) -> Array:
+        """``(N, N)`` what a product of factors is multiplied by."""
+        return (-2.0 * self.pupil.amplitude).astype(self.dtype)
+
+    def _fold(self, along_y: Array, along_x: Array) -> Array:
+        """Return the gradient of every line, ``(n_lines, n_points)``."""
+        n_terms, n_lines, n_u = along_x.shape
+        lit = self.pupil.lit
+        product = along_y.T @ along_x.reshape(n_terms, -1)
+        gradient = product.reshape(n_u, n_lines, n_u).transpose(1, 0, 2)[:, lit]
+        return np.asarray(gradient * self._scale[lit])
+
+    def _tile_by_tile(self, shapes: LocalShapes) -> Callable[[Array, Array], Array]:
+        """Return what makes of a row's factors the response to local shapes."""
+        strips: dict[int, list[tuple[Patch, Array]]] = {}
+        for patch in shapes.patches:
+            tile = patch.tile
+            scale = self._scale[tile.rows, tile.columns].reshape(-1, 1)
+            heights = np.ascontiguousarray((patch.weights * scale).T)
+            strips.setdefault(tile.rows.start, []).append((patch, heights))
+
+        def respond(along_y: Array, along_x: Array) -> Array:
+            n_terms, n_lines, n_u = along_x.shape
+            flat_x = along_x.reshape(n_terms, -1)
+            by_function = np.zeros((len(shapes.combination), n_lines), self.dtype)
+            for strip in strips.values():
+                product = along_y[:, strip[0][0].tile.rows].T @ flat_x
+                by_line = product.reshape(-1, n_lines, n_u).swapaxes(0, 1)
+                for patch, heights in strip:
+                    seen = by_line[..., patch.tile.columns].reshape(n_lines, -1)
+                    by_function[patch.functions] += heights @ seen.T
+            return np.asarray(by_function.T @ shapes.combination)
+
+        return respond
 
 
 def enough_modulation_points(wfs: Pyramid) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.kinds import Normalisation, SignalKind
+from service.model.local import Shapes
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.pyramid.description import pyramid_in
@@ -21,7 +23,7 @@ from service.model.sensors.pyramid.optics import (
     enough_modulation_points,
 )
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import Fineness, Mapper, Work, by_rows
+from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Work, by_rows
 from service.model.slopes import PLAIN, SlopeRecipe
 
 Array = NDArray[Any]
@@ -53,7 +55,10 @@ def pyramid_sensor(
         recipe=instrument.slopes,
     )
     return PyramidSensor(
-        optics=optics, valid=valid_subapertures(instrument), mapper=fineness.mapper
+        optics=optics,
+        valid=valid_subapertures(instrument),
+        mapper=fineness.mapper,
+        kept_bytes=fineness.kept_bytes,
     )
 
 
@@ -64,30 +69,46 @@ class PyramidSensor:
     optics: PyramidOptics
     valid: NDArray[np.bool_]
     mapper: Mapper = map
+    kept_bytes: float = KEPT_BYTES
+    """Size of a gradient at every point that a response keeps for the shapes that come next."""
 
     @property
     def n_signals(self) -> int:
         """Two slopes or four pixels for each valid subaperture."""
         return self.optics.recipe.kind.n_planes * int(self.valid.sum())
 
+    @property
+    def keeps_gradient(self) -> bool:
+        """Whether the gradient at every point is small enough to be kept."""
+        optics = self.optics
+        n_points = int(optics.pupil.lit.sum())
+        return bool(np.dtype(optics.dtype).itemsize * self.n_signals * n_points <= self.kept_bytes)
+
     def at(self, shift: tuple[float, float]) -> PyramidResponse:
         """Return the response with the four images moved by ``shift``, (x, y) in subapertures."""
-        gradient = self.optics.response(self.valid, shift, mapper=self.mapper)
-        return PyramidResponse(sensor=self, shift=shift, at_rest=gradient)
+        return PyramidResponse(sensor=self, shift=shift)
 
     def work(self, n_shapes: int) -> Work:
-        """Return what K and its product with so many shapes take; K is held whole, twice."""
+        """Return what a response and its product with an array of so many shapes take.
+
+        A gradient at every point is held whole where it is kept, else for one row at a time.
+        """
         optics, rows, n_valid = self.optics, self.n_signals, int(self.valid.sum())
-        n_points, side = int(optics.pupil.lit.sum()), len(optics.pupil.coordinates)
+        n, side = optics.wfs.n_subapertures, len(optics.pupil.coordinates)
+        n_points = int(optics.pupil.lit.sum())
         local = optics.recipe.normalisation is Normalisation.LOCAL
+        n_terms = 4 * optics.n_pairs * optics.n_nodes
+        in_a_row = optics.recipe.kind.n_planes * n + (n if local else 1)
         gradients = rows + (n_valid if local else int(self.valid.any(axis=1).sum()))
-        n_lines = 2 * optics.wfs.n_subapertures * optics.n_nodes
+        n_lines = 2 * n * optics.n_nodes
         fields = 4.0 * optics.n_pairs * n_lines * (n_lines + side)
-        of_source = 8.0 * optics.n_pairs * optics.n_nodes * side
-        folded = of_source * (side * gradients + 8.0 * optics.n_nodes * n_valid)
+        factors = 2.0 * n_terms * side * (n + in_a_row)
+        folds = in_a_row * (n_terms * side + side**2 + 2.0 * n_points)
+        kept = gradients * n_points if self.keeps_gradient else 0
         itemsize = np.dtype(optics.dtype).itemsize
+        folded = 2.0 * n_terms * side * (side * gradients + 8.0 * optics.n_nodes * n_valid)
         return Work(
-            memory_bytes=itemsize * (fields + 2.0 * gradients * n_points),
+            memory_bytes=itemsize * (fields + kept + max(factors, folds)),
             flop=folded + 2.0 * gradients * n_points * n_shapes,
         )
 
@@ -98,12 +119,15 @@ class PyramidResponse:
 
     sensor: PyramidSensor
     shift: tuple[float, float]
-    at_rest: LightGradient
+    other_light: NDArray[np.float64] | None = None
+    """``(2, n, 2, n)`` light at rest; None: that of a flat wavefront."""
 
-    @property
+    @cached_property
     def light(self) -> NDArray[np.float64]:
         """``(2, n, 2, n)`` the four images: side along y, row, side along x, column."""
-        return self.at_rest.images
+        if self.other_light is not None:
+            return self.other_light
+        return self.sensor.optics.images(self.shift)
 
     def lit(self, light: NDArray[np.float64]) -> PyramidResponse:
         """Return the response where the images have other light at rest.
@@ -111,43 +135,53 @@ class PyramidResponse:
         What the phase changes in the light that is missing, some 1e-4 of the flux's gradient, is
         left in.
         """
-        return replace(self, at_rest=replace(self.at_rest, images=light))
+        return replace(self, other_light=light)
 
     def jacobian(self) -> Array:
         """Return K whole, ``(n_signals, n_points)`` per metre."""
-        return self._per_metre(normalised_jacobian(self.at_rest, self.sensor.valid))
+        return self._per_metre(normalised_jacobian(self._gradient, self.sensor.valid))
 
-    def apply(self, shapes: Array) -> Array:
+    def apply(self, shapes: Shapes) -> Array:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
-        light = self.at_rest.to(shapes, self._product)
-        return self._per_metre(normalised_jacobian(light, self.sensor.valid))
+        return self._per_metre(normalised_jacobian(self._to(shapes), self.sensor.valid))
 
-    def shift_rates(self, shapes: Array) -> tuple[Array, Array]:
+    def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
         """Return how they change when the images move along x, and along y, per subaperture."""
-        at_rest = self.at_rest.to(shapes, self._product)
-        optics, valid = self.sensor.optics, self.sensor.valid
+        at_rest, valid = self._to(shapes), self.sensor.valid
         along_x, along_y = (
-            self._per_metre(
-                normalised_derivative(
-                    at_rest,
-                    optics.response(valid, self.shift, mapper=self.sensor.mapper, **edges).to(
-                        shapes, self._product
-                    ),
-                    valid,
-                )
-            )
+            self._per_metre(normalised_derivative(at_rest, self._to(shapes, **edges), valid))
             for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()})
         )
         return along_x, along_y
+
+    @cached_property
+    def _gradient(self) -> LightGradient:
+        """The gradient at every point."""
+        sensor = self.sensor
+        found = sensor.optics.response(sensor.valid, self.shift, mapper=sensor.mapper)
+        return self._as_lit(found)
+
+    def _to(self, shapes: Shapes, **edges: Nodes) -> LightGradient:
+        """Return the response to shapes; with edges its rate when the images move, never kept."""
+        sensor = self.sensor
+        if sensor.keeps_gradient and not edges:
+            return self._gradient.to(shapes, self._product)
+        found = sensor.optics.response(
+            sensor.valid, self.shift, shapes=shapes, mapper=sensor.mapper, **edges
+        )
+        return found if edges else self._as_lit(found)
+
+    def _as_lit(self, found: LightGradient) -> LightGradient:
+        return found if self.other_light is None else replace(found, images=self.other_light)
 
     def _per_metre(self, jacobian: Array) -> Array:
         wavelength_m = self.sensor.optics.wfs.wavelength_m
         jacobian *= np.asarray(2 * np.pi / wavelength_m, dtype=jacobian.dtype)
         return jacobian
 
-    def _product(self, gradient: Array, shapes: Array) -> Array:
+    def _product(self, gradient: Array, shapes: Shapes) -> Array:
         if gradient.ndim == 1:
-            return np.asarray(gradient @ shapes)
+            return np.asarray((gradient[None] @ shapes)[0])
         return by_rows(self.sensor.mapper, lambda rows: rows @ shapes, gradient)
 
 

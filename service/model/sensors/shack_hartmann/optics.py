@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from service.model.instrument import Instrument
+from service.model.local import Shapes
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.sensor import Work
 from service.model.sensors.shack_hartmann.description import shack_hartmann_in
@@ -176,11 +177,11 @@ class ShackHartmannResponse:
         """Return the same: a centroid does not depend on how much light tells it."""
         return self
 
-    def apply(self, shapes: Array) -> Array:
+    def apply(self, shapes: Shapes) -> Array:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
         return np.asarray(self._matrix @ shapes)
 
-    def shift_rates(self, shapes: Array) -> tuple[Array, Array]:
+    def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
         """Return how they change when the image moves along x, and along y, per subaperture."""
         along_x, along_y = self._rates
         return np.asarray(along_x @ shapes), np.asarray(along_y @ shapes)

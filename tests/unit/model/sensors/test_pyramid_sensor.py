@@ -25,11 +25,10 @@ RECIPES = [
 ]
 
 
-def sensor_of(instrument, sampling=2, dtype=np.float64):
+def sensor_of(instrument, sampling=2, dtype=np.float64, kept_bytes=1e9):
     pupil = instrument_pupil(instrument, sampling)
-    return kind_of(instrument).sensor(
-        instrument, pupil, Fineness(n_nodes=sampling, dtype=dtype)
-    ), pupil
+    fineness = Fineness(n_nodes=sampling, dtype=dtype, kept_bytes=kept_bytes)
+    return kind_of(instrument).sensor(instrument, pupil, fineness), pupil
 
 
 def instrument_with(order, normalisation):
@@ -37,9 +36,10 @@ def instrument_with(order, normalisation):
     return replace(plain, slopes=replace(plain.slopes, order=order, normalisation=normalisation))
 
 
+@pytest.mark.parametrize("kept_bytes", [1e9, 0.0])
 @pytest.mark.parametrize(("order", "normalisation"), RECIPES)
-def test_what_is_applied_to_shapes_is_the_jacobian(order, normalisation):
-    sensor, pupil = sensor_of(instrument_with(order, normalisation))
+def test_what_is_applied_to_shapes_is_the_jacobian(order, normalisation, kept_bytes):
+    sensor, pupil = sensor_of(instrument_with(order, normalisation), kept_bytes=kept_bytes)
     response, shapes = sensor.at(SHIFT), small_basis().render(pupil.points)[:, :5]
     applied = response.apply(shapes)
     assert len(applied) == sensor.n_signals
@@ -82,19 +82,20 @@ def test_pixels_of_a_subaperture_are_its_four_places_in_the_light():
     np.testing.assert_array_equal(light.reshape(-1)[pixel_places(valid)][:, 0], expected)
 
 
+@pytest.mark.parametrize("keeps", [True, False])
 @pytest.mark.parametrize("normalisation", Normalisation)
-def test_the_memory_of_a_response_is_known_beforehand(normalisation):
-    """20 subapertures across; what one row of K needs beside fields and K is left out."""
+def test_the_memory_of_a_response_is_known_beforehand(normalisation, keeps):
+    """20 subapertures across."""
     plain = instrument_with(SlopeOrder.XY, normalisation)
     wide = replace(plain, wfs=replace(plain.wfs, n_subapertures=20, pupil_separation_subap=25.0))
-    sensor, _ = sensor_of(wide, 3, np.float32)
+    sensor, pupil = sensor_of(wide, 3, np.float32, kept_bytes=1e9 if keeps else 0.0)
+    assert sensor.keeps_gradient is keeps
     tracemalloc.start()
     try:
-        kept = sensor.at((0.0, 0.0))
+        sensor.at((0.0, 0.0)).apply(np.ones((len(pupil.points), 1), np.float32))
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert kept is not None
     assert sensor.work(0).memory_bytes == pytest.approx(peak, rel=0.2)
 
 

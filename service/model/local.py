@@ -1,0 +1,145 @@
+"""Shapes of functions that end near their actuators, tile by tile of the pupil.
+
+Where every function covers a few subapertures only, a tile of the pupil knows a hundred of them and
+not thousands: what a sensor makes of the tile is multiplied by those, and the modes come last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.model.pupil import PupilGrid
+
+Array = NDArray[Any]
+Indices = NDArray[np.intp]
+
+TILE_SUBAP = 4
+"""Side of a tile: in smaller ones products are too small, larger ones know too many functions."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tile:
+    """A square of the pupil's grid."""
+
+    rows: slice
+    columns: slice
+    points: NDArray[np.float64]
+    """``(n_points, 2)`` x and y of all its points, row-major; some may be dark."""
+
+    lit: Indices
+    """``(n_lit,)`` which of them see light."""
+
+    places: Indices
+    """``(n_lit,)`` where those stand among the lit points of the pupil."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Patch:
+    """The functions that reach into a tile."""
+
+    tile: Tile
+    functions: Indices
+    """``(n_near,)`` which they are."""
+
+    weights: Array
+    """``(n_points, n_near)`` their heights, or rates, at all points of the tile."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocalShapes:
+    """Combinations of local functions: ``rows @ shapes`` is a product as with an array of shapes.
+
+    ``rows`` is ``(n_rows, n_points)`` over the lit points of the pupil, an array or sparse.
+    """
+
+    patches: Sequence[Patch]
+    combination: Array
+    """``(n_functions, n_shapes)`` the weights of the functions in every shape."""
+
+    n_points: int
+    """Lit points of the pupil."""
+
+    __array_ufunc__: ClassVar[None] = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(n_points, n_shapes)``, as that of an array."""
+        return self.n_points, int(self.combination.shape[1])
+
+    @property
+    def n_near(self) -> float:
+        """Functions that reach a point, as its tile knows them, in the mean."""
+        known = sum(len(patch.tile.lit) * len(patch.functions) for patch in self.patches)
+        return known / self.n_points
+
+    @property
+    def is_cheaper(self) -> bool:
+        """Whether products of it take fewer operations than with an array of the shapes."""
+        by_tiles = self.n_points * self.n_near + self.combination.size
+        return by_tiles < self.n_points * self.shape[1]
+
+    def array(self) -> Array:
+        """Return the shapes ``(n_points, n_shapes)``."""
+        out = np.zeros(self.shape, self.combination.dtype)
+        for patch in self.patches:
+            known = self.combination[patch.functions]
+            out[patch.tile.places] = patch.weights[patch.tile.lit] @ known
+        return out
+
+    def sparse(self) -> Any:  # noqa: ANN401 - scipy has no types
+        """Return the functions ``(n_points, n_functions)``, sparse."""
+        parts = [
+            (
+                patch.weights[patch.tile.lit].ravel(),
+                np.repeat(patch.tile.places, len(patch.functions)),
+                np.tile(patch.functions, len(patch.tile.lit)),
+            )
+            for patch in self.patches
+        ]
+        values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
+        shape = (self.n_points, len(self.combination))
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=shape)
+
+    def __rmatmul__(self, rows: Any) -> Array:  # noqa: ANN401 - scipy has no types
+        """Return ``rows`` times the shapes, ``(n_rows, n_shapes)``."""
+        if scipy.sparse.issparse(rows):
+            return np.asarray(rows @ self.sparse() @ self.combination)
+        by_function = np.zeros((len(self.combination), len(rows)), self.combination.dtype)
+        for patch in self.patches:
+            heights = patch.weights[patch.tile.lit]
+            by_function[patch.functions] += heights.T @ rows[:, patch.tile.places].T
+        return np.asarray(by_function.T @ self.combination)
+
+
+Shapes = Array | LocalShapes
+"""Wavefronts at the lit points of a pupil: ``(n_points, n_shapes)``, or what makes them."""
+
+
+def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:
+    """Return the tiles of a pupil that see any light, row after row."""
+    lit, side = pupil.lit, TILE_SUBAP * pupil.sampling
+    place = np.cumsum(lit).reshape(lit.shape) - 1
+    found = []
+    for row in range(0, len(lit), side):
+        for column in range(0, len(lit), side):
+            part = (slice(row, row + side), slice(column, column + side))
+            inside = np.flatnonzero(lit[part])
+            if len(inside) == 0:
+                continue
+            y, x = np.meshgrid(*(pupil.coordinates[one] for one in part), indexing="ij")
+            found.append(
+                Tile(
+                    rows=part[0],
+                    columns=part[1],
+                    points=np.column_stack([x.ravel(), y.ravel()]),
+                    lit=inside,
+                    places=place[part].ravel()[inside],
+                )
+            )
+    return tuple(found)

@@ -111,8 +111,8 @@ class Search:
         if self.best.correlation < MIN_CORRELATION:
             return (
                 f"no orientation of the slopes explains the lowest orders (correlation "
-                f"{self.best.correlation:.2f}): the modes are another basis, or the matrix "
-                "another instrument's"
+                f"{self.best.correlation:.2f}): the modes are another basis or "
+                "in another order, or the matrix another instrument's"
             )
         if self.ties:
             named = "; ".join(pose.reported() for pose in (self.best, *self.ties))

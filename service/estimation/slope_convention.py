@@ -167,8 +167,8 @@ def _judged(poses: list[Pose], instrument: Instrument, start_rad: float) -> Slop
     if best.correlation < MIN_CORRELATION:
         text = (
             'slopes.orientation is "auto", and no orientation explains the RTC\'s own matrix '
-            f"(correlation {best.correlation:.2f}): its modes are another basis; write "
-            "[slopes] orientation"
+            f"(correlation {best.correlation:.2f}): its modes are another basis, or "
+            "listed in another order: compare them with the file, or write [slopes] orientation"
         )
         return SlopeConvention(wrong="" if stated else text)
     alike = [pose for pose in poses if pose.correlation > best.correlation - MIN_LEAD]

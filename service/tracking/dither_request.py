@@ -217,18 +217,20 @@ def expected_dither(
 def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[float, ...]:
     """Return lines in the band that wind leaves alone, as clear of vibrations as these allow.
 
-    Those of the last dither stay while none of them is on a vibration.
+    Those of the last dither stay while none of them is on a vibration, or beyond what the frame
+    rate of now can tell.
     """
     last = choice.last_hz
-    near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
-    if len(last) == n_lines and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
-        return last
     rate, step = rtc.frame_rate_hz, step_of(rtc, choice.window_s)
+    edge = float(SIDE_OFFSETS_HZ.max()) + step
+    near = [abs(line - vibration) for line in last for vibration in choice.avoid_hz]
+    told = all(edge <= line <= rate / 2 - edge for line in last)
+    if len(last) == n_lines and told and min(near, default=np.inf) >= CLEARANCES_HZ[-1]:
+        return last
     fractions = LINE_FRACTIONS[:n_lines]
     if n_lines > N_LINES:
         fractions = tuple(np.linspace(*LINE_RANGE, n_lines).tolist())
     wanted = tuple(fraction * rate for fraction in fractions)
-    edge = float(SIDE_OFFSETS_HZ.max()) + step
     band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
     for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
         found = clear_of(

@@ -13,7 +13,7 @@ from service.tracking.dither_modes import (
     controlled,
     expected_amplification,
 )
-from service.tracking.dither_request import total_m
+from service.tracking.dither_request import DitherParameters, clear_lines, total_m
 from service.wire import DitherRequest, DitherStop
 from tests.unit.tracking.dithered import DitheredNight
 from tests.unit.tracking.situations import N_MODES, POLICY, of_kind, rtc
@@ -137,3 +137,12 @@ def test_the_dither_stays_where_it_is_when_its_modes_come_into_the_loop():
     assert len({request.modes for request in night.requests}) == 1
     assert on_the_mirror_m(night.requests[-1], night.view) <= BUDGET_M * (1.0 + 1e-9)
     assert not night.alarms
+
+
+def test_the_lines_of_a_faster_loop_are_left_where_a_slower_one_cannot_tell_them():
+    """The RTC may come back at another frame rate: binned, for a faint star."""
+    last = (169.0, 207.0, 233.0, 265.0)
+    asked = DitherParameters(total_m=1e-9, window_s=1.0, n_windows=1, last_hz=last)
+    assert clear_lines(rtc(frame_rate_hz=800.0), 4, asked) == last
+    slower = clear_lines(rtc(frame_rate_hz=500.0), 4, asked)
+    assert 0.2 * 500.0 <= min(slower) < max(slower) <= 0.35 * 500.0

@@ -70,24 +70,25 @@ class PupilNumber:
 
 def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
     size, hole = about.wfs.pupil_diameter, about.obscuration_ratio
-    return (
-        PupilNumber(
-            key="obscuration_ratio",
-            reported=hole,
-            power=2,
-            step=0.01,
-            range=(0.0, max(0.6, hole)),
-            notable=0.03,
-        ),
-        PupilNumber(
-            key="pupil_diameter_subap",
-            reported=size,
-            power=1,
-            step=0.01 * size,
-            range=(0.94 * size, 1.06 * size),
-            notable=0.01 * size,
-        ),
+    width = PupilNumber(
+        key="pupil_diameter_subap",
+        reported=size,
+        power=1,
+        step=0.01 * size,
+        range=(0.94 * size, 1.06 * size),
+        notable=0.01 * size,
     )
+    if about.pupil is not None:
+        return (width,)  # its map has the obscuration
+    inner = PupilNumber(
+        key="obscuration_ratio",
+        reported=hole,
+        power=2,
+        step=0.01,
+        range=(0.0, max(0.6, hole)),
+        notable=0.03,
+    )
+    return inner, width
 
 
 class Few:

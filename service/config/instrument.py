@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from service.config import instrument_schema as schema
 from service.config import packaged_file
 from service.config.mirrors import Pupil, own_modes, read_mirror
+from service.config.pupils import read_pupil
 from service.config.sources import read_dataset, refuse
 from service.errors import ConfigurationError
 from service.model.instrument import (
@@ -43,6 +44,8 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     section, kind = said.section, said.kind
     about, wfs = section(schema.AboutTable).said, section(kind.table)
     pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
+    told = asdict(about)
+    del told["pupil"], told["pupil_pitch_m"]
     sensor = _sensor(wfs, kind)
     with schema.refused_at(wfs.path, wfs.name):
         kind.check(sensor, pupil.subaperture_m)
@@ -51,7 +54,8 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     with schema.refused_at(wfs.path, wfs.name):
         frames = kind.frames(wfs.said, wfs.given)
     instrument = Instrument(
-        **asdict(about),
+        **told,
+        pupil=read_pupil(section(schema.AboutTable), pupil.subaperture_m),
         wfs=sensor,
         mirror=mirror,
         modes=modes,

@@ -46,6 +46,13 @@ class AboutTable(kinds.Telescope):
     config_id: Id | None = None
     """Pins the RTC's sensor configuration; None: the first seen is adopted."""
 
+    pupil: str | None = None
+    """Map of the pupil, ``path:/dataset``, ``path.fits`` or ``path.npy`` of ``(ny, nx)``: the share
+    of each point that is lit, [y, x] in the mirror's plane, centred; None: a ring."""
+
+    pupil_pitch_m: kinds.Positive | None = None
+    """Step of that map; None: ``diameter_m`` over its points."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MirrorTable(kinds.InfluenceShape):

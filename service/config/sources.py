@@ -28,6 +28,7 @@ _EXPECTED = "Input should be "
 
 _HDF5 = re.compile(r"(?P<path>.+):/(?P<name>.+)")
 _FITS = re.compile(r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::/?(?P<name>.+))?", re.IGNORECASE)
+_NUMPY = re.compile(r"(?P<path>.+\.npy)(?P<name>)", re.IGNORECASE)
 
 
 class Table(BaseModel):
@@ -117,7 +118,7 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
     Parameters
     ----------
     reference
-        ``path:/dataset``, ``path.fits:EXTNAME``; a relative path starts at ``folder``.
+        ``path:/dataset``, ``path.fits:EXTNAME``, ``path.npy``; relative paths start at ``folder``.
     folder
         Where the instrument file lies.
     where
@@ -131,9 +132,11 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
     """
     from service.files.container import opened
 
-    parts = _FITS.fullmatch(reference) or _HDF5.fullmatch(reference)
+    forms = (_NUMPY, _FITS, _HDF5)
+    parts = next((found for form in forms if (found := form.fullmatch(reference))), None)
     if parts is None:
-        refuse(where, repr(reference), "path:/dataset of an HDF5 file, or path.fits:EXTNAME")
+        expected = "path:/dataset of an HDF5 file, path.fits:EXTNAME, or path.npy"
+        refuse(where, repr(reference), expected)
     try:
         with opened(folder / parts["path"]) as container:
             stored = _named(container, parts["name"], where)

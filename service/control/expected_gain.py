@@ -232,7 +232,7 @@ def noise_of_star(
     instrument: Instrument, *, magnitude: float, frame_rate_hz: float, n_valid: int
 ) -> float:
     """Return 1 σ of a slope of a star whose light falls evenly on the valid subapertures."""
-    area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
+    area_m2 = instrument.collecting_area_m2
     flux = ZERO_POINT_PHOTONS * 10 ** (-0.4 * magnitude) * area_m2
     own = flux * THROUGHPUT / frame_rate_hz / n_valid
     return kind_of(instrument).slope_noise(own, READ_NOISE_ELECTRONS)

@@ -114,6 +114,17 @@ class TabulatedModes(Mount):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PupilMap:
+    """A pupil that no circle describes, centred on the middle of its array."""
+
+    lit: NDArray[np.float64]
+    """``(ny, nx)`` [y, x]: share of each point's area that is lit, 0 to 1."""
+
+    pitch_m: float
+    """Step of the grid along both axes, metres in the pupil plane."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SensorMode:
     """One way in which the RTC reads its sensor: mirror, modes and order of slopes are the same."""
 
@@ -161,9 +172,21 @@ class Instrument(Telescope):
     config_id: str | None = None
     """Pins the RTC's sensor configuration; None: the first seen is adopted."""
 
+    pupil: PupilMap | None = None
+    """Outline and obscurations as they are; None: a ring, with the spider's arms."""
+
     sensor_modes: tuple[SensorMode, ...] = ()
     """Modes that the RTC may change to; ``config_id`` says which one ``wfs`` is of. Empty: it has
     one alone."""
+
+    @property
+    def collecting_area_m2(self) -> float:
+        """Area of the pupil that light comes through."""
+        if self.pupil is not None:
+            return float(self.pupil.lit.sum()) * self.pupil.pitch_m**2
+        arm_m = self.diameter_m / 2 * (1 - self.obscuration_ratio)
+        arms_m2 = len(self.spiders_deg) * (self.spiders_m or 0.0) * arm_m
+        return np.pi / 4 * self.diameter_m**2 * (1 - self.obscuration_ratio**2) - arms_m2
 
     @property
     def binning(self) -> int:
@@ -219,6 +242,10 @@ class Instrument(Telescope):
         return self.mirror
 
 
+_LATER = frozenset({"unknown", "sensor_modes", "pupil", "spiders_m", "spiders_deg"})
+"""Fields without which an instrument has the digest that it has always had."""
+
+
 def instrument_sha256(instrument: Instrument) -> str:
     """Return the SHA-256 of every field of an instrument, arrays included, as hex.
 
@@ -250,11 +277,11 @@ def _add(digest: hashlib._Hash, value: object) -> None:
 def _parts(record: DataclassInstance) -> Iterator[tuple[str, object]]:
     """Yield fields by name, of an influence function its own: so fits of before know it.
 
-    What is unknown, and what modes there are, is told where anything is.
+    What came later is told where anything is.
     """
     for one in fields(record):
         value = getattr(record, one.name)
-        if one.name in {"unknown", "sensor_modes"} and not value:
+        if one.name in _LATER and not value:
             continue
         if isinstance(value, InfluenceShape):
             yield from _parts(value)

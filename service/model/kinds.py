@@ -159,6 +159,12 @@ class Telescope(Read):
     double_pass: bool = False
     """A measured matrix sees the mirror twice."""
 
+    spiders_m: Positive | None = None
+    """Width of the shadows that the secondary's arms cast on the pupil, metres; None: none."""
+
+    spiders_deg: tuple[float, ...] = ()
+    """Where each arm goes from the centre outwards, degrees from +x towards +y."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InfluenceShape(Read):

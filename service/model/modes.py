@@ -317,9 +317,9 @@ def _given_basis(instrument: Instrument, mirror: Mirror, strokes: Array) -> Moda
 def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     """Return the first ``n_modes`` KL modes of the instrument's mirror, piston-free, unit RMS.
 
-    Mode 0 is the tilt along +x, mode 1 the tilt along +y. Where the mirror is symmetric about the
-    x axis the even and odd modes are found apart, so that pairs of equal variance have one
-    well-defined orientation and every machine finds the same basis.
+    Mode 0 is the tilt along +x, mode 1 the tilt along +y. Where mirror and pupil are symmetric
+    about the x axis the even and odd modes are found apart, so that pairs of equal variance have
+    one well-defined orientation and every machine finds the same basis.
 
     Raises
     ------
@@ -339,10 +339,12 @@ def karhunen_loeve_basis(instrument: Instrument) -> ModalBasis:
     gram, covariance = pupil_statistics(
         instrument, lambda points: surface.basis(points) @ influence
     )
-    strokes, variance = _diagonalise(
-        gram, covariance, _parity_sectors(mirror.positions_m), turbulence.n_modes
-    )
-    strokes = _unit_rms(strokes, surface, influence, instrument_pupil(instrument, 4))
+    pupil = instrument_pupil(instrument, 4)
+    sectors = [np.eye(n_actuators)]
+    if np.allclose(pupil.amplitude, pupil.amplitude[::-1], rtol=0.0, atol=1e-9):
+        sectors = _parity_sectors(mirror.positions_m)
+    strokes, variance = _diagonalise(gram, covariance, sectors, turbulence.n_modes)
+    strokes = _unit_rms(strokes, surface, influence, pupil)
     strokes = _tilts_along_axes(strokes, mirror.positions_m)
     strokes = _fix_signs(strokes, mirror.positions_m)
     return ModalBasis(

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, PupilMap
 from service.model.slopes import rtc_mask, turned_mask
 
 _EDGE_NODES = 32
 """Gauss-Legendre nodes across a cell: area fractions good to about 1e-4."""
+
+_PARTS = 8
+"""Parts of a cell along either axis that an arm's shadow is looked at in."""
 
 _FULL = 0.999
 """Light of a full subaperture, to what those are good for."""
@@ -124,12 +128,87 @@ def annular_pupil(
 
 def instrument_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
     """Return the instrument's evenly lit pupil, ``sampling`` points per subaperture."""
-    return annular_pupil(
+    return _drawn(_outline(instrument), sampling)
+
+
+class _Outline(NamedTuple):
+    """All that a pupil is drawn of; lengths in subapertures."""
+
+    n_subapertures: int
+    diameter: float
+    obscuration_ratio: float
+    spiders: float
+    spiders_deg: tuple[float, ...]
+    own: PupilMap | None
+    subaperture_m: float
+
+
+def _outline(instrument: Instrument) -> _Outline:
+    return _Outline(
         n_subapertures=instrument.wfs.n_subapertures,
-        diameter_subap=instrument.wfs.pupil_diameter,
+        diameter=instrument.wfs.pupil_diameter,
         obscuration_ratio=instrument.obscuration_ratio,
+        spiders=(instrument.spiders_m or 0.0) / instrument.subaperture_m,
+        spiders_deg=instrument.spiders_deg,
+        own=instrument.pupil,
+        subaperture_m=instrument.subaperture_m,
+    )
+
+
+def _drawn(outline: _Outline, sampling: int) -> PupilGrid:
+    if outline.own is not None:
+        return _mapped(outline, outline.own, sampling)
+    ring = annular_pupil(
+        n_subapertures=outline.n_subapertures,
+        diameter_subap=outline.diameter,
+        obscuration_ratio=outline.obscuration_ratio,
         sampling=sampling,
     )
+    if not outline.spiders_deg:
+        return ring
+    return replace(ring, amplitude=ring.amplitude * (1.0 - _shadows(ring, outline)))
+
+
+def _mapped(outline: _Outline, own: PupilMap, sampling: int) -> PupilGrid:
+    """Return a pupil from its map: of every cell the share of its area that is lit."""
+    step = own.pitch_m / outline.subaperture_m
+    width = max(outline.n_subapertures, outline.diameter, max(own.lit.shape) * step)
+    n = sampling * int(np.ceil(width - 1e-6))
+    coordinates = (np.arange(n) - (n - 1) / 2) / sampling
+    along_y, along_x = (_shares(coordinates, sampling, m, step) for m in own.lit.shape)
+    amplitude = np.clip(along_y @ own.lit @ along_x.T, 0.0, 1.0)
+    return PupilGrid(sampling=sampling, coordinates=coordinates, amplitude=amplitude)
+
+
+def _shares(
+    coordinates: NDArray[np.float64], sampling: int, m: int, step: float
+) -> NDArray[np.float64]:
+    """Return which share of each cell ``(n, m)`` each of ``m`` points of a map covers, one axis."""
+    points = (np.arange(m) - (m - 1) / 2) * step
+    half, wide = 0.5 / sampling, step / 2
+    high = np.minimum(coordinates[:, None] + half, points + wide)
+    low = np.maximum(coordinates[:, None] - half, points - wide)
+    return np.asarray(np.maximum(high - low, 0.0) * sampling)
+
+
+def _shadows(pupil: PupilGrid, outline: _Outline) -> NDArray[np.float64]:
+    """Return the share of every cell ``(n, n)`` that an arm of the spider hides.
+
+    Cells are divided; of each part the share is that of an edge across it.
+    """
+    inside = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) / pupil.sampling
+    fine = (pupil.coordinates[:, None] + inside).reshape(-1)
+    part, hidden = 1.0 / (_PARTS * pupil.sampling), np.zeros((len(fine), len(fine)))
+    for degrees in outline.spiders_deg:
+        cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+        along = cosine * fine + sine * fine[:, None]
+        across = np.abs(cosine * fine[:, None] - sine * fine)
+        width = part * (abs(cosine) + abs(sine))  # of a square part, seen along the edge
+        covered = np.clip((outline.spiders / 2 - across) / width + 0.5, 0.0, 1.0)
+        covered *= np.clip(along / width + 0.5, 0.0, 1.0)
+        np.maximum(hidden, covered, out=hidden)
+    n = len(pupil.coordinates)
+    return np.asarray(hidden.reshape(n, _PARTS, n, _PARTS).mean(axis=(1, 3)))
 
 
 def valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
@@ -153,29 +232,20 @@ def lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     The flux is the pupil's light on each subaperture, so that the mask depends neither on the
     sampling nor on the light diffracted out of the images.
     """
-    n = instrument.wfs.n_subapertures
-    flux = _light_per_subaperture(n, instrument.wfs.pupil_diameter, instrument.obscuration_ratio)
+    flux = _light_per_subaperture(_outline(instrument))
     return np.asarray(flux >= instrument.wfs.flux_threshold)
 
 
 def fully_lit_subapertures(instrument: Instrument) -> NDArray[np.bool_]:
     """Return which subapertures ``(n, n)`` the edge of the pupil does not cut at α = 0."""
-    n = instrument.wfs.n_subapertures
-    flux = _light_per_subaperture(n, instrument.wfs.pupil_diameter, instrument.obscuration_ratio)
+    flux = _light_per_subaperture(_outline(instrument))
     return np.asarray(flux > _FULL)
 
 
 @lru_cache(maxsize=8)
-def _light_per_subaperture(
-    n: int, diameter_subap: float, obscuration_ratio: float
-) -> NDArray[np.float64]:
+def _light_per_subaperture(outline: _Outline) -> NDArray[np.float64]:
     """Return the share of each subaperture ``(n, n)`` that the pupil lights."""
-    fine = annular_pupil(
-        n_subapertures=n,
-        diameter_subap=diameter_subap,
-        obscuration_ratio=obscuration_ratio,
-        sampling=8,
-    ).amplitude
+    n, fine = outline.n_subapertures, _drawn(outline, 8).amplitude
     margin = (len(fine) - 8 * n) // 2
     inner = fine[margin : margin + 8 * n, margin : margin + 8 * n]
     return np.asarray(inner.reshape(n, 8, n, 8).mean(axis=(1, 3)))

@@ -51,7 +51,7 @@ class Camera:
         self, instrument: Instrument, *, magnitude: float, frame_rate_hz: float
     ) -> float:
         """Return the electrons of a star on all pixels together."""
-        area_m2 = np.pi / 4 * instrument.diameter_m**2 * (1 - instrument.obscuration_ratio**2)
+        area_m2 = instrument.collecting_area_m2
         flux = self.zero_point_photons * 10 ** (-0.4 * magnitude) * area_m2
         return float(flux * self.throughput / frame_rate_hz)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, Mirror
+from service.model.instrument import Instrument, Mirror, PupilMap
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
@@ -38,6 +38,9 @@ _TENSION_PITCHES = 1.0
 _SOFTNESS = 0.002
 """Compliance of the actuators over the plate's: the shape of mode 400 departs by 2 % from that of
 the service's thin plate, its size by 3 %."""
+
+_HALF = 0.5
+"""Share of a map's point from which on it is lit."""
 
 _FEW_MODES = 32
 """Dithered modes beyond the controlled ones that are worth picking out."""
@@ -334,8 +337,24 @@ def centred_pupil(instrument: Instrument, sampling: int) -> PupilGrid:
     fine = (coordinates[:, None] + inside).reshape(-1)
     squared = fine[:, None] ** 2 + fine**2
     lit = (squared <= radius**2) & (squared >= (radius * instrument.obscuration_ratio) ** 2)
+    if instrument.pupil is not None:
+        lit = _lit_in_map(instrument.pupil, fine * instrument.subaperture_m)
+    for degrees in instrument.spiders_deg:
+        ray = np.exp(-1j * np.deg2rad(degrees)) * (fine + 1j * fine[:, None])
+        width = (instrument.spiders_m or 0.0) / instrument.subaperture_m
+        lit &= (ray.real < 0.0) | (np.abs(ray.imag) > width / 2)
     amplitude = lit.reshape(n, _EDGE_SAMPLES, n, _EDGE_SAMPLES).mean(axis=(1, 3))
     return PupilGrid(sampling=sampling, coordinates=coordinates, amplitude=amplitude)
+
+
+def _lit_in_map(own: PupilMap, fine_m: Array) -> NDArray[np.bool_]:
+    """Return where a map is lit, by its nearest point; beyond it all is dark."""
+    lit, ny, nx = np.pad(own.lit > _HALF, 1), *own.lit.shape
+    row, column = (
+        np.clip(np.rint(fine_m / own.pitch_m + (n - 1) / 2).astype(int) + 1, 0, n + 1)
+        for n in (ny, nx)
+    )
+    return np.asarray(lit[np.ix_(row, column)])
 
 
 def _half_plane(n: Array) -> Array:

@@ -10,6 +10,7 @@ it is the least-squares inverse.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -28,6 +29,12 @@ MAX_CONDITION = 100.0
 
 _WELL = 1e3
 """Condition up to which the normal equations lose nothing: its square is far from 1e16."""
+
+_MANY = 1000
+"""Modes from which on their eigenvectors are used rather than singular ones: four times as fast."""
+
+_SLOPES_AT_ONCE = 2048
+"""Columns of a reconstructor that are solved for together: thousands of modes fit in memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,17 +66,18 @@ def invert(
     Heritier et al. 2018, section 2.2.
     """
     controlled = checked_columns(interaction_matrix, n_modes)
-    power = np.linalg.eigvalsh(controlled.T @ controlled)
+    normal = controlled.T @ controlled
+    power = np.linalg.eigvalsh(normal)
     if power[0] * min(max_condition, _WELL) ** 2 > power[-1]:
         # nothing is left out: the normal equations say the same at a third of the cost
-        factor = scipy.linalg.cho_factor(controlled.T @ controlled)
+        factor = scipy.linalg.cho_factor(normal, overwrite_a=True)
         return Inversion(
-            matrix=np.ascontiguousarray(
-                scipy.linalg.cho_solve(factor, controlled.T), dtype=np.float32
-            ),
+            matrix=_by_slopes(controlled, lambda some: scipy.linalg.cho_solve(factor, some.T)),
             condition_number=float(np.sqrt(power[-1] / power[0])),
             n_truncated=0,
         )
+    if n_modes >= _MANY and max_condition <= _WELL:
+        return _of_eigenvectors(controlled, normal, max_condition)
     left, singular, right = scipy.linalg.svd(controlled, full_matrices=False)
     kept = singular > singular[0] / max_condition
     inverse = (right[kept].T / singular[kept]) @ left[:, kept].T
@@ -78,6 +86,41 @@ def invert(
         condition_number=float(singular[0] / singular[-1]),
         n_truncated=int(np.count_nonzero(~kept)),
     )
+
+
+def _of_eigenvectors(controlled: Array, normal: Array, max_condition: float) -> Inversion:
+    """Return the truncated inverse by the eigenvectors of the normal equations.
+
+    Their eigenvalues are the squares of the singular values, good to 1e-16 of the largest: a
+    condition beyond 1e8 cannot be told, and is told as that.
+    """
+    power, axes = np.linalg.eigh(normal)
+    kept = power * max_condition**2 > power[-1]
+    inverse = (axes[:, kept] / power[kept]) @ axes[:, kept].T
+    smallest = max(power[0], np.finfo(np.float64).eps * power[-1])
+    return Inversion(
+        matrix=_by_slopes(controlled, lambda some: inverse @ some.T),
+        condition_number=float(np.sqrt(power[-1] / smallest)),
+        n_truncated=int(np.count_nonzero(~kept)),
+    )
+
+
+def _by_slopes(controlled: Array, solve: Callable[[Array], Array]) -> NDArray[np.float32]:
+    """Return what ``solve`` makes of rows ``(n, n_modes)``, ``(n_modes, n)``, for all of them."""
+    matrix = np.empty(controlled.shape[::-1], np.float32)
+    for start in range(0, len(controlled), _SLOPES_AT_ONCE):
+        part = slice(start, start + _SLOPES_AT_ONCE)
+        matrix[:, part] = solve(controlled[part])
+    return matrix
+
+
+def _condition(controlled: Array) -> float:
+    """Return the largest over the smallest singular value."""
+    if controlled.shape[1] < _MANY:
+        singular = scipy.linalg.svdvals(controlled)
+        return float(singular[0] / singular[-1])
+    power = np.linalg.eigvalsh(controlled.T @ controlled)
+    return float(np.sqrt(power[-1] / max(power[0], np.finfo(np.float64).eps * power[-1])))
 
 
 def checked_columns(interaction_matrix: NDArray[Any], n_modes: int) -> NDArray[np.float64]:
@@ -159,10 +202,9 @@ def invert_with_prior(interaction_matrix: NDArray[Any], n_modes: int, prior: Pri
     estimate = scipy.linalg.cho_solve(system, white.T)[:n_modes] * amplitude[:n_modes, None]
     estimate /= prior.slope_noise
     estimate /= np.einsum("ij,ji->i", estimate, controlled)[:, None]
-    singular = scipy.linalg.svdvals(controlled)
     return Inversion(
         matrix=np.ascontiguousarray(estimate, dtype=np.float32),
-        condition_number=float(singular[0] / singular[-1]),
+        condition_number=_condition(controlled),
         n_truncated=0,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from service.control import reconstructor
 from service.control.reconstructor import MAX_CONDITION, invert
 from service.errors import ModelError
 from tests.numerics import N_MODES, small_linearisation
@@ -66,6 +67,27 @@ def test_the_limit_of_the_condition_can_be_chosen():
         1,
         2,
     ]
+
+
+def test_many_modes_are_truncated_by_their_eigenvectors_as_fewer_are(monkeypatch):
+    """1e-6 of the largest element at a condition of 5000: squares of it lose half of 16 digits."""
+    matrix = with_singular_values(list(np.geomspace(1.0, 2e-4, 12)))
+    by_svd = invert(matrix, 12)
+    monkeypatch.setattr(reconstructor, "_MANY", 1)
+    monkeypatch.setattr(reconstructor, "_SLOPES_AT_ONCE", 7)
+    found = invert(matrix, 12)
+    assert found.n_truncated == by_svd.n_truncated == 6
+    assert found.condition_number == pytest.approx(by_svd.condition_number, rel=1e-6)
+    np.testing.assert_allclose(found.matrix, by_svd.matrix, atol=1e-6 * np.abs(by_svd.matrix).max())
+
+
+def test_a_mode_that_nobody_sees_leaves_a_condition_that_cannot_be_told(monkeypatch):
+    matrix = with_singular_values([3.0, 2.0, 0.0])
+    monkeypatch.setattr(reconstructor, "_MANY", 1)
+    found = invert(matrix, 3)
+    assert found.n_truncated == 1
+    assert found.condition_number > 1e7
+    assert np.all(np.isfinite(found.matrix))
 
 
 def test_what_travels_is_single_precision_row_after_row():

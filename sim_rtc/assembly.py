@@ -14,8 +14,9 @@ from service.errors import ConfigurationError, ModelError
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import KarhunenLoeve, Normalisation
-from service.model.modes import ModalBasis, analytic_basis, mirror_surface
+from service.model.modes import ModalBasis, analytic_basis
 from service.model.slopes import Orientation
+from service.model.surface import mirror_surface
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer

@@ -17,10 +17,11 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, Stop
 from service.model.misregistration import Misregistration
-from service.model.modes import Basis, Gaussian, ModalBasis, ThinPlate, mirror_surface
+from service.model.modes import Basis, ModalBasis
 from service.model.pupil import Illumination
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Mapper
+from service.model.surface import Gaussian, ThinPlate, mirror_surface
 
 Array = NDArray[np.float64]
 

@@ -34,8 +34,9 @@ from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
-from service.model.modes import Basis, Gaussian, ModalBasis, modal_basis
+from service.model.modes import Basis, ModalBasis, modal_basis
 from service.model.sensors.registry import kind_of
+from service.model.surface import Gaussian
 
 SAMPLING = 4
 """Pupil points per subaperture, and detector nodes: the finest of the design's table that takes

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from service.model import instrument as model_code
 from service.model.instrument import Instrument, Mirror, instrument_sha256
 from service.model.kinds import BasisKind
-from service.model.modes import Basis, ModalBasis, mirror_surface, modal_basis
+from service.model.modes import Basis, ModalBasis, modal_basis
 from service.model.sensor_modes import in_subapertures
+from service.model.surface import mirror_surface
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -83,13 +84,14 @@ class DiskCache:
                 raise TypeError(f"found {type(basis).__name__} for an analytic mirror")
             return {
                 "mode_to_actuator": basis.mode_to_actuator,
-                "coefficients": basis.coefficients,
                 "variance_m2": basis.variance_m2,
             }
 
         kept = self.arrays(instrument, ("modes",), computed)
+        surface = mirror_surface(mirror, instrument.subaperture_m)
         return ModalBasis(
-            surface=mirror_surface(mirror, instrument.subaperture_m),
+            surface=surface,
+            coefficients=surface.coefficients(kept["mode_to_actuator"]),
             y_sign=mirror.y_sign,
             **kept,
         )

@@ -241,8 +241,9 @@ class InteractionModel:
 
         shapes = LocalShapes(
             patches=tuple(self._map(patch, range(len(self._tiles)))),
-            combination=basis.coefficients.astype(self._dtype),
             n_points=int(self.pupil.lit.sum()),
+            n_functions=len(basis.coefficients),
+            combination=basis.coefficients.astype(self._dtype),
         )
         return shapes if shapes.is_cheaper else shapes.array()
 

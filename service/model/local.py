@@ -59,17 +59,21 @@ class LocalShapes:
     """
 
     patches: Sequence[Patch]
-    combination: Array
-    """``(n_functions, n_shapes)`` the weights of the functions in every shape."""
-
     n_points: int
     """Lit points of the pupil."""
+
+    n_functions: int
+    combination: Array | None = None
+    """``(n_functions, n_shapes)`` the weights of the functions in every shape; None: every function
+    is a shape."""
 
     __array_ufunc__: ClassVar[None] = None
 
     @property
     def shape(self) -> tuple[int, int]:
         """``(n_points, n_shapes)``, as that of an array."""
+        if self.combination is None:
+            return self.n_points, self.n_functions
         return self.n_points, int(self.combination.shape[1])
 
     @property
@@ -81,16 +85,12 @@ class LocalShapes:
     @property
     def is_cheaper(self) -> bool:
         """Whether products of it take fewer operations than with an array of the shapes."""
-        by_tiles = self.n_points * self.n_near + self.combination.size
+        by_tiles = self.n_points * self.n_near + self.n_functions * self.shape[1]
         return by_tiles < self.n_points * self.shape[1]
 
     def array(self) -> Array:
         """Return the shapes ``(n_points, n_shapes)``."""
-        out = np.zeros(self.shape, self.combination.dtype)
-        for patch in self.patches:
-            known = self.combination[patch.functions]
-            out[patch.tile.places] = patch.weights[patch.tile.lit] @ known
-        return out
+        return np.asarray(self.combined(self.sparse()))
 
     def sparse(self) -> Any:  # noqa: ANN401 - scipy has no types
         """Return the functions ``(n_points, n_functions)``, sparse."""
@@ -103,18 +103,26 @@ class LocalShapes:
             for patch in self.patches
         ]
         values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
-        shape = (self.n_points, len(self.combination))
+        shape = (self.n_points, self.n_functions)
         return scipy.sparse.csr_array((values, (rows, columns)), shape=shape)
 
     def __rmatmul__(self, rows: Any) -> Array:  # noqa: ANN401 - scipy has no types
         """Return ``rows`` times the shapes, ``(n_rows, n_shapes)``."""
         if scipy.sparse.issparse(rows):
-            return np.asarray(rows @ self.sparse() @ self.combination)
-        by_function = np.zeros((len(self.combination), len(rows)), self.combination.dtype)
+            return self.combined(rows @ self.sparse())
+        by_function = np.zeros((self.n_functions, len(rows)), rows.dtype)
         for patch in self.patches:
             heights = patch.weights[patch.tile.lit]
             by_function[patch.functions] += heights.T @ rows[:, patch.tile.places].T
-        return np.asarray(by_function.T @ self.combination)
+        return self.combined(by_function.T)
+
+    def combined(self, by_function: Any) -> Array:  # noqa: ANN401 - scipy has no types
+        """Return what is known of the functions, ``(n_rows, n_functions)``, of the shapes."""
+        if self.combination is not None:
+            return np.asarray(by_function @ self.combination)
+        if scipy.sparse.issparse(by_function):
+            return np.asarray(by_function.toarray())
+        return np.asarray(by_function)
 
 
 Shapes = Array | LocalShapes

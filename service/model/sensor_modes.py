@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.model.instrument import Instrument
-from service.model.modes import Basis, ModalBasis, mirror_surface
+from service.model.modes import Basis, ModalBasis
+from service.model.surface import mirror_surface
 
 
 def in_subapertures(basis: Basis, instrument: Instrument) -> Basis:

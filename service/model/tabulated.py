@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument, TabulatedModes
-from service.model.turbulence import expected_variance
+from service.model.turbulence import expected_variance, pupil_statistics
 
 Array = NDArray[np.float64]
 Table = NDArray[np.floating]
@@ -64,7 +64,7 @@ class TabulatedBasis:
     @cached_property
     def variance_m2(self) -> Array:
         """``(n_modes,)`` expected variance of each mode under the turbulence, its unit squared."""
-        return expected_variance(self.instrument, self.render)
+        return expected_variance(*pupil_statistics(self.instrument, self.render))
 
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""

@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 
 from service.model.instrument import Instrument
 from service.model.kinds import KarhunenLoeve
-from service.model.pupil import instrument_pupil
+from service.model.local import LocalShapes
+from service.model.pupil import PupilGrid, instrument_pupil
 
 Array = NDArray[np.float64]
+
+SAMPLING = 3
+"""Points a subaperture at which turbulence meets shapes."""
+
+_BLOCK = 64
+"""Functions at a time."""
 
 REFERENCE_WAVELENGTH_M = 500e-9
 """Wavelength at which r0 is quoted, metres."""
@@ -56,29 +63,89 @@ def pupil_statistics(
     a convolution of every weighted shape with B(r), done exactly on a padded grid: the dense
     n_points² matrix is never formed.
     """
-    pupil = instrument_pupil(instrument, 3)
+    pupil = instrument_pupil(instrument, SAMPLING)
     weights = pupil.weights
     shapes = piston_free(render(pupil.points), weights)
     weighted = shapes * weights[:, None]
-    n = len(pupil.coordinates)
-    size = scipy.fft.next_fast_len(2 * n, real=True)
-    lag = np.minimum(np.arange(size), size - np.arange(size))
-    separation = np.hypot(lag[:, None], lag) / pupil.sampling * instrument.subaperture_m
-    kernel = scipy.fft.rfft2(von_karman_covariance(separation, instrument.modes))
+    spread = Spread(instrument, pupil)
     convolved = np.empty_like(weighted)
-    plane = np.zeros((n, n))
+    every = np.flatnonzero(pupil.lit)
     for j in range(weighted.shape[1]):
-        plane[pupil.lit] = weighted[:, j]
-        spread = scipy.fft.irfft2(scipy.fft.rfft2(plane, (size, size)) * kernel, (size, size))
-        convolved[:, j] = spread[:n, :n][pupil.lit]
+        convolved[:, j] = spread(every, weighted[:, j])
     return shapes.T @ weighted, weighted.T @ convolved
 
 
-def expected_variance(instrument: Instrument, render: Callable[[Array], Array]) -> Array:
+def local_statistics(instrument: Instrument, functions: LocalShapes) -> tuple[Array, Array]:
+    """Return the same of functions that end, on the pupil of ``SAMPLING``, none of them whole.
+
+    In float64: the last of thousands of modes have a millionth of the first one's variance, and a
+    transform in single precision would put a tenth of noise on them.
+    """
+    pupil = instrument_pupil(instrument, SAMPLING)
+    weights = pupil.weights
+    spread, places = Spread(instrument, pupil), np.flatnonzero(pupil.lit)
+    heights = functions.sparse().tocsc()
+    covariance = np.empty((functions.n_functions, functions.n_functions))
+    for start in range(0, functions.n_functions, _BLOCK):
+        columns = range(start, min(start + _BLOCK, functions.n_functions))
+        block = np.zeros((len(columns), functions.n_points))
+        for k, j in enumerate(columns):
+            at = slice(heights.indptr[j], heights.indptr[j + 1])
+            points = heights.indices[at]
+            if len(points):  # an actuator may stand in the dark
+                block[k] = spread(places[points], heights.data[at] * weights[points])
+        covariance[start : columns.stop] = (block * weights) @ functions
+    piston = spread(places, weights) * weights
+    # without their means: (f - m)' W B W (f - m), m the mean of each function
+    mean, on_piston = weights @ functions.sparse(), piston @ functions.sparse()
+    covariance -= np.outer(mean, on_piston)
+    covariance -= np.outer(on_piston, mean)
+    covariance += piston.sum() * np.outer(mean, mean)
+    return pupil_gram(functions, weights), (covariance + covariance.T) / 2
+
+
+def pupil_gram(functions: LocalShapes, weights: Array) -> Array:
+    """Return the Gram matrix of functions that end, without their means, ``(n, n)``."""
+    heights = functions.sparse()
+    mean = weights @ heights
+    weighted = scipy.sparse.diags_array(weights) @ heights
+    return np.asarray((heights.T @ weighted).toarray() - np.outer(mean, mean))
+
+
+class Spread:
+    """The turbulence's covariance B(r), spread about weights on a pupil: their convolution."""
+
+    def __init__(self, instrument: Instrument, pupil: PupilGrid) -> None:
+        n = len(pupil.coordinates)
+        self._lit = pupil.lit
+        self._size = scipy.fft.next_fast_len(2 * n, real=True)
+        lag = np.minimum(np.arange(self._size), self._size - np.arange(self._size))
+        separation = np.hypot(lag[:, None], lag) / pupil.sampling * instrument.subaperture_m
+        self._kernel = scipy.fft.rfft2(von_karman_covariance(separation, instrument.modes))
+
+    def __call__(self, places: NDArray[np.intp], weights: Array) -> Array:
+        """Return the convolution at all lit points, of weights at places of the flat grid.
+
+        Only the lines that hold any are transformed along x, and only those of the pupil back.
+        """
+        n, size = len(self._lit), self._size
+        y, x = np.divmod(places, n)
+        first, last = y.min(), y.max() + 1
+        lines = np.zeros((last - first, n))
+        lines[y - first, x] = weights
+        along_x = np.zeros((size, size // 2 + 1), complex)
+        along_x[first:last] = scipy.fft.rfft(lines, size, axis=1)
+        both = scipy.fft.fft(along_x, axis=0, overwrite_x=True)
+        both *= self._kernel
+        back = scipy.fft.ifft(both, axis=0, overwrite_x=True)[:n]
+        return np.asarray(scipy.fft.irfft(back, size, axis=1)[:, :n][self._lit])
+
+
+def expected_variance(gram: Array, covariance: Array) -> Array:
     """Return the variance ``(n_shapes,)`` of each coefficient when turbulence is fitted, metres².
 
-    The shapes need be neither orthogonal nor independent: the fit is the shortest.
+    Of statistics of the pupil. The shapes need be neither orthogonal nor independent: the fit is
+    the shortest.
     """
-    gram, covariance = pupil_statistics(instrument, render)
     inverse = scipy.linalg.pinvh(gram)
     return np.asarray(np.einsum("ij,jk,ki->i", inverse, covariance, inverse, optimize=True))

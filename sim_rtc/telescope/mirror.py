@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError
 from service.model.instrument import Mirror
 from service.model.kinds import Influence
-from service.model.modes import mirror_surface
+from service.model.surface import mirror_surface
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

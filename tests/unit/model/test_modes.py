@@ -8,7 +8,7 @@ import pytest
 from service.config.instrument import load_instrument
 from service.config.mirrors import grid, rings
 from service.errors import ModelError
-from service.model import modes
+from service.model import karhunen_loeve
 from service.model.kinds import Influence
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from service.model.pupil import instrument_pupil
@@ -96,7 +96,7 @@ def test_mode_slopes_agree_with_central_differences():
 
 def perturbed(monkeypatch, instrument):
     """The basis of this instrument when the covariance is off by one part in 1e12."""
-    exact = modes.pupil_statistics
+    exact = karhunen_loeve.pupil_statistics
 
     def noisy(*arguments):
         gram, covariance = exact(*arguments)
@@ -104,7 +104,7 @@ def perturbed(monkeypatch, instrument):
         return gram, covariance * (1 + 0.5e-12 * (noise + noise.T))
 
     with monkeypatch.context() as patch:
-        patch.setattr(modes, "pupil_statistics", noisy)
+        patch.setattr(karhunen_loeve, "pupil_statistics", noisy)
         return karhunen_loeve_basis(instrument)
 
 

@@ -8,7 +8,7 @@ import pytest
 from service.config.mirrors import rings
 from service.model.instrument import Mirror
 from service.model.kinds import Influence, InfluenceShape
-from service.model.modes import Gaussian, ThinPlate, mirror_surface
+from service.model.surface import Gaussian, ThinPlate, mirror_surface
 
 POSITIONS = rings(1, 4, 1.1)
 

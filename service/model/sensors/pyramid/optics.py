@@ -334,23 +334,24 @@ class PyramidOptics:
     def _tile_by_tile(self, shapes: LocalShapes) -> Callable[[Array, Array], Array]:
         """Return what makes of a row's factors the response to local shapes."""
         strips: dict[int, list[tuple[Patch, Array]]] = {}
+        scale = self._scale
         for patch in shapes.patches:
             tile = patch.tile
-            scale = self._scale[tile.rows, tile.columns].reshape(-1, 1)
-            heights = np.ascontiguousarray((patch.weights * scale).T)
+            at_points = scale[tile.rows, tile.columns].reshape(-1, 1)
+            heights = np.ascontiguousarray((patch.weights * at_points).T)
             strips.setdefault(tile.rows.start, []).append((patch, heights))
 
         def respond(along_y: Array, along_x: Array) -> Array:
             n_terms, n_lines, n_u = along_x.shape
             flat_x = along_x.reshape(n_terms, -1)
-            by_function = np.zeros((len(shapes.combination), n_lines), self.dtype)
+            by_function = np.zeros((shapes.n_functions, n_lines), self.dtype)
             for strip in strips.values():
                 product = along_y[:, strip[0][0].tile.rows].T @ flat_x
                 by_line = product.reshape(-1, n_lines, n_u).swapaxes(0, 1)
                 for patch, heights in strip:
                     seen = by_line[..., patch.tile.columns].reshape(n_lines, -1)
                     by_function[patch.functions] += heights @ seen.T
-            return np.asarray(by_function.T @ shapes.combination)
+            return shapes.combined(by_function.T)
 
         return respond
 

@@ -7,7 +7,8 @@ import pytest
 from service.errors import ConfigurationError
 from service.model.kinds import Influence, InfluenceShape
 from service.model.misregistration import Misregistration
-from service.model.modes import ThinPlate, karhunen_loeve_basis, mirror_surface
+from service.model.modes import karhunen_loeve_basis
+from service.model.surface import ThinPlate, mirror_surface
 from sim_rtc.assembly import build_plant
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.influence import InfluenceCube, read_influence

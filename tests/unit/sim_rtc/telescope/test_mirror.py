@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import ConfigurationError
-from service.model.modes import ThinPlate
+from service.model.surface import ThinPlate
 from sim_rtc.telescope.mirror import MirrorFaults, TensionedPlate, disobedient, misplaced
 
 

@@ -6,8 +6,8 @@ import pytest
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
-from service.model.modes import ThinPlate
 from service.model.pupil import instrument_pupil
+from service.model.surface import ThinPlate
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.linear import LinearPlant, optical_gain
 from sim_rtc.telescope.mirror import MirrorFaults, misplaced

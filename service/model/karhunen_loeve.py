@@ -1,0 +1,189 @@
+"""Karhunen-Loeve modes of a mirror: what turbulence makes strongest, mode after mode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.local import LocalShapes, Patch, tiles_of
+from service.model.pupil import instrument_pupil
+from service.model.surface import Gaussian, Surface
+from service.model.turbulence import (
+    SAMPLING,
+    local_statistics,
+    piston_free,
+    pupil_gram,
+    pupil_statistics,
+)
+
+Array = NDArray[np.float64]
+
+_PISTON_RATIO = 1e-9
+_DEGENERATE = 1e-3
+"""The square grid splits pairs that the mirror's symmetry makes equal by less than this."""
+
+_FINER = 4
+"""Points a subaperture on which modes are orthonormal."""
+
+_WHOLE_BYTES = 1e9
+"""Functions of which a table over the pupil is larger are known tile by tile, if they end."""
+
+
+def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
+    """Return strokes ``(n_actuators, n_modes)`` and variances of the mirror's first KL modes.
+
+    Piston-free, of unit RMS; mode 0 is the tilt along +x, mode 1 the tilt along +y. Where mirror
+    and pupil are symmetric about the x axis the even and odd modes are found apart, so that pairs
+    of equal variance have one well-defined orientation and every machine finds the same basis.
+
+    Raises
+    ------
+    ModelError
+        If the mirror has fewer modes than were asked for.
+    """
+    n_modes, positions_m = instrument.modes.n_modes, instrument.analytic_mirror.positions_m
+    if not 2 <= n_modes < len(positions_m):
+        raise ModelError(
+            f"modes: found n_modes = {n_modes}; expected at least tip and tilt, and "
+            f"fewer than the {len(positions_m)} actuators (piston is left out)"
+        )
+    gram, covariance = surface_statistics(instrument, surface)
+    amplitude = instrument_pupil(instrument, _FINER).amplitude
+    sectors = [scipy.sparse.eye_array(len(positions_m), format="csc")]
+    if np.allclose(amplitude, amplitude[::-1], rtol=0.0, atol=1e-9):
+        sectors = _parity_sectors(positions_m)
+    strokes, variance = _diagonalise(gram, covariance, sectors, n_modes)
+    strokes = _unit_rms(strokes, _gram(instrument, surface, strokes))
+    strokes = _tilts_along_axes(strokes, positions_m)
+    return _fix_signs(strokes, positions_m), variance
+
+
+def surface_statistics(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
+    """Return Gram matrix of the actuators' functions and covariance of turbulence on them."""
+    functions = _local(instrument, surface, SAMPLING)
+    if functions is not None:
+        return local_statistics(instrument, functions)
+    influence = _influence(surface)
+    return pupil_statistics(instrument, lambda points: surface.basis(points) @ influence)
+
+
+def _gram(instrument: Instrument, surface: Surface, strokes: Array) -> Array:
+    """Return the Gram matrix of modes on the finer grid."""
+    weights = instrument_pupil(instrument, _FINER).weights
+    functions = _local(instrument, surface, _FINER)
+    if functions is not None:
+        return np.asarray(strokes.T @ pupil_gram(functions, weights) @ strokes)
+    points = instrument_pupil(instrument, _FINER).points
+    shapes = piston_free(surface.basis(points) @ (_influence(surface) @ strokes), weights)
+    return np.asarray(shapes.T @ (shapes * weights[:, None]))
+
+
+def _influence(surface: Surface) -> Array:
+    return surface.coefficients(np.eye(len(surface.positions)))
+
+
+def _local(instrument: Instrument, surface: Surface, sampling: int) -> LocalShapes | None:
+    """Return the actuators' functions tile by tile; None: they do not end, or are small whole."""
+    pupil = instrument_pupil(instrument, sampling)
+    n_points, n_functions = int(pupil.lit.sum()), len(surface.positions)
+    if not isinstance(surface, Gaussian) or 8.0 * n_points * n_functions < _WHOLE_BYTES:
+        return None
+    patches = []
+    for tile in tiles_of(pupil):
+        near = surface.near(tile.points)
+        heights = surface.only(near).basis(tile.points)
+        patches.append(Patch(tile=tile, functions=near, weights=heights))
+    return LocalShapes(patches=patches, n_points=n_points, n_functions=n_functions)
+
+
+def _parity_sectors(positions_m: Array) -> list[Any]:
+    """Return bases ``(n_actuators, n)``, sparse, of the strokes even and odd under y -> -y.
+
+    One sector with everything when the layout has no such symmetry.
+    """
+    n = len(positions_m)
+    distance, image = scipy.spatial.KDTree(positions_m).query(positions_m * [1.0, -1.0])
+    if distance.max() > 1e-6 * np.ptp(positions_m) or len(set(image)) != n:
+        return [scipy.sparse.eye_array(n, format="csc")]
+    on_axis = np.flatnonzero(image == np.arange(n))
+    first = np.flatnonzero(image > np.arange(n))
+    # the axis' own come where they stand among the pairs, so that every mirror keeps its basis
+    leading = np.sort(np.concatenate([on_axis, first]))
+    mirror = scipy.sparse.csc_array((np.ones(n), (image, np.arange(n))), shape=(n, n))
+    whole = scipy.sparse.eye_array(n, format="csc")
+    scale = np.where(np.isin(leading, on_axis), 0.5, np.sqrt(0.5))
+    even = (whole + mirror)[:, leading].multiply(scale).tocsc()
+    return [even, (whole - mirror)[:, first] * np.sqrt(0.5)]
+
+
+def _diagonalise(
+    gram: Array, covariance: Array, sectors: list[Any], n_modes: int
+) -> tuple[Array, Array]:
+    """Return strokes and variances of the KL modes, by falling variance.
+
+    Solves the eigenproblem of the turbulence projected on each sector, in coordinates where the
+    Gram matrix is the identity; the null vector of the Gram matrix is piston and is dropped.
+    """
+    found = []
+    for parity, sector in enumerate(sectors):
+        power, axes = scipy.linalg.eigh(sector.T @ gram @ sector)
+        kept = power > _PISTON_RATIO * power[-1]
+        whiten = sector @ (axes[:, kept] / np.sqrt(power[kept]))
+        variance, vectors = scipy.linalg.eigh(whiten.T @ covariance @ whiten)
+        strokes = whiten @ vectors
+        found += [(variance[j], parity, strokes[:, j]) for j in range(len(variance))]
+    found.sort(key=lambda mode: -mode[0])
+    ordered = _even_before_odd(found)[:n_modes]
+    if len(ordered) < n_modes:
+        raise ModelError(f"modes: the mirror has {len(ordered)} modes, {n_modes} were asked for")
+    return np.column_stack([mode[2] for mode in ordered]), np.array([mode[0] for mode in ordered])
+
+
+def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float, int, Array]]:
+    """Settle the order inside pairs of equal variance, which rounding would otherwise decide."""
+    ordered: list[tuple[float, int, Array]] = []
+    start = 0
+    for stop in range(1, len(found) + 1):
+        if (
+            stop == len(found)
+            or found[stop - 1][0] - found[stop][0] > _DEGENERATE * found[start][0]
+        ):
+            ordered += sorted(found[start:stop], key=lambda mode: mode[1])
+            start = stop
+    return ordered
+
+
+def _unit_rms(strokes: Array, gram: Array) -> Array:
+    """Orthonormalise the modes over the pupil, in order: their ``gram`` there becomes one."""
+    upper = scipy.linalg.cholesky(gram)
+    return np.asarray(scipy.linalg.solve_triangular(upper, strokes.T, trans="T").T)
+
+
+def _tilts_along_axes(strokes: Array, positions_m: Array) -> Array:
+    """Turn the first two modes in their plane until mode 1 holds no tilt along x.
+
+    They are equally strong, so without a symmetry their orientation is any. The turn leaves both
+    orthonormal.
+    """
+    along = positions_m[:, 0] @ strokes[:, :2]
+    cosine, sine = along / np.hypot(*along)
+    turned = strokes.copy()
+    turned[:, :2] = strokes[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
+    return turned
+
+
+def _fix_signs(strokes: Array, positions_m: Array) -> Array:
+    """Give every mode one sign: tilts rise along +x and +y, the rest by a fixed projection.
+
+    The projection is on an arbitrary irregular vector, so that no symmetry can make it vanish.
+    """
+    index = np.arange(1, len(positions_m) + 1)
+    projection = np.modf(index * np.sqrt(2.0))[0] - 0.5
+    sign = np.sign(projection @ strokes)
+    sign[:2] = np.sign([positions_m[:, 0] @ strokes[:, 0], positions_m[:, 1] @ strokes[:, 1]])
+    return np.asarray(strokes * sign)

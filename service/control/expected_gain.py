@@ -235,4 +235,4 @@ def noise_of_star(
     area_m2 = instrument.collecting_area_m2
     flux = ZERO_POINT_PHOTONS * 10 ** (-0.4 * magnitude) * area_m2
     own = flux * THROUGHPUT / frame_rate_hz / n_valid
-    return kind_of(instrument).slope_noise(own, READ_NOISE_ELECTRONS)
+    return kind_of(instrument).slope_noise(instrument, own, READ_NOISE_ELECTRONS)

@@ -81,15 +81,19 @@ class Detector:
         """Detected on all pixels together while none is dead."""
         kind, sensor = instrument.slopes.kind, kind_of(instrument)
         self._light = sensor.light(instrument)
-        pixels = images.reshape(-1)[sensor.pixels(valid)]
+        pixels = images.reshape(-1)[sensor.pixels(instrument, valid)]
         own = pixels.sum(axis=0) * self.electrons_per_frame
         if kind is SignalKind.XY:
             lights, n_pixels = np.tile(own, 2), len(pixels)
         else:
             lights, n_pixels = pixels.reshape(-1) * self.electrons_per_frame, 1
-        variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
-        variance /= own.mean() ** 2
-        self.sigma: Array32 = np.sqrt(variance).astype(np.float32)
+        if sensor.normalised:
+            variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
+            sigma = np.sqrt(variance) / own.mean()
+        else:
+            noise = camera.read_noise_electrons, camera.excess_noise
+            sigma = np.array([sensor.slope_noise(instrument, light, *noise) for light in lights])
+        self.sigma: Array32 = sigma.astype(np.float32)
         """``(n_slopes,)`` 1 σ of a slope, or of a normalised pixel, in one frame."""
         if silent is not None:
             self.sigma[np.tile(silent, kind.n_planes)] = 0.0

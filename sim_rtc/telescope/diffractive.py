@@ -8,7 +8,7 @@ of place.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict, Unpack
+from typing import Any, Protocol, Self, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,11 @@ from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
 from service.model.sensors.pyramid.description import Pyramid, pyramid_in
 from service.model.sensors.pyramid.signals import reference_slopes
+from service.model.sensors.shack_hartmann.description import ShackHartmann
+from service.model.slopes import SlopeRecipe
 from sim_rtc.telescope.detector import PixelDetector
 from sim_rtc.telescope.imperfections import SlopeErrors
+from sim_rtc.telescope.lenslets import LENSLET_SAMPLING, DiffractiveLenslets
 from sim_rtc.telescope.mirror import PlantSurface, TensionedPlate, heights
 from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registration_between
 
@@ -46,6 +49,22 @@ _FEW_MODES = 32
 """Dithered modes beyond the controlled ones that are worth picking out."""
 
 
+class DiffractiveSensor(Protocol):
+    """A sensor that makes light of any wavefront, its image of the pupil at one place."""
+
+    shift_subap: tuple[float, float]
+    """(x, y) by which the image is moved."""
+
+    def at(self, shift_subap: tuple[float, float]) -> Self:
+        """Return the same sensor with its image elsewhere."""
+
+    def images(self, opd_m: Array) -> Array:
+        """Return the light on its pixels of a wavefront ``(n_points,)`` where the pupil is lit."""
+
+    def signals(self, light: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> Array:
+        """Return what is made of the light ``(n_slopes,)``, of a flat wavefront too."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DiffractiveOptics(Optics):
     """The optics of a diffractive plant at one registration.
@@ -53,7 +72,7 @@ class DiffractiveOptics(Optics):
     A mode of ``opd_per_command`` is contiguous in memory: modes at rest then cost nothing.
     """
 
-    sensor: DiffractivePyramid
+    sensor: DiffractiveSensor
     """Its images where the registration puts them."""
 
     static_opd_m: Array32
@@ -104,7 +123,7 @@ class DiffractiveOptics(Optics):
         return np.asarray(opd_m)
 
     def light(self, opd_m: Array32) -> Array32:
-        """Return what the pixels detect of this wavefront ``(2, n, 2, n)``, in the sensor's unit.
+        """Return what the pixels detect of this wavefront, in the sensor's own shape and unit.
 
         ``opd_m`` is ``(n_points,)``, the mirror's part in it, the non-common path not.
         """
@@ -121,12 +140,12 @@ class DiffractiveOptics(Optics):
         light = self.light(opd_m)
         if detector is not None:
             light = detector.read(light / np.float32(self.light_at_rest), rng)
-        slopes, _ = reference_slopes(light, self.valid, self.errors.recipe)
+        slopes = self.sensor.signals(light, self.valid, self.errors.recipe)
         return self.errors.applied((slopes - self.slopes_at_rest).astype(np.float32, copy=False))
 
 
 class DiffractivePlant(Plant):
-    """A pyramid and a mirror with all that linear algebra leaves out."""
+    """A sensor and a mirror with all that linear algebra leaves out."""
 
     def __init__(
         self,
@@ -138,7 +157,13 @@ class DiffractivePlant(Plant):
         **made: Unpack[Departures],
     ) -> None:
         """Take the instrument as it is binned: the finest pixels set how finely it is computed."""
-        super().__init__(instrument, basis, centred_pupil(instrument, _SAMPLING * binning), made)
+        lenslets = isinstance(instrument.wfs, ShackHartmann)
+        sampling = LENSLET_SAMPLING if lenslets else _SAMPLING * binning
+        super().__init__(instrument, basis, centred_pupil(instrument, sampling), made)
+        self._sensor: DiffractiveSensor
+        if isinstance(self._wfs, ShackHartmann):
+            self._sensor = DiffractiveLenslets(self._wfs, self._pupil, instrument.subaperture_m)
+            return
         wfs = pyramid_in(replace(instrument, wfs=self._wfs))
         self._sensor = DiffractivePyramid(
             wfs, self._pupil, quadrature=quadrature or _quadrature(wfs, binning)
@@ -189,13 +214,13 @@ class _AtRest(TypedDict):
 
 
 def _at_rest(
-    sensor: DiffractivePyramid, valid: NDArray[np.bool_], errors: SlopeErrors, n_points: int
+    sensor: DiffractiveSensor, valid: NDArray[np.bool_], errors: SlopeErrors, n_points: int
 ) -> _AtRest:
     """Propagate a flat wavefront."""
     light = sensor.images(np.zeros(n_points, dtype=np.float32))
     total = float(light.sum())
     light = errors.read(light)
-    slopes, _ = reference_slopes(light, valid, errors.recipe)
+    slopes = sensor.signals(light, valid, errors.recipe)
     return {
         "images": light.astype(np.float64) / total,
         "light_at_rest": total,
@@ -294,6 +319,10 @@ class DiffractivePyramid:
         # Rows: side, subaperture, node; columns: point of the pair, side, subaperture, node, part.
         by_node = power.reshape(2, n, nodes, 2, 2, n, nodes * 2)
         return np.asarray(by_node.sum(axis=(2, 3, 6)))
+
+    def signals(self, light: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> Array:
+        """Return the signals of its images ``(n_slopes,)``, of a flat wavefront too."""
+        return reference_slopes(light, valid, recipe)[0]
 
     def _roof(self, shift_subap: float) -> Array:
         """Return the roof operator along one axis, ``(2 n n_nodes, N)``, its weights included.

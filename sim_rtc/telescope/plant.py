@@ -51,7 +51,8 @@ class Optics(ABC):
 
     images: Array
     """Share of the light that every pixel detects, 0 where it is dead, in the sensor's own shape:
-    ``(2, n, 2, n)`` of a pyramid, side, row along y, side, column along x."""
+    ``(2, n, 2, n)`` of a pyramid, side, row along y, side, column along x; ``(n, m, n, m)`` of
+    lenslets, row of them, row of their pixels, and so along x."""
 
     responses: tuple[tuple[float, PhaseResponse], ...] = ()
     """Slopes per metre of turbulence OPD: shares of exact responses, their sum 1; none where the
@@ -112,7 +113,7 @@ class Plant(ABC):
         """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
         self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
         """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
-        self.pixels: NDArray[np.intp] = kind_of(instrument).pixels(self.valid)
+        self.pixels: NDArray[np.intp] = kind_of(instrument).pixels(instrument, self.valid)
         """``(n_pixels, n_valid)`` where their pixels stand in the light."""
         self.slope_errors = SlopeErrors(self.pixels, imperfections, pixel_rng, instrument.slopes)
         """What the sensor makes of correct light and slopes."""

@@ -168,11 +168,16 @@ class SensorKind(ABC):
         raise ModelError(f"a {self.name}: found binning {binning}, expected none")
 
     @abstractmethod
-    def slope_noise(self, electrons: float, read_noise: float) -> float:
-        """Return 1 σ of a slope of a subaperture with so many electrons, read with this noise."""
+    def slope_noise(
+        self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
+    ) -> float:
+        """Return 1 σ of a slope of a subaperture with so many electrons, read with this noise.
+
+        ``excess`` is the variance of the photon noise over Poisson's.
+        """
 
     @abstractmethod
-    def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
         """Return where the pixels of valid subapertures stand in a response's flat light.
 
         ``(n_pixels, n_valid)``; the light has n_pixels for every subaperture of the grid.

@@ -10,7 +10,7 @@ from pyrcal.offline.matrix import fit_matrix
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.estimation.reference import Reference
-from service.model.misregistration import Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import modal_basis
 from service.runtime.worker import OpticsWorker
 from service.runtime.worker.records import Compute
@@ -35,7 +35,7 @@ def lenslets():
 
 
 def test_a_matrix_without_noise_of_another_grid_is_fitted(lenslets):
-    """The plant has 4 points in a subaperture, the model 3: such differences are 2 % apart."""
+    """The plant has 4 points in a subaperture, the model 3, and its own quadrature."""
     basis, exact = (
         modal_basis(lenslets),
         replace(SETS["ideal"], lowest_optical_gain=1.0, highest_optical_gain=1.0),
@@ -69,3 +69,37 @@ def test_the_service_finds_it_in_a_closed_loop_and_swaps_the_matrix(lenslets):
     in_use = [r for r in night.state.matrices.reconstructors if r.state is MatrixState.APPLIED]
     assert [r.id.startswith("cm-") for r in in_use] == [True]
     assert night.dome.moments[-1].wavefront_nm < 300.0
+
+
+@pytest.mark.long
+def test_on_spots_with_noise_alpha_is_followed_a_jump_is_found_and_sigma_is_honest(lenslets):
+    """Photons and read noise on pixels, another mirror, another grid, uneven light."""
+    night = Observatory(
+        [
+            f"--instrument={FILE}",
+            "--plant=diffractive",
+            "--alpha=0.18,-0.12,0.5,1.004",
+            "--jump=12:0.25,-0.1,0,0",
+            "--mag=8",
+            "--rate=500",
+            "--n-controlled=60",
+            "--seed=1",
+        ],
+        policy_of(load_settings(None, {}, {"dither.longest_pause_s": 0.0})),
+        Mode.AUTO,
+        OpticsWorker(lenslets, Compute(threads=1)),
+        latencies=latencies_of(1.0),
+        with_poles=False,
+    )
+    far = []
+    for seconds in (11.0, 19.0):
+        night.advance(seconds)
+        alpha = night.state.alpha.registration
+        error = alpha.alpha.vector - night.dome.computer._optics.alpha.vector
+        sigma = night.glances[-1].sigma
+        far += list(error / sigma)
+        assert np.all(np.abs(error) < [0.05, 0.05, np.deg2rad(0.25), 6e-3]), error * BOUNDARY_SCALE
+        assert np.all(sigma < [0.04, 0.04, np.deg2rad(0.2), 6e-3]), sigma * BOUNDARY_SCALE
+    assert np.abs(far).max() < 3.0
+    in_use = [r for r in night.state.matrices.reconstructors if r.state is MatrixState.APPLIED]
+    assert [r.id.startswith("cm-") for r in in_use] == [True]

@@ -117,12 +117,14 @@ class PyramidKind(SensorKind):
         )
 
     @override
-    def slope_noise(self, electrons: float, read_noise: float) -> float:
+    def slope_noise(
+        self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
+    ) -> float:
         # a difference of four pixels over the mean flux: their variances add up, in x and y alike
-        return math.sqrt(electrons + 4 * read_noise**2) / electrons
+        return math.sqrt(excess * electrons + 4 * read_noise**2) / electrons
 
     @override
-    def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+    def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
         from service.model.sensors.pyramid.signals import pixel_places
 
         return pixel_places(valid)

@@ -107,5 +107,29 @@ def shack_hartmann_in(instrument: Instrument) -> ShackHartmann:
     return instrument.wfs
 
 
+def pixel_places(sensor: ShackHartmann, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return where the pixels of valid subapertures stand in flat light ``(n, m, n, m)``.
+
+    ``(m**2, n_valid)``: m pixels along a side of each of n subapertures, row by row.
+    """
+    n, m = len(valid), sensor.pixels_per_subaperture
+    places = np.arange((n * m) ** 2, dtype=np.intp).reshape(n, m, n, m)
+    return np.ascontiguousarray(places.transpose(1, 3, 0, 2)[..., valid].reshape(m * m, -1))
+
+
+def centroid_variances(sensor: ShackHartmann, subaperture_m: float) -> tuple[float, float]:
+    """Return the variance of a centroid by one photon's place, and by noise 1 of all its pixels.
+
+    In (λ/d)², over the square of the photons yet: of a spot sinc² u its variance within a field
+    from -w to w is w / π². A threshold, or weights, let the core count alone: w = 1.
+    """
+    pixel = sensor.pixel_lambda_over_d(subaperture_m)
+    half = sensor.pixels_per_subaperture * pixel / 2
+    if sensor.centroid is not Centroid.CENTRE_OF_GRAVITY:
+        half = min(half, 1.0)
+    across = 2.0 * half / pixel
+    return half / math.pi**2, across**2 * (2.0 * half) ** 2 / 12.0
+
+
 def _usual(centroid: Centroid) -> PartlyLit:
     return PartlyLit.LEAVE_OUT if centroid is Centroid.THRESHOLD else PartlyLit.USE

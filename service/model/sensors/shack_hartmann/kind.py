@@ -79,13 +79,24 @@ class ShackHartmannKind(SensorKind):
             )
 
     @override
-    def slope_noise(self, electrons: float, read_noise: float) -> float:
-        # a spot as wide as the diffraction of its lenslet: half a wave over the root of its light
-        return 0.5 * math.sqrt(electrons + 16 * read_noise**2) / electrons
+    def slope_noise(
+        self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
+    ) -> float:
+        from service.model.sensors.shack_hartmann.description import (
+            centroid_variances,
+            shack_hartmann_in,
+        )
+
+        wfs = shack_hartmann_in(instrument)
+        of_photon, of_pixels = centroid_variances(wfs, instrument.subaperture_m)
+        variance = excess * of_photon * electrons + of_pixels * read_noise**2
+        return math.sqrt(variance) / electrons
 
     @override
-    def pixels(self, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
-        return valid.reshape(1, -1).nonzero()[1][None, :]
+    def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
+        from service.model.sensors.shack_hartmann.description import pixel_places, shack_hartmann_in
+
+        return pixel_places(shack_hartmann_in(instrument), valid)
 
     @override
     def sensor(

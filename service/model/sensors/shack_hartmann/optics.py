@@ -166,12 +166,14 @@ class ShackHartmannResponse:
 
     @cached_property
     def light(self) -> NDArray[np.float64]:
-        """``(n, n)`` light of every subaperture, a full one's being 1."""
-        n = len(self.sensor.valid)
-        _, weights = self.sensor.spots.nodes
+        """``(n, m, n, m)`` light on the pixels: row of lenslets, row of theirs, and so along x.
+
+        Of a full lenslet, wings beyond its field counted, it is 1.
+        """
+        n, spots = len(self.sensor.valid), self.sensor.spots
         y, x = np.indices((n, n)).reshape(2, -1)
-        light = self._amplitudes(y, x)[0] ** 2
-        return np.asarray((weights @ light @ weights).reshape(n, n))
+        light = spots.images(self._amplitudes(y, x)[0])
+        return light.reshape(n, n, *light.shape[1:]).swapaxes(1, 2)
 
     def lit(self, light: NDArray[np.float64]) -> ShackHartmannResponse:
         """Return the same: a centroid does not depend on how much light tells it."""

@@ -69,12 +69,11 @@ class Spots:
     @cached_property
     def _counts(self) -> Array:
         """``(n_angles, n_angles)`` how much the light at an angle counts, of its quadrature too."""
-        angles, weights = self._angles
-        n_inside = angles.shape[1]
+        _, weights = self._angles
         of_angle = np.tile(weights, self.n_pixels)
         area = np.outer(of_angle, of_angle)
-        spot = np.abs(self._seen(np.ones((1, *[len(self.nodes[0])] * 2)))[0]) ** 2 * area
-        light = spot.reshape(self.n_pixels, n_inside, self.n_pixels, n_inside).sum(axis=(1, 3))
+        n_inside = weights.size
+        light = self.images(np.ones((1, *[len(self.nodes[0])] * 2)))[0]
         light /= light.max()
         if self.centroid is Centroid.CENTRE_OF_GRAVITY:
             light = np.ones_like(light)
@@ -84,6 +83,14 @@ class Spots:
 
     def _seen(self, amplitude: Array) -> Array:
         return np.asarray(self._transform @ amplitude @ self._transform.T)
+
+    def images(self, amplitude: Array) -> Array:
+        """Return the light on the pixels ``(n_lenslets, n_pixels, n_pixels)`` [y, x]."""
+        _, weights = self._angles
+        of_angle = np.tile(weights, self.n_pixels)
+        light = np.abs(self._seen(amplitude)) ** 2 * np.outer(of_angle, of_angle)
+        n, inside = self.n_pixels, weights.size
+        return np.asarray(light.reshape(-1, n, inside, n, inside).sum(axis=(2, 4)))
 
     def light(self, first: Array, second: Array) -> Array:
         """Return the light that counts ``(n_lenslets,)``, bilinear in two amplitudes.

@@ -1,0 +1,128 @@
+"""Spots of a Shack-Hartmann for any wavefront, and their centroids.
+
+Nothing of the service's model is in it but the drawing: light between the points of the pupil is
+interpolated straight, on a regular grid under each lenslet, propagated whole, and summed on pixels;
+centroids are those of noisy pixels, their threshold that of each spot in each frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from service.model.pupil import PupilGrid
+from service.model.sensors.shack_hartmann.description import ShackHartmann
+from service.model.sensors.shack_hartmann.table import Centroid
+from service.model.slopes import SlopeRecipe
+
+Array = NDArray[Any]
+
+LENSLET_SAMPLING = 4
+"""Points of the pupil per subaperture."""
+
+_INSIDE_PIXEL = 2
+"""Samples of the light along a side of a pixel, more where it is wider than λ/d."""
+
+_FAINTEST = 0.05
+"""Light of a spot over that of a flat wavefront below which its centroid is that of no spot: the
+noise of its pixels would be divided by nothing."""
+
+
+class DiffractiveLenslets:
+    """The light on the pixels behind the lenslets, at one shift of the pupil's image."""
+
+    def __init__(
+        self,
+        wfs: ShackHartmann,
+        pupil: PupilGrid,
+        subaperture_m: float,
+        shift_subap: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._wfs, self._pupil, self._subaperture_m = wfs, pupil, subaperture_m
+        self.shift_subap = shift_subap
+        """(x, y) by which the pupil's image is moved."""
+
+        self._pixel = wfs.pixel_lambda_over_d(subaperture_m)
+        self._n_inside = _INSIDE_PIXEL * int(np.ceil(self._pixel))
+        field = wfs.pixels_per_subaperture * self._pixel
+        self._n_nodes = max(8, int(np.ceil(field)) + 4)
+        self._on_x, self._on_y = (self._between(shift) for shift in shift_subap)
+        self._amplitude: Array = self._under(pupil.amplitude)
+        self._wavenumber = np.float32(2 * np.pi / wfs.wavelength_m)
+        self._edge, self._inside = _continued(pupil.lit)
+        self._transform = self._to_pixels()
+        self._flat = self.images(np.zeros(int(pupil.lit.sum()), dtype=np.float32))
+
+    def at(self, shift_subap: tuple[float, float]) -> DiffractiveLenslets:
+        """Return the same sensor with the image of the pupil elsewhere."""
+        return DiffractiveLenslets(self._wfs, self._pupil, self._subaperture_m, shift_subap)
+
+    def images(self, opd_m: Array) -> Array:
+        """Return the light ``(n, m, n, m)``: row of lenslets, row of their pixels, so along x.
+
+        ``opd_m`` is ``(n_points,)``, at the lit points of the pupil. The unit is the light of a
+        full lenslet, the wings beyond its pixels counted.
+        """
+        phase = self._wavenumber * self._under(2.0 * opd_m[self._edge] - opd_m[self._inside])
+        field = self._amplitude * np.exp(1j * phase)
+        n, nodes, rows = self._wfs.n_subapertures, self._n_nodes, self._transform
+        seen = rows @ field.reshape(n, nodes, n * nodes)
+        seen = seen.reshape(-1, nodes) @ rows.T
+        m, inside = self._wfs.pixels_per_subaperture, self._n_inside
+        light = seen.real**2 + seen.imag**2
+        # rows: lenslet, pixel, inside; columns: lenslet, pixel, inside
+        return np.asarray(light.reshape(n, m, inside, n, m, inside).sum(axis=(2, 5)))
+
+    def signals(self, light: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> Array:
+        """Return centroids ``(n_slopes,)`` of valid lenslets, waves across one."""
+        spots, flat = (each.swapaxes(1, 2)[valid] for each in (light, self._flat))
+        if self._wfs.centroid is Centroid.WEIGHTED:
+            spots = spots * flat
+        elif self._wfs.centroid is Centroid.THRESHOLD:
+            brightest = spots.max(axis=(1, 2), keepdims=True)
+            spots = np.where(spots >= np.float32(self._wfs.threshold or 0.0) * brightest, spots, 0)
+        m = self._wfs.pixels_per_subaperture
+        places = (self._pixel * (np.arange(m) - (m - 1) / 2)).astype(spots.dtype)
+        total = spots.sum(axis=(1, 2))
+        total = np.maximum(total, _FAINTEST * np.median(total))
+        along = np.stack([spots.sum(axis=1) @ places, spots.sum(axis=2) @ places])
+        return np.asarray((along / total).reshape(-1))
+
+    def _between(self, shift: float) -> Array:
+        """Return how nodes under lenslets read the pupil's grid, ``(n n_nodes, n_grid)``."""
+        n, grid = self._wfs.n_subapertures, self._pupil.coordinates
+        places = (np.arange(n * self._n_nodes) + 0.5) / self._n_nodes - n / 2 - shift
+        distance = np.abs(places[:, None] - grid) * self._pupil.sampling
+        return np.maximum(1.0 - distance, 0.0).astype(np.float32)
+
+    def _under(self, on_grid: Array) -> Array:
+        """Return a map of the pupil's grid at the nodes of all lenslets."""
+        return np.asarray(self._on_y @ on_grid.astype(np.float32, copy=False) @ self._on_x.T)
+
+    def _to_pixels(self) -> Array:
+        """Return the transform of a lenslet's line of nodes to samples of its pixels."""
+        m, inside = self._wfs.pixels_per_subaperture, self._n_inside
+        angles = self._pixel * ((np.arange(m * inside) + 0.5) / inside - m / 2)
+        nodes = (np.arange(self._n_nodes) + 0.5) / self._n_nodes - 0.5
+        step = np.sqrt(self._pixel / inside) / self._n_nodes
+        transform = step * np.exp(-2j * np.pi * angles[:, None] * nodes)
+        return np.asarray(transform.astype(np.complex64))
+
+
+def _continued(lit: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return lit points whose wavefronts continue it straight, twice the first less the second.
+
+    Both ``(n_grid, n_grid)``: the nearest lit point and its neighbour across; where it is lit both
+    are the point itself.
+    """
+    number = np.full(lit.shape, -1)
+    number[lit] = np.arange(lit.sum())
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~lit, return_distances=False, return_indices=True
+    )
+    across = np.clip(2 * nearest - np.indices(lit.shape), 0, len(lit) - 1)
+    across = np.where(lit[tuple(across)], across, nearest)
+    return number[tuple(nearest)], number[tuple(across)]

@@ -1,0 +1,103 @@
+"""Spots of the simulated Shack-Hartmann: by hand, by brute force, with noise."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.config import load_instrument
+from service.model.modes import modal_basis
+from service.model.pupil import fully_lit_subapertures, valid_subapertures
+from service.model.sensors.registry import kind_of
+from service.model.sensors.shack_hartmann.table import Centroid
+from service.model.slopes import PLAIN
+from sim_rtc.telescope.detector import Camera, PixelDetector
+from sim_rtc.telescope.diffractive import DiffractivePlant, centred_pupil
+from sim_rtc.telescope.imperfections import SETS
+from sim_rtc.telescope.lenslets import LENSLET_SAMPLING, DiffractiveLenslets
+from tests.physics.fft_spots import pushed
+
+FILE = Path(__file__).parents[3] / "data" / "lenslets.toml"
+SHIFT = (0.3, -0.2)
+
+
+@pytest.fixture(scope="module")
+def lenslets():
+    return load_instrument(FILE)
+
+
+def sensor_of(instrument, shift=SHIFT):
+    pupil = centred_pupil(instrument, LENSLET_SAMPLING)
+    return DiffractiveLenslets(instrument.wfs, pupil, instrument.subaperture_m, shift), pupil
+
+
+def inner(instrument):
+    """Return valid subapertures that the edge does not reach at a shift of a third."""
+    radius = np.hypot(*np.indices((12, 12)) - 5.5)
+    return ((radius < 4.7) & (radius > 2.2))[valid_subapertures(instrument)]
+
+
+def test_light_of_a_full_lenslet_is_what_its_field_holds(lenslets):
+    """Within 3 λ/d of the middle sinc² has 0.966 along one axis."""
+    sensor, pupil = sensor_of(lenslets, (0.0, 0.0))
+    light = sensor.images(np.zeros(len(pupil.points), np.float32)).sum(axis=(1, 3))
+    full = fully_lit_subapertures(lenslets)
+    np.testing.assert_allclose(np.median(light[full]), 0.966**2, rtol=0.03)
+
+
+@pytest.mark.parametrize("centroid", Centroid)
+def test_small_wavefronts_move_spots_as_those_by_brute_force(lenslets, centroid):
+    """3 %: four points for a lenslet, and two samples of the light for a pixel."""
+    about = replace(lenslets, wfs=replace(lenslets.wfs, centroid=centroid, threshold=0.02))
+    sensor, pupil = sensor_of(about)
+    valid = valid_subapertures(about)
+    counted = {
+        Centroid.CENTRE_OF_GRAVITY: np.ones_like,
+        Centroid.WEIGHTED: lambda spot: spot,
+        Centroid.THRESHOLD: lambda spot: spot >= 0.02 * spot.max(),
+    }[centroid]
+
+    def opd(points):
+        x, y = points.T
+        return (np.sin(x / 1.7 + 0.3) * np.cos(y / 2.3) + 0.05 * x * y)[:, None]
+
+    step = (2e-9 * opd(pupil.points)[:, 0]).astype(np.float32)
+    push, pull = (sensor.signals(sensor.images(s * step), valid, PLAIN) for s in (1, -1))
+    slopes = ((push - pull) / 4e-9).reshape(2, -1)[:, inner(about)]
+    brute = pushed(about, opd, SHIFT, counted)[:, valid, 0][:, inner(about)]
+    gain = np.vdot(brute, slopes) / np.vdot(brute, brute)
+    assert abs(gain - 1.0) < (0.1 if centroid is Centroid.WEIGHTED else 0.04)
+    assert np.linalg.norm(slopes - gain * brute) < 0.03 * np.linalg.norm(slopes)
+
+
+@pytest.mark.parametrize(("magnitude", "read_noise"), [(8.0, 0.0), (7.0, 6.0)])
+def test_noise_of_centroids_is_that_of_their_photons_and_pixels(lenslets, magnitude, read_noise):
+    """A third of it is left to the shape of the pixels: a photon's place is known to one."""
+    camera = Camera(read_noise_electrons=read_noise)
+    plant = DiffractivePlant(
+        lenslets, modal_basis(lenslets), rng=np.random.default_rng(1), imperfections=SETS["ideal"]
+    )
+    optics = plant.optics(lenslets.start)
+    electrons = camera.electrons_per_frame(lenslets, magnitude=magnitude, frame_rate_hz=500.0)
+    detector = PixelDetector(electrons_per_light=electrons, camera=camera)
+    flat, rng = np.zeros(len(plant.points_m), np.float32), np.random.default_rng(2)
+    slopes = np.array([optics.slopes(flat, detector, rng) for _ in range(300)])
+    full = np.tile(fully_lit_subapertures(lenslets)[plant.valid], 2)
+    own = electrons * optics.images.sum(axis=(1, 3))[fully_lit_subapertures(lenslets)].mean()
+    told = kind_of(lenslets).slope_noise(lenslets, own, read_noise)
+    assert slopes[:, full].std() == pytest.approx(told, rel=0.3)
+    assert abs(slopes[:, full].mean()) < 5 * told / np.sqrt(slopes[:, full].size)
+
+
+def test_a_threshold_keeps_the_noise_of_dark_pixels_out(lenslets):
+    rng = np.random.default_rng(3)
+    valid = valid_subapertures(lenslets)
+    spread = {}
+    for centroid in (Centroid.CENTRE_OF_GRAVITY, Centroid.THRESHOLD):
+        about = replace(lenslets, wfs=replace(lenslets.wfs, centroid=centroid, threshold=0.2))
+        sensor, pupil = sensor_of(about, (0.0, 0.0))
+        light = 1000 * sensor.images(np.zeros(len(pupil.points), np.float32))
+        noisy = [light + 10.0 * rng.standard_normal(light.shape) for _ in range(50)]
+        spread[centroid] = np.std([sensor.signals(one, valid, PLAIN) for one in noisy])
+    assert spread[Centroid.THRESHOLD] < 0.5 * spread[Centroid.CENTRE_OF_GRAVITY]

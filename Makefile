@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long check paper clean FORCE
+.PHONY: help setup demo docs test test-long check paper bench clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -44,6 +44,9 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 
 paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--quick rehearses
 	@$(PY) -m studies.heritier2018 $(ARGS)
+
+bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/bench.md; a quarter of an hour
+	@$(PY) -m benchmarks.bench $(ARGS)
 
 clean: ## remove what make made; never var/, which holds calibration products
 	rm -rf .venv build dist service/web/manual *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \

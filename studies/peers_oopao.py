@@ -38,7 +38,7 @@ class Oopao:
         star = Source(optBand="I", magnitude=0)
         star * self.telescope
         self.wavelength_m = float(star.wavelength)
-        self._sensor = Pyramid(
+        self.sensor = Pyramid(
             nSubap=bench.n_subapertures,
             telescope=self.telescope,
             modulation=_modulation(bench),
@@ -46,23 +46,23 @@ class Oopao:
             n_pix_separation=bench.pupil_separation_subap - bench.n_subapertures,
             nTheta_user_defined=bench.n_modulation,
         )
-        self._sensor.nJobs = 1
-        self._sensor.compute_focal_plane = False
-        self.valid: NDArray[np.bool_] = np.asarray(self._sensor.validI4Q)
+        self.sensor.nJobs = 1
+        self.sensor.compute_focal_plane = False
+        self.valid: NDArray[np.bool_] = np.asarray(self.sensor.validI4Q)
 
     def frame(self, opd_m: Array) -> Array:
         """Return the frame of its detector."""
         self.slopes(opd_m)
-        return np.array(self._sensor.cam.frame)
+        return np.array(self.sensor.cam.frame)
 
     def slopes(self, opd_m: Array) -> Array:
         """Return its slopes maps, cropped to its valid pixels."""
-        self._sensor.wfs_measure(phase_in=2 * np.pi / self.wavelength_m * opd_m)
-        return np.array(self._sensor.signal)
+        self.sensor.wfs_measure(phase_in=2 * np.pi / self.wavelength_m * opd_m)
+        return np.array(self.sensor.signal)
 
     def move_images(self, columns_px: float, rows_px: float) -> None:
         """Tilt the faces of the pyramid together."""
-        self._sensor.apply_shift_wfs(sx=columns_px, sy=-rows_px)
+        self.sensor.apply_shift_wfs(sx=columns_px, sy=-rows_px)
 
 
 def _telescope(bench: Bench) -> Telescope:

@@ -58,11 +58,12 @@ class AboutTable(kinds.Telescope):
 class MirrorTable(kinds.InfluenceShape):
     """``[mirror]``: analytic (``layout``) or measured (``modes``, ``influence_functions``)."""
 
-    layout: Literal["rings", "grid", "positions"] | None = None
+    layout: Literal["rings", "grid", "hexagonal", "positions"] | None = None
     """Placement of an analytic mirror's actuators."""
 
     pitch_m: kinds.Positive | None = None
-    """Distance between neighbours, metres; None: 0.30 for rings, measured for positions."""
+    """Distance between neighbours, metres; None: 0.30 for rings, measured for positions. Hexagonal:
+    rows along +x, one actuator in the middle."""
 
     first_ring: kinds.Count = 2
     """Rings only."""
@@ -74,7 +75,7 @@ class MirrorTable(kinds.InfluenceShape):
     """Grid only: actuators along a diameter."""
 
     diameter_m: kinds.Positive | None = None
-    """Grid only: actuators beyond this circle do not exist."""
+    """Grid and hexagonal: actuators beyond this circle do not exist."""
 
     positions: str | None = None
     """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
@@ -104,7 +105,14 @@ class MirrorTable(kinds.InfluenceShape):
     """Meaning of the user's modes: OPD, or surface."""
 
     influence_functions: str | None = None
-    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``."""
+    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``, or cropped."""
+
+    influence_origin: str | None = None
+    """Cropped functions only: ``path:/dataset`` of ``(n_actuators, 2)``, row and column where each
+    begins in the whole table; beyond its crop a function is 0."""
+
+    influence_table: tuple[kinds.Count, kinds.Count] | None = None
+    """Cropped functions only: rows and columns of the whole table, centred on the pupil."""
 
 
 class OrientationTable(Table):

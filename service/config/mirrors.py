@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from service.config.crops import modes_of_crops, remarks_on_crops
 from service.config.instrument_schema import MirrorTable, Section
 from service.config.sources import refuse
 from service.errors import ConfigurationError
@@ -25,15 +26,17 @@ _KINDS = ("layout", "modes", "influence_functions")
 _LAYOUT_KEYS = {
     "rings": {"first_ring", "last_ring", "pitch_m"},
     "grid": {"n_across", "pitch_m", "diameter_m"},
+    "hexagonal": {"pitch_m", "diameter_m"},
     "positions": {"positions", "pitch_m"},
 }
 
-_MEASURED = {"modes_pitch_m"}
+_CROPPED = {"influence_origin", "influence_table"}
+_MEASURED = {"modes_pitch_m"} | _CROPPED
 _ANALYTIC = set().union(*_LAYOUT_KEYS.values()) | {"influence", "coupling"}
 
 _FOREIGN = {
     "layout": _MEASURED,
-    "modes": _ANALYTIC | {"mode_to_actuator", "basis"},
+    "modes": _ANALYTIC | _CROPPED | {"mode_to_actuator", "basis"},
     "influence_functions": _ANALYTIC,
 }
 """Keys that mean nothing to a mirror of each kind."""
@@ -135,12 +138,13 @@ def _analytic(file: MirrorSection) -> Mirror:
             f"actuators {pair[0]} and {pair[1]} in the same place",
             "every actuator in a place of its own",
         )
+    strokes = _mode_to_actuator(file, len(positions))
     return Mirror(
         positions_m=positions,
         pitch_m=table.pitch_m or typical_pitch(positions),
         shape=InfluenceShape(influence=table.influence, coupling=table.coupling),
         basis=table.basis,
-        mode_to_actuator=_mode_to_actuator(file, len(positions)),
+        mode_to_actuator=None if strokes is None else _opd(file, strokes).astype(np.float64),
         **_mount(table),
     )
 
@@ -196,6 +200,13 @@ def _grid(file: MirrorSection) -> NDArray[np.float64]:
     return positions
 
 
+def _hexagonal(file: MirrorSection) -> NDArray[np.float64]:
+    pitch_m, diameter_m = _mandatory(file, ("pitch_m", "diameter_m"))
+    positions = hexagonal(pitch_m, diameter_m)
+    _check_number(len(positions), f"{file.path}: mirror")
+    return positions
+
+
 def _listed_positions(file: MirrorSection) -> NDArray[np.float64]:
     where = file.where("positions")
     _mandatory(file, ("positions",))
@@ -212,6 +223,7 @@ def _listed_positions(file: MirrorSection) -> NDArray[np.float64]:
 _LAYOUTS: dict[str, Callable[[MirrorSection], NDArray[np.float64]]] = {
     "rings": _rings,
     "grid": _grid,
+    "hexagonal": _hexagonal,
     "positions": _listed_positions,
 }
 
@@ -242,7 +254,7 @@ def _mode_to_actuator(file: MirrorSection, n_actuators: int) -> NDArray[np.float
         refuse(where, f"shape {values.shape}{hint}", expected)
     if values.shape[1] == 0 or not np.isfinite(values).all():
         refuse(where, "no mode, or strokes that are not finite", f"{expected} finite strokes")
-    return _opd(file, values).astype(np.float64)
+    return values.astype(np.float64)
 
 
 # --- where actuators are
@@ -269,7 +281,28 @@ def grid(n_across: int, pitch_m: float, diameter_m: float) -> NDArray[np.float64
     """
     line = (np.arange(n_across) - (n_across - 1) / 2) * pitch_m
     y, x = np.meshgrid(line, line, indexing="ij")
-    points = np.column_stack([x.ravel(), y.ravel()])
+    return _inside(x, y, diameter_m)
+
+
+def hexagonal(pitch_m: float, diameter_m: float) -> NDArray[np.float64]:
+    """Return the points of a triangular lattice inside a circle, ``(n_actuators, 2)``, metres.
+
+    Each has six neighbours at ``pitch_m``. One lies at the centre, rows run along +x, from the
+    lowest y up: the layout is its own mirror image under y -> -y.
+    """
+    rows = int(diameter_m / 2 / (pitch_m * np.sqrt(0.75)) + 1e-9)
+    row = np.arange(-rows, rows + 1)
+    columns = int(diameter_m / 2 / pitch_m) + 1
+    along = np.arange(-columns, columns + 1) + 0.5 * (row % 2)[:, None]
+    y = np.broadcast_to((row * pitch_m * np.sqrt(0.75))[:, None], along.shape)
+    return _inside(along * pitch_m, y, diameter_m)
+
+
+def _inside(
+    x_m: NDArray[np.float64], y_m: NDArray[np.float64], diameter_m: float
+) -> NDArray[np.float64]:
+    """Return the points that lie in a circle or on it, ``(n, 2)``, row by row."""
+    points = np.column_stack([x_m.ravel(), y_m.ravel()])
     rounding = 1.0 + 1e-9
     inside = np.linalg.norm(points, axis=1) <= diameter_m / 2 * rounding
     return np.asarray(points[inside])
@@ -317,14 +350,21 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
         raise ConfigurationError(
             f"{file.where('modes_pitch_m')}: missing, mirror.{key} needs the step of its grid"
         )
-    cube = _read(file, key)
+    cube = crops = _read(file, key)
     if cube.ndim != 3 or min(cube.shape) < 1:
         refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
-    known = known_samples(cube)
-    remarks = _judged(file, pupil, key, known, file.said.modes_pitch_m)
-    cube = np.where(known, cube, cube.dtype.type(0))
-    if key == "influence_functions":
-        cube = _combined(file, cube)
+    strokes = _strokes(file, len(cube)) if key == "influence_functions" else None
+    if file.said.influence_origin is not None:
+        cube, known = modes_of_crops(file, cube, strokes)
+    else:
+        known = known_samples(cube)
+        cube = np.where(known, cube, cube.dtype.type(0))
+        if strokes is not None:
+            cube = np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
+    remarks = (
+        *_judged(file, pupil, key, known, file.said.modes_pitch_m),
+        *remarks_on_crops(file, crops),
+    )
     modes = TabulatedModes(
         cube=_opd(file, cube),
         pitch_m=file.said.modes_pitch_m,
@@ -334,17 +374,20 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     return modes, remarks
 
 
-def _combined(file: MirrorSection, cube: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return the modes that influence functions make."""
+def _strokes(file: MirrorSection, n_actuators: int) -> NDArray[np.floating] | None:
+    """Return strokes ``(n_actuators, n_modes)`` of modes made of influence functions.
+
+    None: each makes a mode by itself.
+    """
     if file.said.basis is BasisKind.ZONAL:
-        return cube
-    strokes = _mode_to_actuator(file, len(cube))
+        return None
+    strokes = _mode_to_actuator(file, n_actuators)
     if strokes is None:
         raise ConfigurationError(
             f"{file.where('mode_to_actuator')}: missing, mirror.influence_functions needs it, or "
             'basis = "zonal" for the actuators themselves'
         )
-    return np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
+    return strokes
 
 
 def _judged(

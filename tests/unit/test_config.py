@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.config import Settings, load_instrument, load_settings, packaged_file
-from service.config.mirrors import coincident, grid, rings, typical_pitch
+from service.config.mirrors import coincident, grid, hexagonal, rings, typical_pitch
 from service.errors import ConfigurationError, ModelError
 from service.model.instrument import instrument_sha256
 from service.model.kinds import Influence, LoopFacts, Normalisation, SignalKind, SlopeOrder, Stop
@@ -79,6 +79,29 @@ def test_an_11_by_11_grid_in_a_circle_has_the_97_actuators_of_an_alpao_dm97():
 
 def test_a_17_by_17_grid_in_a_circle_has_the_241_actuators_of_an_alpao_dm241():
     assert len(grid(17, 1.5e-3, 17.5 * 1.5e-3)) == 241
+
+
+def test_a_hexagonal_layout_has_six_neighbours_each_and_one_in_the_middle():
+    positions = hexagonal(0.5, 5 * 0.5)
+    assert len(positions) == 1 + 6 + 6 + 6
+    apart = np.linalg.norm(positions[:, None] - positions, axis=2)
+    middle = int(np.argmin(np.hypot(*positions.T)))
+    np.testing.assert_allclose(positions[middle], 0.0, atol=1e-12)
+    for one in range(len(positions)):
+        if np.hypot(*positions[one]) < 0.8:
+            np.testing.assert_allclose(np.sort(apart[one])[1:7], 0.5)
+    assert typical_pitch(positions) == pytest.approx(0.5)
+    mirrored = np.linalg.norm(positions[:, None] - positions * [1, -1], axis=2)
+    assert mirrored.min(axis=1).max() < 1e-12
+
+
+def test_a_file_may_ask_for_a_hexagonal_layout(write):
+    mirror = '[mirror]\nlayout = "hexagonal"\npitch_m = 0.5\ndiameter_m = 8.5\n'
+    bench = load_instrument(write(ABOUT + APART + mirror + MODES))
+    np.testing.assert_allclose(bench.mirror.positions_m, hexagonal(0.5, 8.5))
+    assert bench.mirror.pitch_m == 0.5
+    message = refusal(load_instrument, write(ABOUT + APART + mirror + "n_across = 9\n" + MODES))
+    assert 'n_across: belongs to layout = "grid"' in message
 
 
 def test_a_grid_keeps_the_points_that_lie_on_its_circle():
@@ -571,6 +594,86 @@ def test_influence_functions_and_a_matrix_make_modes(write, tmp_path):
     )
     zonal = load_instrument(write(ABOUT + WFS + mirror + 'basis = "zonal"\n'))
     np.testing.assert_array_equal(zonal.mirror.cube, functions)
+
+
+def test_a_surface_of_influence_functions_counts_twice_not_four_times(write, tmp_path):
+    save(tmp_path / "ifs.h5", cube=np.random.default_rng(3).normal(size=(5, 90, 90)), m2c=np.eye(5))
+    mirror = '[mirror]\ninfluence_functions = "ifs.h5:/cube"\nmodes_pitch_m = 0.1\n'
+    mirror += 'mode_to_actuator = "ifs.h5:/m2c"\n'
+    opd = load_instrument(write(ABOUT + WFS + mirror))
+    surface = load_instrument(write(ABOUT + WFS + mirror + 'modes_kind = "surface"\n'))
+    np.testing.assert_allclose(surface.mirror.cube, 2.0 * opd.mirror.cube)
+
+
+CROPPED = (
+    '[mirror]\ninfluence_functions = "ifs.h5:/crops"\ninfluence_origin = "ifs.h5:/origin"\n'
+    "influence_table = [90, 92]\nmodes_pitch_m = 0.1\n"
+)
+
+
+def cropped_functions():
+    """Bumps on a grid, some of them over the rim of the table; whole and cropped."""
+    y, x = np.mgrid[:90, :92]
+    places = [(r, c) for r in range(2, 90, 9) for c in range(3, 92, 9)]
+    radius = [np.hypot(y - r, x - c) for r, c in places]
+    whole = np.array(
+        [np.where(d < 10, np.cos(np.pi * np.minimum(d, 10) / 20) ** 4, 0) for d in radius]
+    )
+    around = np.pad(whole, ((0, 0), (10, 10), (10, 10)))
+    crops = np.array(
+        [one[r : r + 21, c : c + 21] for one, (r, c) in zip(around, places, strict=True)]
+    )
+    return whole, crops, np.array(places) - 10
+
+
+def test_cropped_influence_functions_are_the_whole_ones(write, tmp_path):
+    whole, crops, origin = cropped_functions()
+    strokes = np.random.default_rng(4).normal(size=(len(whole), 7))
+    save(tmp_path / "ifs.h5", cube=whole, crops=crops, origin=origin, m2c=strokes)
+    for modes in ('mode_to_actuator = "ifs.h5:/m2c"\n', 'basis = "zonal"\n'):
+        bench = load_instrument(write(ABOUT + WFS + CROPPED + modes))
+        dense = CROPPED.partition("influence_origin")[0].replace("crops", "cube")
+        dense += "modes_pitch_m = 0.1\n"
+        full = load_instrument(write(ABOUT + WFS + dense + modes, "full.toml"))
+        np.testing.assert_allclose(bench.mirror.cube, full.mirror.cube, atol=1e-12)
+        assert bench.mirror.known.all()
+        assert not any("cut where" in remark for remark in bench.remarks)
+
+
+def test_functions_that_are_cropped_too_far_are_remarked_on(write, tmp_path):
+    _, crops, origin = cropped_functions()
+    save(tmp_path / "ifs.h5", crops=crops[:, 5:-5, 5:-5], origin=origin + 5)
+    (remark,) = [
+        r
+        for r in load_instrument(write(ABOUT + WFS + CROPPED + 'basis = "zonal"\n')).remarks
+        if "cut where" in r
+    ]
+    assert "cut where a function still has 25% of its height" in remark
+
+
+@pytest.mark.parametrize(
+    ("change", "origin", "expected"),
+    [
+        (
+            ("influence_table = [90, 92]\n", ""),
+            None,
+            "influence_table: missing beside mirror.influ",
+        ),
+        (("[90, 92]", "[90000, 92000]"), None, "100 modes over 90000 x 92000 points, 6624.0 GB"),
+        (("[90, 92]", "[90]"), None, "mirror.influence_table"),
+        ((":/origin", ":/none"), None, "no dataset /none"),
+        (("", ""), np.zeros((3, 2)), "found shape (3, 2), expected (100, 2): row and column"),
+        (("", ""), np.full((100, 2), 0.5), "rows or columns that are no whole numbers"),
+        (("", ""), np.full((100, 2), 95), "found function 0 at row 95, column 95, expected all"),
+        (("influence_functions", "modes"), None, "has no meaning beside mirror.modes"),
+    ],
+)
+def test_crops_that_cannot_be_placed_are_refused(write, tmp_path, change, origin, expected):
+    _, crops, good = cropped_functions()
+    save(tmp_path / "ifs.h5", crops=crops, origin=good if origin is None else origin)
+    basis = "" if change[1] == "modes" else 'basis = "zonal"\n'
+    text = CROPPED.replace(*change) if change[0] else CROPPED
+    assert expected in refusal(load_instrument, write(ABOUT + WFS + text + basis))
 
 
 def test_arrays_come_from_fits_files_too(write, tmp_path):

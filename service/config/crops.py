@@ -1,0 +1,105 @@
+"""Measured influence functions that are cropped: each a patch at its place in the whole table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config.instrument_schema import MirrorTable, Section
+from service.config.sources import refuse
+from service.errors import ConfigurationError
+from service.files.container import MAX_BYTES
+
+_CUT = 0.01
+"""Share of the height that a function may have at the rim of its crop."""
+
+
+def modes_of_crops(
+    file: Section[MirrorTable],
+    crops: NDArray[np.floating],
+    strokes: NDArray[np.floating] | None,
+) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+    """Return modes ``(n_modes, ny, nx)`` of crops ``(n_actuators, p, q)``, and where one is given.
+
+    ``strokes`` are ``(n_actuators, n_modes)``; None: each function is a mode.
+
+    Raises
+    ------
+    ConfigurationError
+        One line: the table or a place in it is missing or wrong, or the modes are too large.
+    """
+    shape = file.said.influence_table
+    if shape is None:
+        raise ConfigurationError(
+            f"{file.where('influence_table')}: missing beside mirror.influence_origin"
+        )
+    if not np.isfinite(crops).all():
+        refuse(file.where("influence_functions"), "a height that is not finite", "numbers alone")
+    n_modes = len(crops) if strokes is None else strokes.shape[1]
+    n_bytes = n_modes * shape[0] * shape[1] * crops.dtype.itemsize
+    if n_bytes > MAX_BYTES:
+        refuse(
+            file.where("influence_table"),
+            f"{n_modes} modes over {shape[0]} x {shape[1]} points, {n_bytes / 1e9:.1f} GB",
+            f"at most {MAX_BYTES / 1e9:.2g} GB: a coarser table, or fewer modes",
+        )
+    modes, known = np.zeros((n_modes, *shape), crops.dtype), np.zeros(shape, np.bool_)
+    for k, (at, part) in enumerate(_placed(crops, _origins(file, crops, shape), shape)):
+        known[at] = True
+        if strokes is None:
+            modes[k][at] = part
+        else:
+            modes[:, *at] += np.multiply.outer(strokes[k].astype(crops.dtype), part)
+    return modes, known
+
+
+def remarks_on_crops(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[str, ...]:
+    """Return a note where functions are cut before they have come down to nothing."""
+    if file.said.influence_origin is None:
+        return ()
+    rim = np.abs(crops)
+    highest = max(float(rim.max()), float(np.finfo(rim.dtype).tiny))
+    rim[:, 1:-1, 1:-1] = 0
+    left = float(rim.max()) / highest
+    if left <= _CUT:
+        return ()
+    return (
+        f"{file.where('influence_functions')}: cut where a function still has {left:.0%} of its "
+        "height: the surface has steps there; crop less",
+    )
+
+
+def _origins(
+    file: Section[MirrorTable], crops: NDArray[np.floating], shape: tuple[int, int]
+) -> NDArray[np.intp]:
+    """Return the row and column at which each crop begins, ``(n_actuators, 2)``."""
+    where, origins = file.where("influence_origin"), file.array("influence_origin")
+    if origins.shape != (len(crops), 2):
+        refuse(where, f"shape {origins.shape}", f"({len(crops)}, 2): row and column for each")
+    if not np.array_equal(origins, np.rint(origins)):
+        refuse(where, "rows or columns that are no whole numbers", "points of the table")
+    outside = np.any((origins >= shape) | (origins + crops.shape[1:] <= 0), axis=1)
+    if outside.any():
+        row, column = origins[outside][0]
+        refuse(
+            where,
+            f"function {int(np.argmax(outside))} at row {row:g}, column {column:g}",
+            f"all of them on the table of {shape[0]} x {shape[1]} points",
+        )
+    return origins.astype(np.intp)
+
+
+def _placed(
+    crops: NDArray[np.floating], origins: NDArray[np.intp], shape: tuple[int, int]
+) -> Iterator[tuple[tuple[slice, slice], NDArray[np.floating]]]:
+    """Yield where each crop lies on the table, and as much of it as does."""
+    for crop, (row, column) in zip(crops, origins.tolist(), strict=True):
+        rows = slice(max(row, 0), min(row + crop.shape[0], shape[0]))
+        columns = slice(max(column, 0), min(column + crop.shape[1], shape[1]))
+        seen = (
+            slice(rows.start - row, rows.stop - row),
+            slice(columns.start - column, columns.stop - column),
+        )
+        yield (rows, columns), crop[seen]

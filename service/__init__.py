@@ -1,3 +1,3 @@
-"""pyrcal: the calibration service of an adaptive telescope with a pyramid sensor."""
+"""pyrcal: the calibration service of an adaptive telescope."""
 
 __version__ = "0.1.0"

@@ -34,7 +34,7 @@ REQUESTS_WITHIN_S = 2
 longer."""
 
 _DESCRIPTION = """
-Calibration service of an adaptive telescope with a pyramid wavefront sensor.
+Calibration service of an adaptive telescope.
 
 Shifts are in subapertures, angles in degrees, magnification is a ratio; every number has its unit
 in its name. Times are nanoseconds since the Unix epoch, UTC. A number that is not known or not

@@ -15,10 +15,10 @@ from sim_rtc.telescope.detector import FLAO_PRESETS
 _USAGE = "pyrcal sim [options]    (or: python -m sim_rtc [options])"
 
 _DESCRIPTION = """\
-Simulated real-time computer of an adaptive telescope with a pyramid sensor. It closes the loop on
-frozen-flow turbulence at the frame rate, publishes telemetry over zenoh, and takes dithers, loop
-commands, gain ramps, measurements and reconstructors, as the service's wire contract says. Its
-mirror is mis-registered on the sensor by an amount that it tells nobody on the wire.
+Simulated real-time computer of an adaptive telescope. It closes the loop on frozen-flow turbulence
+at the frame rate, publishes telemetry over zenoh, and takes dithers, loop commands, gain ramps,
+measurements and reconstructors, as the service's wire contract says. Its mirror is mis-registered
+on the sensor by an amount that it tells nobody on the wire.
 """
 
 _PRESETS = "\n".join(
@@ -30,9 +30,10 @@ _PRESETS = "\n".join(
 _EPILOG = f"""\
 plants
   linear       one matrix, real time at 1 kHz; an optical gain of its own invention.
-  diffractive  the field of the pyramid for every frame: the optical gain is what the residual
-               wavefront makes it. Other influence functions and pupil grid than the service's.
-               150 to 200 frames a second on one core; timestamps follow the loop's own time.
+  diffractive  the field of the sensor for every frame: the optical gain is what the residual
+               wavefront makes it, centroids are those of noisy pixels. Other influence functions
+               and pupil grid than the service's. 150 to 200 frames a second of FLAO on one core;
+               timestamps follow the loop's own time.
 
 presets
   --preset flao looks at the magnitude:

@@ -100,7 +100,7 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     )
     modes = "basis indices to use, like 0:400 (400 is not) or 3,5,9; default all"
     start = "start of the fit: subapertures, degrees, ratio"
-    flux = "mean counts of the four pupil images, array flux (4, n, n), to light the model"
+    flux = "mean counts of a pyramid's four images, array flux (4, n, n), to light the model"
     reference = "a flux map of another day: report how far the light has turned since"
     arms = "the spider's arms at rotation 0: report the rotation of their shadows in the flux map"
     add(

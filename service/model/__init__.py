@@ -1,1 +1,1 @@
-"""The optics: pupil, mirror, modes, pyramid, registration, D(α). Pure numerics."""
+"""The optics: pupil, mirror, modes, sensors, registration, D(α). Pure numerics."""

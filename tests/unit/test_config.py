@@ -157,6 +157,25 @@ def test_every_value_of_the_packaged_soul_names_its_source():
     assert "[mirror] # [L]" in "\n".join(lines)
 
 
+def test_the_packaged_gpao_is_what_its_sources_say():
+    """Table B.1 of aa55666-25: the pupil fills 97.0 % of 40, the pitch is 102.8 % of one."""
+    gpao = load_instrument("gpao-ut")
+    assert gpao.wfs.kind == "shack-hartmann"
+    assert gpao.wfs.n_subapertures == 40
+    assert gpao.wfs.pupil_diameter == pytest.approx(0.970 * 40)
+    assert gpao.mirror.pitch_m / gpao.subaperture_m == pytest.approx(1.028, abs=1e-3)
+    assert len(gpao.mirror.positions_m) == 1433
+    assert gpao.wfs.pixel_lambda_over_d(gpao.subaperture_m) == pytest.approx(1.0, abs=0.01)
+    assert not gpao.remarks
+
+
+def test_every_value_of_the_packaged_gpao_names_its_source():
+    lines = packaged_file("gpao-ut").read_text(encoding="utf-8").splitlines()
+    values = [line for line in lines if "=" in line and not line.startswith("#")]
+    named = re.compile(r"# (\[[AW]\]|ours)")
+    assert [value for value in values if not named.search(value)] == ['name = "gpao-ut"']
+
+
 def test_a_users_file_gives_an_instrument(write):
     pins = 'basis_id = "kl-7"\nconfig_id = "b1"\ndouble_pass = true\n'
     extra = 'influence = "gaussian"\ncoupling = 0.2\n'
@@ -421,7 +440,9 @@ def test_an_unknown_mode_names_those_that_are_known(write):
 
 
 def test_an_unknown_packaged_name_lists_the_known_ones():
-    assert "neither a packaged name (flao-lbt, soul-lbt)" in refusal(load_instrument, "flao-lbtt")
+    assert "neither a packaged name (flao-lbt, gpao-ut, soul-lbt)" in refusal(
+        load_instrument, "flao-lbtt"
+    )
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):

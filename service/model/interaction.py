@@ -18,7 +18,7 @@ from typing_extensions import override
 
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
-from service.model.local import LocalShapes, Patch, Shapes, tiles_of
+from service.model.local import LocalShapes, Patch, Shapes, beside, tiles_of
 from service.model.misregistration import Misregistration, rotation
 from service.model.modes import Basis, ModalBasis
 from service.model.pupil import Illumination, instrument_pupil
@@ -118,11 +118,12 @@ class InteractionModel:
         ----------
         Heritier et al. 2018, equation 6: D = M_WFS M_DM.
         """
-        return self.seen(alpha, self._rendered(alpha))
+        return self._as_listed(self.seen(alpha, self._rendered(alpha)))
 
     def derivatives(self, alpha: Misregistration) -> Array:
         """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
-        return np.stack([*self._shift_derivatives(alpha), *self._shape_derivatives(alpha)])
+        _, *rates = self._with_rates(alpha)
+        return np.stack([self._as_listed(rate) for rate in rates])
 
     def stretch_derivatives(self, alpha: Misregistration) -> Array:
         """Return how D changes with an anamorphosis of the mirror's image, ``(2, ...)``.
@@ -132,10 +133,12 @@ class InteractionModel:
         """
         turn = rotation(alpha.rotation_rad)
 
-        def rate(way: Array) -> Array:
-            return self.seen(alpha, self._moved(alpha, lambda at: at @ way))
-
-        return np.stack([rate(turn.T * [-1.0, 1.0] @ turn), rate(-turn.T[:, ::-1] @ turn)])
+        stretch, askew = turn.T * [-1.0, 1.0] @ turn, -turn.T[:, ::-1] @ turn
+        moved = [
+            self._moved(alpha, lambda at: at @ stretch),
+            self._moved(alpha, lambda at: at @ askew),
+        ]
+        return np.stack(self._seen_together(alpha, moved))
 
     def width_derivative(self, alpha: Misregistration) -> Array:
         """Return how D changes with the logarithm of the influence functions' width.
@@ -147,10 +150,13 @@ class InteractionModel:
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return D(α) and its derivatives together."""
+        matrix, *rates = self._with_rates(alpha)
         return Linearisation(
             alpha=alpha,
-            matrix=self.interaction_matrix(alpha).astype(np.float32),
-            derivatives=self.derivatives(alpha).astype(np.float32),
+            matrix=np.ascontiguousarray(self._as_listed(matrix), np.float32),
+            derivatives=np.stack([self._as_listed(rate) for rate in rates]).astype(
+                np.float32, copy=False
+            ),
         )
 
     def seen(self, alpha: Misregistration, shapes: Shapes) -> Array:
@@ -202,20 +208,34 @@ class InteractionModel:
         moved = alpha.vector - np.array([*shift, 0.0, 0.0])
         return self._modes.get(tuple(moved), lambda: self._moved(alpha, None))
 
-    def _shape_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
-        return (
-            self.seen(alpha, self._moved(alpha, lambda at: at[:, ::-1] * [1.0, -1.0])),
-            self.seen(alpha, self._moved(alpha, lambda at: -at / alpha.magnification)),
-        )
+    def _as_listed(self, rows: Array) -> Array:
+        """Return rows ``(n_slopes, ...)`` as whoever asked this model knows them."""
+        return rows
 
-    def _shift_derivatives(self, alpha: Misregistration) -> tuple[Array, Array]:
-        if self.instrument.stop is Stop.TELESCOPE:
-            step_x, step_y = -rotation(alpha.rotation_rad) / alpha.magnification
-            return (
-                self.seen(alpha, self._moved(alpha, lambda at: np.broadcast_to(step_x, at.shape))),
-                self.seen(alpha, self._moved(alpha, lambda at: np.broadcast_to(step_y, at.shape))),
-            )
-        return self._at(self._image_shift(alpha)).shift_rates(self._rendered(alpha))
+    def _with_rates(self, alpha: Misregistration) -> list[Array]:
+        """Return D and its four derivatives."""
+        rendered = self._rendered(alpha)
+        shapes = [
+            rendered,
+            self._moved(alpha, lambda at: at[:, ::-1] * [1.0, -1.0]),
+            self._moved(alpha, lambda at: -at / alpha.magnification),
+        ]
+        if self.instrument.stop is Stop.MIRROR:
+            matrix, *turned = self._seen_together(alpha, shapes)
+            shifted = self._at(self._image_shift(alpha)).shift_rates(rendered)
+            return [matrix, *shifted, *turned]
+        step_x, step_y = -rotation(alpha.rotation_rad) / alpha.magnification
+        shapes[1:1] = [
+            self._moved(alpha, lambda at: np.broadcast_to(step_x, at.shape)),
+            self._moved(alpha, lambda at: np.broadcast_to(step_y, at.shape)),
+        ]
+        return self._seen_together(alpha, shapes)
+
+    def _seen_together(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
+        """Return the signals of each of some shapes, with one response for all if none is kept."""
+        if self.sensor.keeps_gradient:
+            return [self.seen(alpha, one) for one in shapes]
+        return np.split(self.seen(alpha, beside(shapes)), len(shapes), axis=1)
 
     def _moved(self, alpha: Misregistration, way: Way | None) -> Shapes:
         """Return the modes where α puts them or, with a way, their rates along it."""
@@ -284,26 +304,18 @@ class RtcInteractionModel(InteractionModel):
         """``(n_modes,)`` slopes per unit of command over the drawing's; None: as drawn."""
 
     @override
-    def interaction_matrix(self, alpha: Misregistration) -> Array:
-        """Return D(α), ``(n_slopes, n_modes)``, as the RTC lists slopes and its modes answer."""
-        return self._answered(self._listed(super().interaction_matrix(alpha)))
-
-    @override
-    def derivatives(self, alpha: Misregistration) -> Array:
-        """Return dD/dα ``(4, n_slopes, n_modes)``, as the RTC lists and its modes answer."""
-        every = np.stack([self._listed(matrix) for matrix in super().derivatives(alpha)])
-        return self._answered(every)
+    def _as_listed(self, rows: Array) -> Array:
+        """Return rows as the RTC lists slopes, columns as its modes answer."""
+        listed = self._listed(rows)
+        if self._mode_response is None:
+            return listed
+        return np.asarray(listed * self._mode_response.astype(listed.dtype))
 
     @override
     def unknown_rows(self, alpha: Misregistration) -> NDArray[np.bool_]:
         """Return which of the RTC's slopes lie near unknown surface, ``(n_slopes,)``."""
         marks = self._listed(super().unknown_rows(alpha).astype(np.float32))
         return np.asarray(marks != 0.0)
-
-    def _answered(self, columns: Array) -> Array:
-        if self._mode_response is None:
-            return columns
-        return np.asarray(columns * self._mode_response.astype(columns.dtype))
 
     def _listed(self, rows: Array) -> Array:
         recipe = self.instrument.slopes

@@ -7,7 +7,7 @@ not thousands: what a sensor makes of the tile is multiplied by those, and the m
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -67,14 +67,17 @@ class LocalShapes:
     """``(n_functions, n_shapes)`` the weights of the functions in every shape; None: every function
     is a shape."""
 
+    n_layers: int = 1
+    """Sets of functions, combined alike, that stand beside one another: heights and rates, as many
+    as were put ``beside`` one another. Function j of layer k is number ``k n_functions + j``."""
+
     __array_ufunc__: ClassVar[None] = None
 
     @property
     def shape(self) -> tuple[int, int]:
         """``(n_points, n_shapes)``, as that of an array."""
-        if self.combination is None:
-            return self.n_points, self.n_functions
-        return self.n_points, int(self.combination.shape[1])
+        n_shapes = self.n_functions if self.combination is None else self.combination.shape[1]
+        return self.n_points, self.n_layers * int(n_shapes)
 
     @property
     def n_near(self) -> float:
@@ -93,7 +96,7 @@ class LocalShapes:
         return np.asarray(self.combined(self.sparse()))
 
     def sparse(self) -> Any:  # noqa: ANN401 - scipy has no types
-        """Return the functions ``(n_points, n_functions)``, sparse."""
+        """Return the functions of all layers ``(n_points, n_all_functions)``, sparse."""
         parts = [
             (
                 patch.weights[patch.tile.lit].ravel(),
@@ -103,30 +106,58 @@ class LocalShapes:
             for patch in self.patches
         ]
         values, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
-        shape = (self.n_points, self.n_functions)
+        shape = (self.n_points, self.n_all_functions)
         return scipy.sparse.csr_array((values, (rows, columns)), shape=shape)
 
     def __rmatmul__(self, rows: Any) -> Array:  # noqa: ANN401 - scipy has no types
         """Return ``rows`` times the shapes, ``(n_rows, n_shapes)``."""
         if scipy.sparse.issparse(rows):
             return self.combined(rows @ self.sparse())
-        by_function = np.zeros((self.n_functions, len(rows)), rows.dtype)
+        by_function = np.zeros((self.n_all_functions, len(rows)), rows.dtype)
         for patch in self.patches:
             heights = patch.weights[patch.tile.lit]
             by_function[patch.functions] += heights.T @ rows[:, patch.tile.places].T
         return self.combined(by_function.T)
 
+    @property
+    def n_all_functions(self) -> int:
+        """Functions of all layers."""
+        return self.n_layers * self.n_functions
+
     def combined(self, by_function: Any) -> Array:  # noqa: ANN401 - scipy has no types
-        """Return what is known of the functions, ``(n_rows, n_functions)``, of the shapes."""
-        if self.combination is not None:
-            return np.asarray(by_function @ self.combination)
-        if scipy.sparse.issparse(by_function):
-            return np.asarray(by_function.toarray())
-        return np.asarray(by_function)
+        """Return what is known of the functions, ``(n_rows, n_all_functions)``, of the shapes."""
+        known = by_function.toarray() if scipy.sparse.issparse(by_function) else by_function
+        if self.combination is None:
+            return np.asarray(known)
+        layers = np.split(known, self.n_layers, axis=1)
+        return np.hstack([layer @ self.combination for layer in layers])
 
 
 Shapes = Array | LocalShapes
 """Wavefronts at the lit points of a pupil: ``(n_points, n_shapes)``, or what makes them."""
+
+
+def beside(shapes: Sequence[Shapes]) -> Shapes:
+    """Return shapes of one pupil as one, their columns one after another: one response for all.
+
+    Local ones are the same functions, their heights or rates, in one combination.
+    """
+    arrays = [one for one in shapes if isinstance(one, np.ndarray)]
+    if len(arrays) == len(shapes):
+        return np.hstack(arrays)
+    local = [one for one in shapes if isinstance(one, LocalShapes)]
+    n_functions = local[0].n_functions
+    patches = [
+        Patch(
+            tile=layers[0].tile,
+            functions=np.concatenate(
+                [layer.functions + k * n_functions for k, layer in enumerate(layers)]
+            ),
+            weights=np.hstack([layer.weights for layer in layers]),
+        )
+        for layers in zip(*(one.patches for one in local), strict=True)
+    ]
+    return replace(local[0], patches=patches, n_layers=len(local))
 
 
 def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:

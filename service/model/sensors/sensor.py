@@ -65,6 +65,13 @@ class Sensor(Protocol):
     def n_signals(self) -> int:
         """Signals of a frame."""
 
+    @property
+    def keeps_gradient(self) -> bool:
+        """Whether a response keeps what it has once found for the shapes that come next.
+
+        Where it does not, shapes are better asked for together.
+        """
+
     def at(self, shift: tuple[float, float]) -> Response:
         """Return the response with the pupil's image moved by ``shift``, (x, y) subapertures."""
 

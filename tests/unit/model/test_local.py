@@ -12,7 +12,7 @@ import scipy
 from service.errors import ModelError
 from service.model.interaction import InteractionModel
 from service.model.kinds import BasisKind, Influence, Normalisation, SlopeOrder, Stop
-from service.model.local import LocalShapes, tiles_of
+from service.model.local import LocalShapes, beside, tiles_of
 from service.model.modes import ModalBasis, analytic_basis
 from service.model.pupil import instrument_pupil
 from service.model.sensors.shack_hartmann.description import ShackHartmann
@@ -96,6 +96,19 @@ def test_all_forms_of_local_shapes_are_the_modes():
     )
     assert shapes.shape == expected.shape
     assert shapes.n_near < 160
+
+
+def test_shapes_beside_one_another_are_seen_as_each_alone():
+    pupil, model, shapes = local_shapes()
+    turned = model._moved(SOMEWHERE, lambda at: at[:, ::-1] * [1.0, -1.0])
+    rows = np.random.default_rng(2).normal(size=(5, len(pupil.points)))
+    both = beside([shapes, turned])
+    apart = np.hstack([rows @ shapes, rows @ turned])
+    assert both.shape == (len(pupil.points), 2 * shapes.shape[1])
+    np.testing.assert_allclose(rows @ both, apart, atol=1e-11)
+    np.testing.assert_allclose(scipy.sparse.csr_array(rows) @ both, apart, atol=1e-11)
+    arrays = [shapes.array(), turned.array()]
+    np.testing.assert_allclose(rows @ beside(arrays), apart, atol=1e-11)
 
 
 def test_few_modes_are_cheaper_as_an_array():

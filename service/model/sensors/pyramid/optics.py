@@ -344,7 +344,7 @@ class PyramidOptics:
         def respond(along_y: Array, along_x: Array) -> Array:
             n_terms, n_lines, n_u = along_x.shape
             flat_x = along_x.reshape(n_terms, -1)
-            by_function = np.zeros((shapes.n_functions, n_lines), self.dtype)
+            by_function = np.zeros((shapes.n_all_functions, n_lines), self.dtype)
             for strip in strips.values():
                 product = along_y[:, strip[0][0].tile.rows].T @ flat_x
                 by_line = product.reshape(-1, n_lines, n_u).swapaxes(0, 1)

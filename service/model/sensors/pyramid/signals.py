@@ -28,6 +28,9 @@ from service.model.slopes import PLAIN, SlopeRecipe
 
 Array = NDArray[Any]
 
+_ROWS = 512
+"""Signals that are normalised at once."""
+
 
 def pyramid_sensor(
     instrument: Instrument,
@@ -143,7 +146,8 @@ class PyramidResponse:
 
     def apply(self, shapes: Shapes) -> Array:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
-        return self._per_metre(normalised_jacobian(self._to(shapes), self.sensor.valid))
+        light = self._to(shapes)
+        return self._per_metre(normalised_jacobian(light, self.sensor.valid, out=light.gradient))
 
     def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
         """Return how they change when the images move along x, and along y, per subaperture."""
@@ -226,15 +230,27 @@ def signals_of(images: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> 
     return signals, flux.mean(axis=-1, keepdims=True)
 
 
-def normalised_jacobian(response: LightGradient, valid: NDArray[np.bool_]) -> Array:
+def normalised_jacobian(
+    response: LightGradient, valid: NDArray[np.bool_], *, out: Array | None = None
+) -> Array:
     """Return the gradient of the normalised signals, ``(n_slopes, n_points)`` per radian.
 
-    Of a response to shapes: their signals, ``(n_slopes, n_shapes)``.
+    Of a response to shapes: their signals, ``(n_slopes, n_shapes)``. ``out`` may be the response's
+    own gradient.
     """
     signals, flux = signals_of(response.images, valid, response.recipe)
-    jacobian = response.gradient - _times(signals / flux, response.flux_gradient)
-    jacobian /= flux[:, None].astype(jacobian.dtype)
-    return np.asarray(jacobian)
+    slopes = signals / flux
+    divisor = np.broadcast_to(flux, slopes.shape)[:, None].astype(response.gradient.dtype)
+    jacobian = np.empty_like(response.gradient) if out is None else out
+    for start in range(0, len(slopes), _ROWS):
+        rows = slice(start, start + _ROWS)
+        own = response.flux_gradient
+        if own.ndim > 1:
+            own = own[np.arange(len(slopes))[rows] % len(own)]
+        moved = slopes[rows, None].astype(own.dtype) * own
+        np.subtract(response.gradient[rows], moved, out=jacobian[rows])
+        jacobian[rows] /= divisor[rows]
+    return jacobian
 
 
 def normalised_derivative(

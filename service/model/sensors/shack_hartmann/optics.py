@@ -49,6 +49,11 @@ class ShackHartmannSensor:
         """Two slopes for each valid subaperture."""
         return 2 * int(self.valid.sum())
 
+    @property
+    def keeps_gradient(self) -> bool:
+        """That K, which is sparse, is kept."""
+        return True
+
     @cached_property
     def spots(self) -> Spots:
         """Pixels and centroid."""

@@ -172,8 +172,9 @@ def left_over(peer: str, found: Measured, folder: Path) -> float:
     """Return the share of a peer's columns that the model does not explain at its registration."""
     wide = np.zeros((len(found.matrix), N_MODES))
     wide[:, MODES] = found.matrix
+    chosen = FitOptions(modes=np.array(MODES))
     case = Case(peer=peer, stop=Stop.TELESCOPE, alpha=SMALL)
-    report = _fit(case, replace(found, matrix=wide), None, folder, np.array(MODES))[0]
+    report = _fit(case, replace(found, matrix=wide), None, folder, chosen)[0]
     return float(report.fit.residual_fraction)
 
 
@@ -182,14 +183,15 @@ def registrations(oopao: PeerProcess, folder: Path) -> list[Row]:
     case = Case(peer="oopao", stop=Stop.TELESCOPE, alpha=SMALL, own_mirror=True)
     product, beside = read_product(measured(case))
     cube = beside["influence_functions"]
-    every, every_s = _fit(case, product, cube, folder, None)
+    every, every_s = _fit(case, product, cube, folder, FitOptions())
+    few = FitOptions(modes=np.arange(N_SPRINT))
     rows, setup_s = [], 0.0
     for alpha in FAR:
         answer, found = oopao.ask(do="sprint", alpha=alpha)
         setup_s = answer["setup_s"]
         wide = np.zeros((len(found.matrix), N_MODES))
         wide[:, :N_SPRINT] = found.matrix
-        report, took_s = _fit(case, replace(found, matrix=wide), cube, folder, np.arange(N_SPRINT))
+        report, took_s = _fit(case, replace(found, matrix=wide), cube, folder, few)
         off = np.array(answer["alpha"]) - np.array(alpha)
         rows.append(
             Row(
@@ -200,14 +202,15 @@ def registrations(oopao: PeerProcess, folder: Path) -> list[Row]:
                 remark=f"{_off(off)}; the fit {_off(error(_told(report), alpha))}",
             )
         )
-    fit_off = error(_told(every), in_degrees(SMALL))
+    fit_off = _off(error(_told(every), in_degrees(SMALL)))
+    sprint_s = setup_s + float(np.median([row.peer_s[0] for row in rows]))
     rows.append(
         Row(
-            what="α of 400 modes",
-            peer="OOPAO SPRINT with 20 modes, sensitivities and estimate",
+            what="α of 400 modes: axes, registration, rival explanations",
+            peer=f"OOPAO SPRINT with {N_SPRINT} modes, sensitivities and estimate",
             own_s=(every_s,),
-            peer_s=(setup_s + float(np.median([row.peer_s[0] for row in rows])),),
-            remark=f"the fit {_off(fit_off)}",
+            peer_s=(sprint_s,),
+            remark=f"the fit {fit_off}",
         )
     )
     return rows
@@ -229,14 +232,14 @@ def _off(off: Array) -> str:
 
 
 def _fit(
-    case: Case, found: Measured, cube: Array | None, folder: Path, modes: Array | None
+    case: Case, found: Measured, cube: Array | None, folder: Path, options: FitOptions
 ) -> tuple[FitReport, float]:
     """Return what ``pyrcal fit`` makes of a matrix, and the processor time it took."""
     reference, toml = folder / "reference.h5", folder / "instrument.toml"
     write_reference(reference, found, cube)
     write_instrument(toml, reference, case, found, LISTINGS[case.peer], case.stop)
     begun = time.process_time()
-    report = fit_file(load_instrument(str(toml)), reference, FitOptions(modes=modes), threads=1)
+    report = fit_file(load_instrument(str(toml)), reference, options, threads=1)
     return report, time.process_time() - begun
 
 

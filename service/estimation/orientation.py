@@ -246,13 +246,13 @@ class _Turned:
         lowest = low_order_of(model)
         points = model.pupil.points
 
-        def at(angle: int) -> Array:
-            return lowest.shapes.render(points @ rotation(ANGLES_RAD[angle]))
+        def at(angle_rad: float) -> Array:
+            return lowest.shapes.render(points @ rotation(angle_rad))
 
-        seen = [
-            model.seen(Misregistration(), shapes) for shapes in mapper(at, range(len(ANGLES_RAD)))
-        ]
-        columns = np.ascontiguousarray(np.array(seen).transpose(2, 0, 1), dtype=np.float64)
+        # one product for all: each by itself would read the whole sensor again
+        shapes = np.concatenate(list(mapper(at, ANGLES_RAD.tolist())), axis=1)
+        seen = model.seen(Misregistration(), shapes).reshape(model.n_slopes, len(ANGLES_RAD), -1)
+        columns = np.ascontiguousarray(seen.transpose(2, 1, 0), dtype=np.float64)
         return cls(lowest=lowest, columns=columns, valid=model.valid)
 
     def pose(self, target: Target, slopes: SlopeRecipe) -> Pose:

@@ -16,6 +16,7 @@
     │   ├── TooSlowError     a request or an upload that does not come in time
     │   └── BusyError        too much under way already: try again later
     ├── WorkerError          the worker process died; the job is lost, the service is not
+    ├── ClusterError         the Dask cluster is not there, is gone, or runs another version
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
         └── StorageError     the disk refuses: full, gone, or not to be written
 
@@ -106,6 +107,10 @@ class BusyError(CommandError):
 
 class WorkerError(PyrcalError):
     """The worker process died with a job in its hands."""
+
+
+class ClusterError(PyrcalError):
+    """The Dask cluster is not there, is gone, or runs another version; work can be done here."""
 
 
 class ArchiveError(PyrcalError):

@@ -105,7 +105,8 @@ class DiskCache:
         """
         if self._folder is None:
             return compute()
-        facts = (instrument_sha256(instrument), _code_sha256(), np.__version__, scipy.__version__)
+        code = code_sha256(Path(model_code.__file__).parent)
+        facts = (instrument_sha256(instrument), code, np.__version__, scipy.__version__)
         digest = hashlib.sha256(repr((facts, what)).encode()).hexdigest()
         path = self._folder / f"{instrument.name}-{what[0]}-{digest[:32]}{_SUFFIX}"
         found = _read(path)
@@ -159,9 +160,10 @@ def _read(path: Path) -> Arrays | None:
 
 
 @cache
-def _code_sha256() -> str:
-    """Return a digest of the model's own code: another version computes other numbers."""
+def code_sha256(*folders: Path) -> str:
+    """Return a digest of the code in folders: another version computes other numbers."""
     digest = hashlib.sha256()
-    for path in sorted(Path(model_code.__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -16,23 +16,25 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+from service.cli.program import status_of
 from service.config import load_settings
 from service.config.policy import floor_of
 from studies.campaign.night import play
 from studies.campaign.plan import Estimator, Night
 from studies.campaign.plots import plot
-from studies.campaign.rows import RowFile, floats, played, range_of, tell, words
+from studies.campaign.rows import RowFile, add_workers, floats, played, range_of, tell, words
 from studies.campaign.summary import table
 from studies.campaign.trouble import Trouble
 
 
 def main() -> int:
     """Run what is missing, then print the table."""
-    given = _parser().parse_args()
+    given = campaign_parser().parse_args()
     file = RowFile(given.output)
     nights = file.missing(_nights(given))
     started = time.monotonic()
-    for k, new in enumerate(played(partial(play, keep=given.keep), nights, given.workers), start=1):
+    rows = played(partial(play, keep=given.keep), nights, given.workers, given.cluster)
+    for k, new in enumerate(rows, start=1):
         file.add(*new)
         left_s = (time.monotonic() - started) / k * (len(nights) - k)
         sys.stderr.write(f"\r{k} of {len(nights)} nights, {left_s / 60:.0f} min left   ")
@@ -48,7 +50,8 @@ def main() -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def campaign_parser() -> argparse.ArgumentParser:
+    """Return the parser of ``pyrcal campaign``."""
     parser = argparse.ArgumentParser(
         prog="pyrcal campaign",
         description="Runs many simulated nights and compares what was estimated with the truth.",
@@ -85,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--modes", type=_modes, metavar="MODE,MODE...", help="that are dithered")
     parser.add_argument("--camera", choices=("ccd", "emccd"), default="ccd")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of sums to look at again")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    add_workers(parser, os.cpu_count() or 1)
     return parser
 
 
@@ -122,4 +125,4 @@ def _modes(text: str) -> tuple[int, ...]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(status_of(main, "pyrcal campaign"))

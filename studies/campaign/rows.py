@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import multiprocessing
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import fields
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from service.errors import ClusterError, say
+from service.runtime.cluster import Cluster
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -48,14 +52,45 @@ class RowFile:
             file.writelines(json.dumps(row) + "\n" for row in rows)
 
 
-def played(play: Callable[[Plan], Result], plans: Iterable[Plan], workers: int) -> Iterator[Result]:
-    """Yield what comes of each plan, as it comes; several workers are processes of their own."""
+def played(
+    play: Callable[[Plan], Result], plans: Sequence[Plan], workers: int, cluster: str | None = None
+) -> Iterator[Result]:
+    """Yield what comes of each plan, as it comes; several workers are processes of their own.
+
+    With the address of a ``cluster`` plans are tasks of its workers; what is left when it is gone
+    is played here.
+
+    Raises
+    ------
+    ClusterError
+        If there is no such cluster, or it runs another version; nothing has been played then.
+    """
+    left = dict(enumerate(plans))
+    if cluster is not None and left:
+        with Cluster(cluster) as helpers:
+            try:
+                for number, result in helpers.each(play, plans):
+                    del left[number]
+                    yield result
+            except ClusterError as error:
+                sys.stderr.write("\n")
+                say(f"{error}; the other {len(left)} are played here, --workers {workers}")
     if workers == 1:
-        yield from map(play, plans)
+        yield from map(play, left.values())
         return
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as executor:
-        for finished in as_completed([executor.submit(play, plan) for plan in plans]):
+        for finished in as_completed([executor.submit(play, plan) for plan in left.values()]):
             yield finished.result()
+
+
+def add_workers(parser: argparse.ArgumentParser, usual: int) -> None:
+    """Add the options that say where nights are played."""
+    parser.add_argument("--workers", type=int, default=usual, help="processes here")
+    parser.add_argument(
+        "--cluster",
+        metavar="tcp://HOST:PORT",
+        help="a running Dask scheduler, whose workers play them (extra 'cluster')",
+    )
 
 
 def heading(*columns: str) -> str:

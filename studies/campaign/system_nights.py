@@ -17,6 +17,7 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
+from service.cli.program import status_of
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.runtime.worker import Compute, OpticsWorker, Sampling
@@ -24,7 +25,7 @@ from service.tracking.state import Mode
 from service.wire import DitherRequest
 from studies.campaign.observatory import Observatory
 from studies.campaign.observatory_dome import replayed
-from studies.campaign.rows import Row, RowFile, floats, played, range_of, tell, words
+from studies.campaign.rows import Row, RowFile, add_workers, floats, played, range_of, tell, words
 from studies.campaign.system_cases import Case, Plan
 from studies.campaign.system_measures import row_of, wavefront_rms_nm
 from studies.campaign.system_table import table
@@ -39,7 +40,7 @@ def main() -> int:
     file = RowFile(given.output)
     plans = file.missing(_plans(given))
     started = time.monotonic()
-    for k, row in enumerate(played(play, plans, given.workers), start=1):
+    for k, row in enumerate(played(play, plans, given.workers, given.cluster), start=1):
         file.add(row)
         spent_min = (time.monotonic() - started) / 60.0
         sys.stderr.write(f"\r{k} of {len(plans)} nights in {spent_min:.0f} min   ")
@@ -116,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KEY=VALUE",
         help="a setting of the service, like dither.window_s=5; may be repeated",
     )
-    parser.add_argument("--workers", type=int, default=1)
+    add_workers(parser, 1)
     return parser
 
 
@@ -140,4 +141,4 @@ def _plans(given: argparse.Namespace) -> Iterator[Plan]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(status_of(main, "system_nights"))

@@ -234,7 +234,7 @@ def status(words):
     except SystemExit as ended:
         return ended.code
 found = [status(words) for words in json.loads(sys.argv[1])]
-late = {"numpy", "scipy", "h5py", "zenoh", "fastapi", "uvicorn", "httpx"} & set(sys.modules)
+late = {"numpy", "scipy", "h5py", "zenoh", "fastapi", "uvicorn", "httpx", "dask"} & set(sys.modules)
 print(json.dumps([found, sorted(late)]), file=sys.stderr)
 """
 

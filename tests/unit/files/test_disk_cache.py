@@ -58,7 +58,7 @@ def test_another_instrument_has_other_modes_whatever_its_name(tmp_path, counted)
 
 def test_another_version_of_the_model_finds_nothing(tmp_path, counted, monkeypatch):
     DiskCache(tmp_path).basis(small_instrument())
-    monkeypatch.setattr(disk_cache, "_code_sha256", lambda: "another")
+    monkeypatch.setattr(disk_cache, "code_sha256", lambda *_: "another")
     DiskCache(tmp_path).basis(small_instrument())
     assert len(counted) == 2
 

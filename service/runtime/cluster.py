@@ -1,0 +1,258 @@
+"""Tasks on a running Dask cluster whose workers run this very version of pyrcal.
+
+Quick to import: ``distributed`` (the extra ``cluster``) is imported where a cluster is asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import scipy
+
+import service
+from service.errors import ClusterError, shown
+from service.files.disk_cache import code_sha256
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Versions = Mapping[str, str]
+
+CONNECT_S = 5.0
+"""A scheduler that does not answer within so long is not there."""
+
+FETCH_S = 30.0
+"""A result that has not come within so long is asked for anew."""
+
+LOOK_S = 1.0
+"""Between two looks whether scheduler and workers are still there."""
+
+EMPTY_S = 20.0
+"""A cluster that has had no worker for so long has lost them: a nanny restarts one in less."""
+
+PACKAGES = ("service", "sim_rtc", "studies")
+"""Whose code a task may run."""
+
+
+class Cluster:
+    """A running Dask scheduler with its workers, all of the versions that run here.
+
+    A worker that dies costs its tasks' time: another one does them again.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Connect to the scheduler at ``address``, like ``tcp://HOST:8786``.
+
+        Raises
+        ------
+        ClusterError
+            If there is none, it has no worker, or one runs another version.
+        """
+        self.address = address
+        self._client = _connected(address)
+        self._seen_s = time.monotonic()
+        try:
+            self._check_versions()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Cluster:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave the cluster; what is under way there is called off."""
+        self.close()
+
+    def close(self) -> None:
+        """Leave the cluster."""
+        with contextlib.suppress(Exception):  # of one that is gone
+            self._client.close(timeout=1.0)
+
+    @property
+    def _start(self) -> str:
+        return f"start some with: dask worker --nthreads 1 {self.address}"
+
+    @property
+    def n_threads(self) -> int:
+        """Tasks that run at the same time.
+
+        Raises
+        ------
+        ClusterError
+            If the scheduler does not answer.
+        """
+        return sum(worker["nthreads"] for worker in self._workers().values())
+
+    def each(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the number of an item and what the function makes of it, as they come.
+
+        What the function raises is raised here.
+
+        Raises
+        ------
+        ClusterError
+            If the scheduler or all workers are gone, or a worker that came later runs another
+            version.
+        """
+        task = partial(_perform, function, own_versions())
+        waiting = dict(zip(self._submitted(task, items), range(len(items)), strict=True))
+        try:
+            while waiting:
+                for future in self._finished(waiting):
+                    yield waiting.pop(future), self._result_of(future)
+        finally:
+            with contextlib.suppress(Exception):  # of one that is gone
+                self._client.cancel(list(waiting))
+
+    def _submitted(self, task: Callable[[Item], Result], items: Sequence[Item]) -> list[Future]:
+        try:
+            return list(self._client.map(task, items, pure=False))
+        except Exception as error:
+            raise self._lost(error) from error
+
+    def _finished(self, waiting: Mapping[Future, int]) -> list[Future]:
+        """Wait for one of them at least, and return those that are done."""
+        from distributed import CancelledError, wait
+
+        while True:
+            with self._client.as_current(), contextlib.suppress(TimeoutError, CancelledError):
+                wait(list(waiting), timeout=LOOK_S, return_when="FIRST_COMPLETED")
+            done = [future for future in waiting if future.done()]
+            if done:
+                return done
+            self._look()
+
+    def _look(self) -> None:
+        """Refuse to wait any longer for what does not answer, or has no worker."""
+        if self._workers():
+            self._seen_s = time.monotonic()
+        elif time.monotonic() - self._seen_s > EMPTY_S:
+            raise ClusterError(
+                f"{self.address}: the cluster has had no worker for {EMPTY_S:.0f} s; {self._start}"
+            )
+
+    def _result_of(self, future: Future) -> Any:  # noqa: ANN401 - whatever the function returns
+        from distributed import KilledWorker
+
+        while True:
+            try:
+                return future.result(timeout=FETCH_S)
+            except KilledWorker as error:
+                raise ClusterError(
+                    f"{self.address}: a task has ended every worker that had it, last "
+                    f"{error.last_worker.address}; has it memory enough? (--memory-limit)"
+                ) from error
+            except Exception as error:
+                if future.status == "error":  # the task's own
+                    raise
+                if not isinstance(error, TimeoutError):
+                    raise self._lost(error) from error
+                self._look()  # its worker died with the result: another one makes it again
+
+    def _workers(self) -> dict[str, dict[str, Any]]:
+        client = self._client
+        try:
+            if client.status != "running":
+                raise OSError(f"connection {client.status}")
+            found = client.sync(client.scheduler.identity, callback_timeout=CONNECT_S, n_workers=-1)
+        except Exception as error:
+            raise self._lost(error) from error
+        return dict(found["workers"])
+
+    def _lost(self, error: BaseException) -> ClusterError:
+        why = shown(str(error).partition("\n")[0]) or type(error).__name__
+        return ClusterError(
+            f"{self.address}: the Dask scheduler does not answer any more ({why}); start it and "
+            "its workers again"
+        )
+
+    def _check_versions(self) -> None:
+        expected = own_versions()
+        try:
+            found: dict[str, Any] = self._client.run(own_versions, on_error="return")
+            found["the scheduler"] = self._client.run_on_scheduler(own_versions)
+        except Exception as error:
+            raise ClusterError(_other_version(self.address, "the scheduler", error)) from error
+        if len(found) == 1:
+            raise ClusterError(f"{self.address}: found a scheduler without workers; {self._start}")
+        for who, told in found.items():
+            if told != expected:
+                raise ClusterError(_other_version(self.address, who, told))
+
+
+@cache
+def own_versions() -> Versions:
+    """Return the versions of all that a task's result depends on, as they are in this process."""
+    import distributed
+
+    home = Path(service.__file__).parent.parent
+    code = code_sha256(*(home / name for name in PACKAGES))
+    return {
+        "pyrcal": f"{service.__version__} (code {code[:8]})",
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "distributed": distributed.__version__,
+    }
+
+
+def _perform(function: Callable[[Item], Result], expected: Versions, item: Item) -> Result:
+    """Do a task on a worker, also on one that has come after the others were asked."""
+    found = own_versions()
+    if found != expected:
+        raise ClusterError(_other_version(platform.node(), "a worker", found, expected))
+    return function(item)
+
+
+def _other_version(where: str, who: str, found: object, expected: Versions | None = None) -> str:
+    here = expected or own_versions()
+    if isinstance(found, dict):
+        names = [name for name in here if found.get(name) != here[name]]
+        what = ", ".join(f"{name} {found.get(name)}" for name in names)
+        meant = ", ".join(f"{name} {here[name]}" for name in names)
+        told = f"found {what}, expected {meant}"
+    else:
+        told = f"found no pyrcal that can be asked for its version ({shown(str(found))})"
+    return f"{where}: {who}: {told}; start scheduler and workers from this very installation"
+
+
+def _connected(address: str) -> Client:
+    try:
+        import dask.config
+
+        # what is wrong is told in our one line; theirs would be tracebacks beside it
+        quiet = dict.fromkeys(("distributed", "distributed.client"), "critical")
+        dask.config.set({"logging": quiet})
+        from distributed import Client
+    except ImportError as error:
+        raise ClusterError(
+            f"{address}: found no package distributed ({error}); install it: "
+            "pip install 'pyrcal[cluster]'"
+        ) from error
+    try:
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except Exception as error:
+        why = shown(str(error).partition("\n")[0])
+        raise ClusterError(
+            f"{address}: found no Dask scheduler there ({why}); start one with dask scheduler, or "
+            "leave --cluster out"
+        ) from error

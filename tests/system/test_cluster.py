@@ -1,0 +1,120 @@
+"""Campaigns on a real Dask scheduler, with workers that die, and a scheduler that does."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from service.errors import ClusterError
+from service.runtime.cluster import Cluster
+from tests.system.dask_cluster import dask_cluster
+from tests.system.night import INSTRUMENT, ROOT, wait_for
+from tests.system.pace import patience
+
+pytestmark = [pytest.mark.system, pytest.mark.long]
+
+N_NIGHTS = 6
+NIGHTS = (
+    f"--instrument={INSTRUMENT}",
+    "--n-controlled=45",
+    "--seconds=3",
+    f"--seeds=0:{N_NIGHTS}",
+)
+
+
+def campaign(rows, *words):
+    return subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "studies.campaign.system_nights",
+            *NIGHTS,
+            f"--output={rows}",
+            *words,
+        ],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process):
+    _, told = process.communicate(timeout=patience(90))
+    return process.returncode, told
+
+
+def rows_of(path):
+    """Return rows in order, without what each run has of its own: its time, its session's id."""
+    rows = sorted(map(json.loads, path.read_text().splitlines()), key=lambda row: row["seed"])
+    for row in rows:
+        del row["took_s"]
+        row["log"] = [line for line in row["log"] if line[2] != "rtc.session"]
+    return rows
+
+
+def n_rows(path):
+    return len(path.read_text().splitlines()) if path.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def played_here(tmp_path_factory):
+    path = tmp_path_factory.mktemp("here") / "rows.jsonl"
+    assert ended(campaign(path))[0] == 0
+    return rows_of(path)
+
+
+def test_a_worker_that_is_killed_changes_nothing_but_time(tmp_path, played_here):
+    with dask_cluster(tmp_path) as dask:
+        path = tmp_path / "rows.jsonl"
+        running = campaign(path, "--cluster", dask.address)
+        wait_for(lambda: n_rows(path), 60, "no row of the cluster's")
+        dask.workers[0].kill()
+        status, told = ended(running)
+    assert (status, "played here" in told) == (0, False)
+    assert rows_of(path) == played_here
+
+
+@pytest.mark.parametrize("how", ["kill", "stop"])
+def test_nights_that_a_lost_scheduler_leaves_are_played_here(tmp_path, played_here, how):
+    with dask_cluster(tmp_path) as dask:
+        path = tmp_path / "rows.jsonl"
+        running = campaign(path, "--cluster", dask.address)
+        wait_for(lambda: n_rows(path), 60, "no row of the cluster's")
+        dask.scheduler.send_signal({"kill": 9, "stop": 19}[how])
+        status, told = ended(running)
+    (line,) = [line for line in told.splitlines() if "played here" in line]
+    assert status == 0
+    assert line.startswith(f"{dask.address}: the Dask scheduler does not answer any more")
+    assert rows_of(path) == played_here
+
+
+def test_nights_without_any_worker_left_are_played_here_and_rows_are_resumed(tmp_path, played_here):
+    path = tmp_path / "rows.jsonl"
+    with dask_cluster(tmp_path, n_workers=1) as dask:
+        running = campaign(path, "--cluster", dask.address)
+        wait_for(lambda: n_rows(path), 60, "no row of the cluster's")
+        dask.workers[0].kill()
+        status, told = ended(running)
+        assert status == 0
+        assert "the cluster has had no worker for" in told
+        assert rows_of(path) == played_here
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+        refused = ended(campaign(path, "--cluster", dask.address))
+    assert refused[0] == 2
+    assert "found a scheduler without workers; start some with" in refused[1]
+    assert n_rows(path) == N_NIGHTS - 1
+
+
+def test_a_worker_of_another_pyrcal_is_named(tmp_path):
+    other = tmp_path / "other"
+    for package in ("service", "sim_rtc", "studies", "pyrcal"):
+        shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("manual"))
+    with (other / "service" / "errors.py").open("a") as file:
+        file.write("# of another day\n")
+    with dask_cluster(tmp_path, n_workers=1) as dask:
+        dask.add_worker(other)
+        with pytest.raises(ClusterError, match=r"found pyrcal .*\(code \w+\), expected pyrcal"):
+            Cluster(dask.address)

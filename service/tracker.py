@@ -19,6 +19,7 @@ from service.tracking import (
     offload,
     operator,
     passive_processing,
+    pointing_law,
     reconstructors,
     resume,
     rtc,
@@ -81,6 +82,7 @@ def step(
         interlocks.require(state, event, policy, now_ns)
     cause = cause or ev.new_id(ev.kebab(type(event)), now_ns)
     context = StepContext(state, policy, now_ns, cause)
+    event = pointing_law.event_of_now(context, event)
     derive_alarms(context)
     for part in (_react, _go_on):
         part(context, event)
@@ -96,6 +98,7 @@ def _react(context: StepContext, event: Event) -> None:
     reaction = REACTIONS.get(type(event))
     if reaction is not None:
         reaction(context, event)
+    pointing_law.follow_law(context)
     window_processing.reset_run(context)
     probation.advance(context, event)
     note_declined(context, rejected=isinstance(event, cmd.Reject))

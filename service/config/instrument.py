@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from service.config import instrument_schema as schema
 from service.config import packaged_file
+from service.config.laws import LawTable, law_of
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.pupils import read_pupil
 from service.config.sources import read_dataset, refuse
@@ -55,6 +56,7 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         frames = kind.frames(wfs.said, wfs.given)
     instrument = Instrument(
         **told,
+        law=law_of(section(LawTable).said),
         pupil=read_pupil(section(schema.AboutTable), pupil.subaperture_m),
         wfs=sensor,
         mirror=mirror,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 from pydantic import BeforeValidator, Field, create_model
 
 from service.config import instrument_path
+from service.config.laws import LawTable
 from service.config.sources import Id, Table, in_file, read_dataset, read_toml, refuse, validated
 from service.errors import ConfigurationError, ModelError
 from service.model import kinds
@@ -146,6 +147,7 @@ def whole_of(kind: SensorKind) -> type[Table]:
         "instrument": AboutTable,
         "wfs": kind.table,
         "mirror": MirrorTable,
+        "law": (LawTable, Field(default_factory=LawTable)),
         "modes": (kinds.KarhunenLoeve, Field(default_factory=kinds.KarhunenLoeve)),
         "slopes": (SlopesTable, Field(default_factory=SlopesTable)),
         "loop": (kinds.LoopFacts, Field(default_factory=kinds.LoopFacts)),

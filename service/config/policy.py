@@ -45,7 +45,7 @@ def floor_of(settings: Settings) -> NDArray[np.float64]:
 def policy_of(settings: Settings, instrument: Instrument | None = None) -> Policy:
     """Return the policy in numeric units: radians, rates per square root of a second.
 
-    ``instrument`` tells the modes of its sensor; None: it has none.
+    ``instrument`` tells the modes of its sensor and its law of pointing; None: it has neither.
     """
     dither, tracking, control = settings.dither, settings.tracking, settings.control
     per_minute = _vector(
@@ -103,6 +103,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         ),
         offloading=_offloading(settings.offload),
         sensor_modes={} if instrument is None else _sensor_modes(instrument),
+        law=None if instrument is None else instrument.law,
     )
 
 

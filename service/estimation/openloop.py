@@ -179,14 +179,17 @@ def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | Non
     return None
 
 
-def far_starts(instrument: Instrument, flux: bytes | None) -> tuple[Misregistration, ...]:
+def far_starts(
+    instrument: Instrument, flux: bytes | None, nominal: Misregistration | None = None
+) -> tuple[Misregistration, ...]:
     """Return where to start from when nothing is known, the likeliest first.
 
     With the mirror as stop the image of the pupil moves with it, so that its mean light tells the
     shift where a sensor can say how; rotation and magnification it does not tell. ``flux`` is as
-    the RTC sends it, in its own axes: it is used where these are the conventions'.
+    the RTC sends it, in its own axes: it is used where these are the conventions'. ``nominal`` is
+    where the mirror should be; None: as the instrument file has it.
     """
-    nominal = instrument.start
+    nominal = nominal or instrument.start
     turned = [replace(nominal, rotation_rad=nominal.rotation_rad + turn) for turn in _TURNS_RAD]
     lit = _lit_start(instrument, nominal, flux)
     return (*(() if lit is None else (lit,)), nominal, *turned)

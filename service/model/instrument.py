@@ -22,6 +22,7 @@ from service.model.kinds import (
     Telescope,
 )
 from service.model.misregistration import Misregistration
+from service.model.pointing_law import PointingLaw
 from service.model.slopes import SlopeRecipe
 
 if TYPE_CHECKING:
@@ -175,6 +176,9 @@ class Instrument(Telescope):
     pupil: PupilMap | None = None
     """Outline and obscurations as they are; None: a ring, with the spider's arms."""
 
+    law: PointingLaw | None = None
+    """Where the mirror lies at any pointing; None: at the same place."""
+
     sensor_modes: tuple[SensorMode, ...] = ()
     """Modes that the RTC may change to; ``config_id`` says which one ``wfs`` is of. Empty: it has
     one alone."""
@@ -242,7 +246,7 @@ class Instrument(Telescope):
         return self.mirror
 
 
-_LATER = frozenset({"unknown", "sensor_modes", "pupil", "spiders_m", "spiders_deg"})
+_LATER = frozenset({"unknown", "sensor_modes", "law", "pupil", "spiders_m", "spiders_deg"})
 """Fields without which an instrument has the digest that it has always had."""
 
 

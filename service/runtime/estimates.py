@@ -28,6 +28,7 @@ from service.tracking import events as ev
 from service.tracking.events import Event
 from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
 from service.tracking.passive_processing import fit_begins_at
+from service.tracking.pointing_law import start_of_fit
 from service.tracking.state import Level, TrackerState
 from service.wire import checksum
 
@@ -114,14 +115,14 @@ async def _outcome(
     window: EndedWindow, state: TrackerState, workers: WorkerPort, matrix_of: MatrixOf
 ) -> lockin.LockInEstimate | RandomEstimate | openloop.WideCaptureEstimate | WindowRefused:
     rtc, registration = state.loop.rtc, state.alpha.registration
-    start = None if registration is None else registration.alpha
+    alpha = None if registration is None else registration.alpha
+    start = start_of_fit(state, alpha, window.t_end_ns_utc)
     if isinstance(window, Correlated):
         return await workers.call(OpticsWorker.fit_random, window, start)
     if state.operations.acquisition.uses_wide_capture:
         flux = None if rtc is None else rtc.flux
-        return await workers.call(
-            OpticsWorker.find, window, state.operations.acquisition.alpha, flux
-        )
+        found, nominal = state.operations.acquisition.alpha, state.alpha.law.nominal
+        return await workers.call(OpticsWorker.find, window, found, flux, nominal)
     if rtc is None:
         return WindowRefused(reason="the RTC is not known", t_ns_utc=window.t_end_ns_utc)
     loop = ClosedLoop(
@@ -195,7 +196,7 @@ async def read_own_matrix(
     if record.judged is not None and workers.first is not None:
         return []
     registration = state.alpha.registration
-    near = None if registration is None else registration.alpha
+    near = state.alpha.law.nominal if registration is None else registration.alpha
     try:
         dialect = await workers.call(OpticsWorker.read_slope_convention, matrix, near)
         own, response = None, None

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from service.errors import CommandError, UnknownIdError
 from service.estimation.loop import why_open
+from service.model.pointing_law import ANGLES
 from service.tracking import (
     alarms,
     dither,
@@ -151,6 +152,10 @@ def _jump_suspected(context: StepContext) -> str | None:
     return registration.doubt if jump is None else jump.text
 
 
+def _law_not_followed(context: StepContext) -> str | None:
+    return context.alpha.law.problem or None
+
+
 RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     "stopped": _stopped,
     alarms.LOOP_OPEN: _loop_open,
@@ -163,6 +168,7 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     alarms.MODES_CONTRARY: mode_proof.contrary_text,
     alarms.MODES_UNEVEN: mode_proof.uneven_text,
     alarms.SUSPECTED: _jump_suspected,
+    "pointing-law": _law_not_followed,
     alarms.STALE: validity.stale_text,
     # the last: windows may be refused for what another alarm says
     alarms.WINDOWS_REFUSED: window_processing.refused_text,
@@ -278,33 +284,46 @@ def _own_definition(rule: Rule) -> AlarmDefinition:
 
 
 def set_value(context: StepContext, command: cmd.SetValue) -> None:
-    """Take a value that a rule asks for; it counts for as long as was said.
+    """Take a value that is asked for; it counts for as long as was said.
 
     Raises
     ------
     CommandError
-        If it is of another kind than the rule compares it with.
+        If it is of another kind than whoever asks for it expects.
     UnknownIdError
-        If no rule asks for it.
+        If neither a rule nor the law of pointing asks for it.
     """
-    asked = {rule.about: rule for rule in context.policy.rules if rule.about not in FIELDS}
+    asked = _values_asked_for(context)
     if command.name not in asked:
         near = get_close_matches(command.name, asked, n=1)
         names = ", ".join(sorted(asked)) or "none"
         hint = f", did you mean {near[0]}?" if near else f"; asked for: {names}"
         raise UnknownIdError(f"value {command.name}: no rule asks for it{hint}")
-    rule = asked[command.name]
-    if kind_of(command.value) != kind_of(rule.than):
-        raise CommandError(
-            f"{command.name}: found {as_text(command.value)}, expected {kind_of(rule.than)}: rule "
-            f"{rule.name} compares it with {as_text(rule.than)}"
-        )
+    kind, because = asked[command.name]
+    if kind_of(command.value) != kind:
+        found = as_text(command.value)
+        raise CommandError(f"{command.name}: found {found}, expected {kind}: {because}")
     until_ns = context.now_ns + round(command.for_s * SECOND_NS)
     value = ObservatoryValue(
         name=command.name, value=command.value, until_ns_utc=until_ns, by=command.by
     )
     others = tuple(each for each in context.alarms.observatory_values if each.name != command.name)
     context.alarms = replace(context.alarms, observatory_values=(*others, value))
+
+
+def _values_asked_for(context: StepContext) -> dict[str, tuple[str, str]]:
+    """Return the kind of each value that is asked for, and who asks, by its name."""
+    law = context.policy.law
+    names = () if law is None else law.names - frozenset(ANGLES)
+    of_law = dict.fromkeys(names, ("a number", "the law of pointing needs it"))
+    return of_law | {
+        rule.about: (
+            kind_of(rule.than),
+            f"rule {rule.name} compares it with {as_text(rule.than)}",
+        )
+        for rule in context.policy.rules
+        if rule.about not in FIELDS
+    }
 
 
 def changes_value(state: TrackerState, command: cmd.SetValue, now_ns: int) -> bool:

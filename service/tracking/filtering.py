@@ -236,6 +236,7 @@ def accept(
         restored_ns_utc=previous.restored_ns_utc if previous is not None else None,
         basis_id=context.loop.basis_id,
         config_id=context.loop.config_id,
+        nominal=context.alpha.law.nominal,
     )
     validity.store_registration(context, registration)
     context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
@@ -357,7 +358,7 @@ def why_no_window(
             RefusalKind.OTHER,
             "too uncertain: raise the dither's amplitude or the window's length",
         )
-    near = context.policy.start if context.registration is None else context.registration.alpha
+    near = context.nominal if context.registration is None else context.registration.alpha
     distance = np.abs(estimate.alpha.vector - near.vector)
     if np.any(distance > CAPTURE_RANGE):
         return RefusalKind.OUT_OF_REACH, (

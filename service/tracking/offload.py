@@ -54,7 +54,7 @@ def request_offload(context: StepContext) -> None:
         or not _may_move(context, registration, rtc, limits)
     ):
         return
-    step = wanted_step(context.state, registration, context.policy.start.vector, limits)
+    step = wanted_step(context.state, registration, context.nominal.vector, limits)
     if not step.any():
         return
     last = context.alpha.offload

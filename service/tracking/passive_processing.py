@@ -106,6 +106,8 @@ def fit_begins_at(state: TrackerState) -> Misregistration | None:
     """Return where the next passive fit begins: α, or the last such estimate; None: nominal."""
     if state.alpha.registration is not None:
         return state.alpha.registration.alpha
+    if state.alpha.law.nominal is not None:
+        return state.alpha.law.nominal
     last = state.alpha.passive
     return last.alpha if last is not None and np.isfinite(last.sigma).all() else None
 
@@ -135,7 +137,7 @@ def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | No
 
 def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
     """Show a passive estimate while α is not known: nothing is made from it alone."""
-    step = event.estimate.alpha.vector - context.policy.start.vector
+    step = event.estimate.alpha.vector - context.nominal.vector
     if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
         text = (
             f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "

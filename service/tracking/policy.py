@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.model.misregistration import Misregistration
+from service.model.pointing_law import PointingLaw
 from service.tracking.alarms import Interlock, Severity
 
 if TYPE_CHECKING:
@@ -167,6 +168,9 @@ class Policy:
 
     sensor_modes: Mapping[str, SensorModePolicy] = field(default_factory=dict)
     """Modes that the sensor may change to, by their ``config_id``; empty: it has one alone."""
+
+    law: PointingLaw | None = None
+    """Where the mirror lies at any pointing; None: at the same place."""
 
     refused_interval_s: float = 30.0
     """The same after one was refused, rejected or not acknowledged."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from service.model.misregistration import Determination, Misregistration
 from service.wire import Pointing
 
 Array = NDArray[np.float64]
+_Timed = TypeVar("_Timed", bound="TimedEstimate")
 
 
 class Source(StrEnum):
@@ -236,6 +238,9 @@ class Registration:
     config_id: str | None = None
     """Of the RTC's configuration; None: not known."""
 
+    nominal: Misregistration | None = None
+    """Where the law of pointing had the mirror when α was as it is here; None: there is no law."""
+
     def bias(self, block: BiasBlock) -> PassiveBias | None:
         """Return what is known of a bias; None: nothing is."""
         return next((bias for bias in self.biases if bias.block.name == block.name), None)
@@ -289,6 +294,71 @@ class HistoryEntry:
 
     in_use: str | None = None
     """Id of the matrix in use when it was looked at; None: unknown."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LawLeap:
+    """A leap of what the law of pointing is told, that may be a mistake."""
+
+    to: Misregistration
+    """Where the law would have the mirror."""
+
+    since_ns_utc: int
+    worked_out_ns_utc: int
+    """When it leapt, and when it was told last, by the service's clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LawState:
+    """The nominal registration by the law of pointing."""
+
+    nominal: Misregistration | None = None
+    """Where it has the mirror now; None: there is no law, or nobody tells what it is of."""
+
+    worked_out_ns_utc: int = 0
+    """When that was worked out, by the service's clock."""
+
+    way: tuple[tuple[int, Misregistration], ...] = ()
+    """Where it had the mirror, and when by the RTC's clock: oldest first, bounded."""
+
+    problem: str = ""
+    """Why it is not followed, and what to do; empty: it is, or there is none."""
+
+    leap: LawLeap | None = None
+    """None: what it is told is believed."""
+
+
+def moved(registration: Registration, step: Array) -> Registration:
+    """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""
+    return replace(
+        registration,
+        alpha=_further(registration.alpha, step),
+        previous_estimate=_previous_moved(registration.previous_estimate, step),
+        suspected_jump=_moved(registration.suspected_jump, step),
+        biases=tuple(
+            replace(bias, previous_estimate=_previous_moved(bias.previous_estimate, step))
+            for bias in registration.biases
+        ),
+    )
+
+
+def _previous_moved(previous: PreviousEstimate | None, step: Array) -> PreviousEstimate | None:
+    if previous is None:
+        return None
+    return replace(
+        previous,
+        alpha=_further(previous.alpha, step),
+        next_window=_moved(previous.next_window, step),
+        previous_estimate=_previous_moved(previous.previous_estimate, step),
+    )
+
+
+def _moved(estimate: _Timed | None, step: Array) -> _Timed | None:
+    return None if estimate is None else replace(estimate, alpha=_further(estimate.alpha, step))
+
+
+def _further(alpha: Misregistration, step: Array) -> Misregistration:
+    return Misregistration.from_vector(alpha.vector + step)
 
 
 class OffloadState(StrEnum):

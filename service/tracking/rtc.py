@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from service.estimation.loop import loop_numbers, same_loop, same_numbers
-from service.tracking import alarms, dither, mode_proof, reconstructors, update_policy, validity
+from service.tracking import (
+    alarms,
+    dither,
+    mode_proof,
+    pointing_law,
+    reconstructors,
+    update_policy,
+    validity,
+)
 from service.tracking import events as ev
 from service.tracking.events import Effect
 from service.tracking.operator import end_ramp
@@ -118,6 +126,7 @@ def _enter_sensor_mode(context: StepContext, config_id: str) -> None:
     reconstructors.discard_proposals(context, f"the sensor's mode is {config_id} now")
     update_policy.forget_limit(context)
     context.loop = replace(context.loop, config_id=config_id)
+    pointing_law.begin_law(context)
     kept, scale = "", context.policy.alpha_scale(before, config_id)
     if scale is not None:
         validity.change_subapertures(context, scale, config_id)

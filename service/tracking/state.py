@@ -18,6 +18,7 @@ from service.tracking.operation_records import (
 from service.tracking.products import Assessment, MatrixState, ReconstructorRecord
 from service.tracking.registration import (
     HistoryEntry,
+    LawState,
     Offload,
     PassiveState,
     Registration,
@@ -152,6 +153,9 @@ class AlphaState:
 
     offload: Offload | None = None
     """The last one asked for; None: none was, or α is corrected by the matrix alone."""
+
+    law: LawState = field(default_factory=LawState)
+    """Where the law of pointing has the mirror."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

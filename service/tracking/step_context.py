@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 
 from service.errors import CommandError
 from service.estimation.loop import NO_RTC
+from service.model.misregistration import Misregistration
 from service.tracking.alarms import (
     ALARMS,
     Alarm,
@@ -178,6 +179,11 @@ class StepContext:
     def dither_policy(self) -> DitherPolicyState:
         """The state of the dither policy."""
         return self.state.dithers.policy
+
+    @property
+    def nominal(self) -> Misregistration:
+        """Where the mirror should be: by the law of pointing, or as the instrument file has it."""
+        return self.state.alpha.law.nominal or self.policy.start
 
     @property
     def acquisition(self) -> Acquisition:

@@ -171,6 +171,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
         previous_estimate=None,
         suspected_jump=None,
         config_id=config_id,
+        nominal=None,
     )
 
 
@@ -273,7 +274,7 @@ def _why_invalid(state: TrackerState, registration: Registration, policy: Policy
     if registration.doubt and registration.doubt_voids:
         return registration.doubt
     moved_deg = slewed_deg(state, registration)
-    if moved_deg > policy.slew_limit_deg:
+    if moved_deg > policy.slew_limit_deg and registration.nominal is None:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
     if np.any(registration.sigma > USELESS_SIGMA):
         return _worst(registration.sigma, USELESS_SIGMA)

@@ -19,7 +19,7 @@ from service.estimation.kalman import Joint
 from service.estimation.random_dither import RandomEstimate
 from service.estimation.windows import RefusalKind
 from service.model.misregistration import step_text
-from service.tracking import alarms, filtering, jumps, validity
+from service.tracking import alarms, filtering, jumps, pointing_law, validity
 from service.tracking import events as ev
 from service.tracking.alarms import Interlock
 from service.tracking.dither import note_found
@@ -59,6 +59,9 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
     estimate = event.estimate
     when = validity.telemetry_span(event.began_ns_utc, estimate.t_ns_utc)
     why = filtering.why_no_window(context, estimate, when)
+    smeared = pointing_law.why_smeared(context.state, when.began_ns_utc, when.ended_ns_utc)
+    if smeared is not None:
+        why = RefusalKind.VOID, smeared
     if why is not None:
         kind, reason = why
         reject_window(context, reason, kind)

@@ -269,7 +269,7 @@ ALPHA = define_view(
     "registration.jumped_ns_utc "
     "suspected registration.optical_gain registration.optical_gains passive_bias "
     "passive_bias_sigma "
-    "registration.pointing",
+    "registration.pointing registration.nominal",
 )
 define_view("HistoryEntryView", HistoryEntry)
 HISTORY = define_view("HistoryView", TrackerState, "entries=alpha.history", "The last estimates.")

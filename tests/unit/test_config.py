@@ -255,7 +255,10 @@ def test_values_that_ask_for_nothing_new_are_accepted(write):
             "instrument.obscuration: unknown key, did you mean obscuration_ratio?",
         ),
         (ABOUT + WFS + MIRROR + "[mode]\n", "mode: unknown key, did you mean modes?"),
-        (ABOUT + WFS + MIRROR + "[zzzz]\n", "zzzz: unknown key; known: instrument, loop, mirror"),
+        (
+            ABOUT + WFS + MIRROR + "[zzzz]\n",
+            "zzzz: unknown key; known: instrument, law, loop, mirror",
+        ),
         (ABOUT.replace("8.0", '"8"') + WFS + MIRROR, "instrument.diameter_m: found '8', expected"),
         (ABOUT.replace("8.0", "-8.0") + WFS + MIRROR, "found -8.0, expected greater than 0"),
         (ABOUT.replace("8.0", "inf") + WFS + MIRROR, "found inf, expected a finite number"),

@@ -293,9 +293,13 @@ class OpticsWorker:
         return estimate if near_enough(estimate.step, estimate.covariance) else None
 
     def find(
-        self, spectra: Spectra, start: Misregistration | None, flux: bytes | None
+        self,
+        spectra: Spectra,
+        start: Misregistration | None,
+        flux: bytes | None,
+        nominal: Misregistration | None = None,
     ) -> WideCaptureEstimate | WindowRefused:
-        """Find α in a window with the loop open; without a start from anywhere in the range.
+        """Find α in a window with the loop open; without a start from anywhere about ``nominal``.
 
         ``flux`` is the RTC's: where the pupil images move with the mirror's they are a start.
         """
@@ -315,11 +319,12 @@ class OpticsWorker:
                 for sampling in (FAR_SAMPLING, COARSE_SAMPLING)
             )
         far, near = self._wide_capture[modes]
-        starts = (start,) if start is not None else far_starts(self._model.instrument, flux)
+        instrument, nominal = self._model.instrument, nominal or self._start
+        starts = (start,) if start is not None else far_starts(instrument, flux, nominal)
         try:
             return find(
                 spectra,
-                WideCaptureSearch(coarse=far, fine=near, nominal=self._start, starts=starts),
+                WideCaptureSearch(coarse=far, fine=near, nominal=nominal, starts=starts),
             )
         except np.linalg.LinAlgError as error:
             return not_found(str(error), spectra)

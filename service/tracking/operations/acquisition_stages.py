@@ -405,6 +405,7 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         n_windows=1,
         basis_id=context.loop.basis_id,
         config_id=context.loop.config_id,
+        nominal=context.alpha.law.nominal,
     )
     validity.store_registration(context, registration)
     stop_running_dither(context)

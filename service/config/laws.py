@@ -1,0 +1,81 @@
+"""``[law]`` of an instrument file: the nominal registration as a law of pointing."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields
+from typing import Annotated, Any
+
+from pydantic import PlainValidator
+
+from service.errors import ModelError
+from service.model.kinds import Read
+from service.model.pointing_law import ANGLES, PointingLaw, Term
+
+_NEAR = 0.75
+"""Likeness from which on a name is a misspelt angle, and no value of the observatory's."""
+
+_FORM = '{ of = "elevation", at = [20, 80], values = [0.1, -0.1] }'
+
+
+def _term(value: object) -> Term:
+    """Return a term as a file has it: a number, an expression or a table."""
+    try:
+        return _checked(value)
+    except ModelError as error:
+        raise ValueError(str(error)) from error
+
+
+def _checked(value: object) -> Term:
+    match value:
+        case bool():
+            raise ModelError(f"found {value}, expected a number, an expression or {_FORM}")
+        case int() | float():
+            return Term(repr(float(value)))
+        case str():
+            term = Term(value)
+        case {"of": str(of), "at": [*at], "values": [*values], **more} if not more:
+            if not all(type(number) in {int, float} for number in (*at, *values)):
+                raise ModelError(f"found {value}, expected numbers in at and values")
+            term = Term(of, tuple(map(float, at)), tuple(map(float, values)))
+        case _:
+            raise ModelError(f"found {value!r}, expected a number, an expression or {_FORM}")
+    for name in sorted(term.names - set(ANGLES)):
+        close = difflib.get_close_matches(name, ANGLES, n=1, cutoff=_NEAR)
+        if close:
+            raise ModelError(f"found {name}, did you mean {close[0]}?")
+    return term
+
+
+_Term = Annotated[
+    Term | None, PlainValidator(_term, json_schema_input_type=float | str | dict[str, Any])
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LawTable(Read):
+    """``[law]``: where the mirror lies at any pointing, each number a law of its own.
+
+    A number, an expression of `azimuth`, `elevation` (degrees, as the RTC's status or the
+    observatory reports them) and of names of the observatory's values, or a table
+    `{ of = "elevation", at = [20, 80], values = [0.1, -0.1] }` with straight lines between.
+    α is followed as its deviation from this.
+    """
+
+    shift_x_subap: _Term = None
+    """Subapertures; None: 0."""
+
+    shift_y_subap: _Term = None
+    """Subapertures; None: 0."""
+
+    rotation_deg: _Term = None
+    """Degrees, as `azimuth - 12.98`; None: 0."""
+
+    magnification: _Term = None
+    """Ratio; None: 1."""
+
+
+def law_of(table: LawTable) -> PointingLaw | None:
+    """Return the law; None: the file has none."""
+    terms = {field.name: getattr(table, field.name) for field in fields(table)}
+    return PointingLaw(**terms) if any(terms.values()) else None

@@ -1,0 +1,195 @@
+"""The nominal registration as a law of pointing: expressions and tables of what is reported.
+
+A mirror on a mount that turns, behind a derotator or below a bending tube has no nominal place but
+at one pointing. Expressions are arithmetic alone: nothing in them can be called but a few functions
+of numbers.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Final
+
+import numpy as np
+
+from service.errors import ModelError
+from service.model.misregistration import Misregistration
+
+ANGLES: Final = ("azimuth", "elevation")
+"""Names of what the pointing tells, degrees."""
+
+LONGEST = 200
+"""Letters of an expression."""
+
+
+def _of_degrees(function: Callable[[float], float]) -> Callable[[float], float]:
+    return lambda degrees: function(math.radians(degrees))
+
+
+FUNCTIONS: Final[Mapping[str, Callable[[float], float]]] = {
+    "sin": _of_degrees(math.sin),
+    "cos": _of_degrees(math.cos),
+    "tan": _of_degrees(math.tan),
+    "sqrt": math.sqrt,
+    "abs": abs,
+}
+"""What an expression may call; angles are in degrees."""
+
+_OPERATORS: Final[Mapping[type[ast.AST], Callable[..., float]]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
+}
+
+Reported = Mapping[str, float]
+"""Numbers by name: azimuth and elevation, degrees, and what the observatory reports."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One number of a registration: an expression, or a table over one."""
+
+    expression: str
+    """Of the pointing and of values that the observatory reports, by their names."""
+
+    at: tuple[float, ...] = ()
+    """Where a table over the expression has values, rising; empty: the expression is the number."""
+
+    values: tuple[float, ...] = ()
+    """The values there, straight lines between them; beyond its ends those of the ends."""
+
+    def __post_init__(self) -> None:
+        """Refuse what is no expression, or no table.
+
+        Raises
+        ------
+        ModelError
+            With what was found.
+        """
+        _parsed(self.expression)
+        if len(self.at) != len(self.values) or (self.at and len(self.at) < 2):
+            raise ModelError(
+                f"found {len(self.at)} places and {len(self.values)} values, expected as many of "
+                "both, two at least"
+            )
+        if any(after <= before for before, after in zip(self.at, self.at[1:], strict=False)):
+            raise ModelError(f"found places {list(self.at)}, expected rising ones")
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of what must be reported."""
+        nodes = ast.walk(_parsed(self.expression))
+        found = {node.id for node in nodes if isinstance(node, ast.Name)}
+        return frozenset(found - FUNCTIONS.keys())
+
+    def value(self, reported: Reported) -> float:
+        """Return the number.
+
+        Raises
+        ------
+        ModelError
+            If it is none: a division by zero, the root of a negative number.
+        """
+        try:
+            found = _evaluated(_parsed(self.expression), reported)
+        except (ArithmeticError, ValueError, TypeError) as error:
+            raise ModelError(f"{self.expression} is no number now: {error}") from error
+        if isinstance(found, complex) or not math.isfinite(found):
+            raise ModelError(f"{self.expression} is no number now: {found}")
+        return float(np.interp(found, self.at, self.values)) if self.at else found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointingLaw:
+    """Where the mirror lies at any pointing; what has no term is nothing, a magnification 1."""
+
+    shift_x_subap: Term | None = None
+    shift_y_subap: Term | None = None
+    rotation_deg: Term | None = None
+    magnification: Term | None = None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of what must be reported."""
+        terms = (getattr(self, field.name) for field in fields(self))
+        return frozenset().union(*(term.names for term in terms if term is not None))
+
+    def at(self, reported: Reported) -> Misregistration:
+        """Return the registration; all of ``names`` must be reported.
+
+        Raises
+        ------
+        ModelError
+            If one of its numbers is none, or no registration can have it.
+        """
+        found = {
+            field.name: term.value(reported)
+            for field in fields(self)
+            if (term := getattr(self, field.name)) is not None
+        }
+        nominal = Misregistration().to_boundary()
+        return Misregistration.from_boundary(nominal | found)
+
+
+@cache
+def _parsed(text: str) -> ast.expr:
+    """Return an expression, of arithmetic alone.
+
+    Raises
+    ------
+    ModelError
+        With what was found and what may be.
+    """
+    expected = (
+        f"numbers, {' and '.join(ANGLES)} (degrees), names of the observatory's values, "
+        f"+ - * / ** ( ) and {', '.join(FUNCTIONS)}"
+    )
+    if len(text) > LONGEST:
+        raise ModelError(f"found {len(text)} letters, expected at most {LONGEST}: {expected}")
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise ModelError(f"found {text!r}, expected an expression of {expected}") from error
+    for node in ast.walk(tree):
+        strange = _strange(node)
+        if strange:
+            raise ModelError(f"found {strange} in {text!r}, expected {expected}")
+    return tree
+
+
+def _strange(node: ast.AST) -> str:
+    """Return what a part of an expression is that may not be; empty: it may."""
+    match node:
+        case ast.Constant(value=value):
+            return "" if type(value) in {int, float} else repr(value)
+        case ast.Call(func=ast.Name(id=name), args=[_], keywords=[]):
+            return "" if name in FUNCTIONS else f"{name}()"
+        case ast.Name() | ast.BinOp() | ast.UnaryOp() | ast.Load():
+            return ""
+        case _:
+            return "" if type(node) in _OPERATORS else type(node).__name__.lower()
+
+
+def _evaluated(node: ast.expr, reported: Reported) -> float:
+    match node:
+        case ast.Constant(value=int() | float() as value):
+            return float(value)
+        case ast.Name(id=name):
+            return float(reported[name])
+        case ast.Call(func=ast.Name(id=name), args=[argument]):
+            return FUNCTIONS[name](_evaluated(argument, reported))
+        case ast.UnaryOp(op=op, operand=operand):
+            return _OPERATORS[type(op)](_evaluated(operand, reported))
+        case ast.BinOp(left=left, op=op, right=right):
+            return _OPERATORS[type(op)](_evaluated(left, reported), _evaluated(right, reported))
+        case _:
+            raise TypeError(f"found {type(node).__name__}")

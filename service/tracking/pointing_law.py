@@ -1,0 +1,252 @@
+"""Follow the law of pointing: α moves as it says, and the filter follows the deviation from it.
+
+All that is known of α is carried along when the law moves, and an estimate is brought from the
+pointing of its telemetry to the present one. So what the filter compares is deviations from the
+law, whatever the telescope does meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.misregistration import Misregistration, step_text, wrapped
+from service.model.pointing_law import PointingLaw, Reported
+from service.tracking import events as ev
+from service.tracking.events import Event
+from service.tracking.operations.acquisition_stages import set_acquisition
+from service.tracking.policy import SECOND_NS
+from service.tracking.registration import LawLeap, LawState, Purpose, moved
+from service.tracking.state import TrackerState
+from service.tracking.step_context import StepContext
+from service.tracking.validity import (
+    age_registration,
+    cast_doubt,
+    request_window,
+    store_registration,
+    void_until,
+)
+
+Array = NDArray[np.float64]
+
+SPACING_NS = SECOND_NS // 2
+"""Between two places of the way that are kept: straight lines join them."""
+
+WAY_KEPT = 240
+
+MAX_STEP = np.array([0.5, 0.5, np.deg2rad(3.0), 0.02])
+"""By which a law may move at once, and each second besides, numeric units: telescopes turn by a few
+degrees a second at most. Further is a leap of what is told."""
+
+BELIEVED_S = 3.0
+"""A leap of the pointing that has stood for so long is believed."""
+
+SMEARED = np.array([0.1, 0.1, np.deg2rad(0.3), 0.004])
+"""A window in which the law moved further tells no one place."""
+
+
+def follow_law(context: StepContext) -> None:
+    """Note where the law has the mirror now, and carry along what is known of α."""
+    law = context.policy.law
+    if law is None:
+        return
+    now = _nominal(context, law)
+    if isinstance(now, str):
+        _set(context, replace(context.alpha.law, problem=now))
+        return
+    state = context.alpha.law
+    since_s = (context.now_ns - state.worked_out_ns_utc) / SECOND_NS
+    if state.nominal is not None and _is_far(state.nominal, now, since_s):
+        _hold(context, state.nominal, now)
+        return
+    _carry(context, now)
+
+
+def begin_law(context: StepContext) -> None:
+    """Forget the way of the law: the sensor's subapertures are others."""
+    _set(context, LawState())
+
+
+def event_of_now(context: StepContext, event: Event) -> Event:
+    """Return an event whose estimate of α is brought to the present pointing."""
+    match event:
+        case ev.WindowFitted(estimate=estimate, began_ns_utc=began_ns):
+            alpha = _of_now(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
+            return replace(event, estimate=replace(estimate, alpha=alpha))
+        case ev.PassiveFitted(estimate=estimate, began_ns_utc=began_ns, t_ns_utc=t_ns):
+            alpha = _of_now(context.state, estimate.alpha, began_ns, t_ns)
+            return replace(event, estimate=replace(estimate, alpha=alpha))
+        case ev.WideCaptureFitted(found=found, began_ns_utc=began_ns):
+            estimate = found.estimate
+            alpha = _of_now(context.state, estimate.alpha, began_ns, estimate.t_ns_utc)
+            return replace(event, found=replace(found, estimate=replace(estimate, alpha=alpha)))
+        case _:
+            return event
+
+
+def start_of_fit(
+    state: TrackerState, alpha: Misregistration | None, t_ns_utc: int
+) -> Misregistration | None:
+    """Return where α of now, or the nominal registration, lay at a time of the RTC's clock."""
+    now, then = state.alpha.law.nominal, law_at(state, t_ns_utc)
+    if now is None or then is None:
+        return alpha
+    return then if alpha is None else _stepped(alpha, difference(now, then))
+
+
+def why_smeared(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
+    """Return why a window tells no one place: the law moved within it; None: it does."""
+    first, last = law_at(state, began_ns_utc), law_at(state, ended_ns_utc)
+    if first is None or last is None:
+        return None
+    step = difference(first, last)
+    if np.all(np.abs(step) <= SMEARED):
+        return None
+    return f"the law of pointing moved α inside the window, by {step_text(step)}"
+
+
+def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
+    """Return where the law had the mirror at a time of the RTC's clock; None: nobody knows."""
+    way = state.alpha.law.way
+    later = next((k for k, (t_ns, _) in enumerate(way) if t_ns >= t_ns_utc), len(way))
+    if not way:
+        return state.alpha.law.nominal
+    if later in {0, len(way)}:
+        return way[min(later, len(way) - 1)][1]
+    (before_ns, before), (after_ns, after) = way[later - 1], way[later]
+    share = (t_ns_utc - before_ns) / (after_ns - before_ns)
+    return _stepped(before, share * difference(before, after))
+
+
+def difference(one: Misregistration, other: Misregistration) -> Array:
+    """Return the step ``(4,)`` from one to the other, numeric units, by the shorter turn."""
+    step = other.vector - one.vector
+    step[2] = wrapped(float(step[2]))
+    return step
+
+
+def _of_now(
+    state: TrackerState, alpha: Misregistration, began_ns_utc: int, ended_ns_utc: int
+) -> Misregistration:
+    """Return an estimate at the present pointing, made of telemetry of another."""
+    now = state.alpha.law.nominal
+    middle_ns = ((began_ns_utc or ended_ns_utc) + ended_ns_utc) // 2
+    then = law_at(state, middle_ns)
+    if now is None or then is None:
+        return alpha
+    return _stepped(alpha, difference(then, now))
+
+
+def _stepped(alpha: Misregistration, step: Array) -> Misregistration:
+    return Misregistration.from_vector(alpha.vector + step) if step.any() else alpha
+
+
+def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
+    """Return where the law has the mirror now, or why nobody knows and what to do."""
+    reported = _reported(context)
+    missing = sorted(law.names - reported.keys())
+    if missing and context.alpha.pointing is None:
+        return (
+            "the instrument file has a law of pointing, and nobody tells where the telescope "
+            "points: have the RTC's status tell it, or PUT /v1/pointing; until then α is followed "
+            "as if it stood still"
+        )
+    if missing:
+        names = " and ".join(missing)
+        return (
+            f"the law of pointing needs {names}, which nobody tells: PUT /v1/values/{missing[0]}; "
+            "until then α is followed as if it stood still"
+        )
+    try:
+        found = law.at(reported)
+    except ModelError as error:
+        return f"the law of pointing gives no registration: {error}; mend [law], or what is told"
+    modes = context.policy.sensor_modes
+    scale = context.policy.alpha_scale(next(iter(modes), None), context.loop.config_id)
+    return found if scale is None else Misregistration.from_vector(found.vector * scale)
+
+
+def _reported(context: StepContext) -> Reported:
+    """Return the numbers that a law may be of."""
+    values = {
+        value.name: float(value.value)
+        for value in context.alarms.observatory_values
+        if context.now_ns < value.until_ns_utc and type(value.value) in {int, float}
+    }
+    pointing = context.alpha.pointing
+    if pointing is None:
+        return values
+    return values | {"azimuth": pointing.azimuth_deg, "elevation": pointing.elevation_deg}
+
+
+def _is_far(one: Misregistration, other: Misregistration, since_s: float) -> bool:
+    allowed = MAX_STEP * (1.0 + max(since_s, 0.0))
+    return bool(np.any(np.abs(difference(one, other)) > allowed))
+
+
+def _hold(context: StepContext, before: Misregistration, now: Misregistration) -> None:
+    """Let α stand where what is told leaps; one that lasts is believed, and α doubted."""
+    law, leap = context.alpha.law, context.alpha.law.leap
+    if leap is None or _is_far(leap.to, now, (context.now_ns - leap.worked_out_ns_utc) / SECOND_NS):
+        leap = LawLeap(to=now, since_ns_utc=context.now_ns, worked_out_ns_utc=context.now_ns)
+        text = (
+            f"what the law of pointing is told leapt, and would move α by "
+            f"{step_text(difference(before, now))} at once: α is let be until it has stood for "
+            f"{BELIEVED_S:.0f} s; see who tells the pointing"
+        )
+        _set(context, replace(law, problem=text, leap=leap))
+        return
+    leap = replace(leap, to=now, worked_out_ns_utc=context.now_ns)
+    if context.now_ns - leap.since_ns_utc < BELIEVED_S * SECOND_NS:
+        _set(context, replace(law, leap=leap))
+        return
+    _set(context, replace(law, way=()))
+    _carry(context, now)
+    because = "what the law of pointing is told has leapt"
+    registration, t_ns = context.registration, 0 if context.rtc is None else context.rtc.t_ns
+    if registration is not None:
+        doubted = replace(registration, doubt=because, doubt_voids=True, suspected_jump=None)
+        store_registration(context, doubted)
+        cast_doubt(context, t_ns)
+        request_window(context, because)
+        age_registration(context)
+    void_until(context, t_ns, because, Purpose.MEASURE)
+    context.warn("law.leapt", f"{because}: α is where the law has it now, until a window tells")
+
+
+def _carry(context: StepContext, now: Misregistration) -> None:
+    """Take this for nominal, and move what is known of α as far as it has moved."""
+    registration, acquisition = context.registration, context.acquisition
+    before = context.alpha.law.nominal
+    if registration is not None and registration.nominal != now:
+        if registration.nominal is not None:
+            registration = moved(registration, difference(registration.nominal, now))
+        store_registration(context, replace(registration, nominal=now))
+    if acquisition.alpha is not None and before is not None and before != now:
+        found = _stepped(acquisition.alpha, difference(before, now))
+        set_acquisition(context, replace(acquisition, alpha=found))
+    state = LawState(nominal=now, worked_out_ns_utc=context.now_ns, way=_way(context, now))
+    if state != context.alpha.law:
+        _set(context, state)
+
+
+def _way(context: StepContext, now: Misregistration) -> tuple[tuple[int, Misregistration], ...]:
+    """Return the way of the law with the present place, as far as it is kept."""
+    way = context.alpha.law.way
+    if context.rtc is None:
+        return way
+    t_ns = context.rtc.t_ns
+    if way and t_ns <= way[-1][0]:
+        kept = tuple(place for place in way if place[0] < t_ns)
+        return (*kept, (t_ns, now))
+    still = len(way) > 1 and way[-1][1] == way[-2][1] == now
+    close = len(way) > 1 and t_ns - way[-2][0] < SPACING_NS and way[-1][1] != way[-2][1]
+    return (*(way[:-1] if still or close else way), (t_ns, now))[-WAY_KEPT:]
+
+
+def _set(context: StepContext, law: LawState) -> None:
+    if law != context.alpha.law:
+        context.alpha = replace(context.alpha, law=law)

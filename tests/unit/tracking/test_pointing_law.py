@@ -1,0 +1,253 @@
+"""The law of pointing: α moves with it, the filter follows the deviation, slews keep α."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import CommandError, UnknownIdError
+from service.model.misregistration import Misregistration
+from service.model.pointing_law import PointingLaw, Term
+from service.tracking import commands as cmd
+from service.tracking import events as ev
+from service.tracking.pointing_law import BELIEVED_S, law_at, start_of_fit
+from service.tracking.policy import SensorModePolicy
+from service.tracking.registration import Validity
+from service.tracking.resume import resumed, saved_of
+from service.wire import Pointing
+from tests.states import tracker_state
+from tests.unit.tracking.situations import ALPHA, POLICY, SECOND, START_NS, Story, estimate, rtc
+
+LAW = PointingLaw(
+    rotation_deg=Term("azimuth - 12.98"), shift_x_subap=Term("elevation", (20.0, 80.0), (0.2, -0.1))
+)
+WITH_LAW = replace(POLICY, law=LAW)
+
+
+def at(azimuth_deg, elevation_deg=50.0):
+    return Pointing(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+
+
+def placed(azimuth_deg, elevation_deg=50.0, off=ALPHA):
+    """α where the mirror lies off the law by ``off``."""
+    nominal = LAW.at({"azimuth": azimuth_deg, "elevation": elevation_deg})
+    return Misregistration.from_vector(nominal.vector + off.vector - Misregistration().vector)
+
+
+class Night(Story):
+    """An RTC that tells a pointing, and windows that measure the same deviation."""
+
+    def __init__(self, policy=WITH_LAW, **changes):
+        super().__init__(policy=policy, **changes)
+        self.seen = None
+
+    def point(self, pointing, after_s=0.2):
+        self.now_ns += round(after_s * SECOND)
+        self.seen = pointing
+        return self.tell(rtc(t_ns=self.now_ns, pointing=pointing))
+
+    def slew(self, azimuth_deg, elevation_deg=50.0, deg_per_s=2.0):
+        """Turn there as a telescope does, the status five times a second."""
+        while self.seen != at(azimuth_deg, elevation_deg):
+            by = np.clip(azimuth_deg - self.seen.azimuth_deg, -0.2 * deg_per_s, 0.2 * deg_per_s)
+            up = np.clip(elevation_deg - self.seen.elevation_deg, -0.4, 0.4)
+            self.point(at(self.seen.azimuth_deg + by, self.seen.elevation_deg + up))
+        return self
+
+    def window(self, alpha, lasts_s=2.0):
+        """Have a window fitted that ended just now."""
+        fitted = estimate(alpha, t_ns=self.now_ns)
+        began_ns = self.now_ns - round(lasts_s * SECOND)
+        return self.tell(ev.WindowFitted(estimate=fitted, began_ns_utc=began_ns))
+
+    @property
+    def alpha(self):
+        return self.state.alpha.registration.alpha
+
+    @property
+    def problem(self):
+        alarm = self.state.alarm("pointing-law")
+        return "" if alarm is None else alarm.text
+
+
+@pytest.fixture
+def night():
+    night = Night().meet(t_ns=START_NS)
+    for _ in range(3):
+        night.point(at(100.0), after_s=2.0)
+        night.window(placed(100.0))
+    return night
+
+
+def test_alpha_is_the_laws_place_and_a_deviation(night):
+    assert night.state.alpha.law.nominal == LAW.at({"azimuth": 100.0, "elevation": 50.0})
+    assert night.alpha.vector == pytest.approx(placed(100.0).vector)
+    assert night.problem == ""
+
+
+def test_a_slew_keeps_alpha_and_takes_it_along(night):
+    """By 60 degrees, and past any slew limit."""
+    windows = night.state.alpha.registration.n_windows
+    night.slew(160.0, 60.0)
+    registration = night.state.alpha.registration
+    assert registration.alpha.vector == pytest.approx(placed(160.0, 60.0).vector)
+    assert registration.validity.level is not Validity.INVALID
+    assert registration.n_windows == windows
+    night.point(at(160.0, 60.0), after_s=2.5)
+    night.window(placed(160.0, 60.0))
+    assert night.state.alpha.registration.suspected_jump is None
+    assert night.alpha.vector == pytest.approx(placed(160.0, 60.0).vector)
+
+
+def test_without_a_law_the_same_slew_makes_alpha_invalid():
+    night = Night(policy=POLICY).meet(t_ns=START_NS)
+    night.point(at(100.0))
+    for _ in range(3):
+        night.point(at(100.0), after_s=2.0)
+        night.window(ALPHA)
+    night.slew(160.0, 60.0)
+    night.tell(ev.Tick())
+    assert night.state.alpha.registration.validity.level is Validity.INVALID
+
+
+def test_windows_of_a_turning_field_are_brought_to_the_present_pointing(night):
+    """A twelfth of a degree a second, fitted two seconds late: five σ of a window each second."""
+    azimuth, night.seen = 100.0, at(100.0)
+    innovations = []
+    for _ in range(30):
+        for _ in range(5):
+            azimuth += 0.2 / 12
+            night.point(at(azimuth))
+        middle = azimuth - 1.0 / 12
+        fitted = estimate(placed(middle), t_ns=night.now_ns)
+        began_ns = night.now_ns - 2 * SECOND
+        for _ in range(10):
+            azimuth += 0.2 / 12
+            night.point(at(azimuth))
+        night.tell(ev.WindowFitted(estimate=fitted, began_ns_utc=began_ns))
+        innovations.append(night.state.alpha.history[-1].innovation)
+    assert night.alpha.vector == pytest.approx(placed(azimuth).vector, abs=2e-5)
+    assert max(innovations) < 1.0
+    assert night.state.alpha.registration.suspected_jump is None
+
+
+def test_a_deviation_is_followed_whatever_the_law_does(night):
+    off = replace(ALPHA, rotation_rad=ALPHA.rotation_rad + np.deg2rad(0.02))
+    night.slew(130.0)
+    for _ in range(20):
+        night.point(at(130.0), after_s=2.0)
+        night.window(placed(130.0, off=off))
+    night.slew(70.0)
+    assert night.alpha.vector == pytest.approx(placed(70.0, off=off).vector, abs=3e-5)
+
+
+def test_the_short_way_is_taken_past_north(night):
+    night.slew(179.9)
+    turned = np.deg2rad(night.alpha.rotation_rad)
+    night.point(at(-179.9))
+    assert night.problem == ""
+    assert np.rad2deg(night.alpha.rotation_rad) == pytest.approx(180.1 - 12.98 + 0.2)
+    assert turned != night.alpha.rotation_rad
+
+
+def test_the_fit_of_a_window_begins_where_alpha_was_then(night):
+    t_ns = night.now_ns
+    night.slew(110.0)
+    begins = start_of_fit(night.state, night.alpha, t_ns)
+    assert begins.vector == pytest.approx(placed(100.0).vector)
+    nominal = start_of_fit(night.state, None, t_ns)
+    assert nominal == law_at(night.state, t_ns)
+
+
+def test_a_window_in_which_the_law_moved_too_far_tells_no_one_place(night):
+    night.slew(104.0)
+    night.window(placed(102.0))
+    assert night.state.windows.refusal.text.startswith(
+        "the law of pointing moved α inside the window, by +0.000, +0.000 subap, +4.0"
+    )
+    assert night.state.windows.run >= 0, "it is no fault"
+
+
+def test_a_law_without_pointing_is_named_with_what_to_do():
+    night = Night().meet(t_ns=START_NS)
+    assert night.problem.startswith("the instrument file has a law of pointing, and nobody tells")
+    assert "PUT /v1/pointing" in night.problem
+    night.tell(cmd.SetPointing(elevation_deg=50.0, azimuth_deg=100.0))
+    assert night.problem == ""
+    assert night.state.alpha.law.nominal is not None
+
+
+def test_a_value_that_the_law_needs_is_asked_for_by_name():
+    law = PointingLaw(rotation_deg=Term("azimuth - 2 * derotator"))
+    night = Night(policy=replace(POLICY, law=law)).meet(t_ns=START_NS)
+    night.point(at(100.0))
+    assert night.problem.startswith("the law of pointing needs derotator, which nobody tells: PUT")
+    with pytest.raises(UnknownIdError, match="did you mean derotator"):
+        night.tell(cmd.SetValue(name="derotador", value=3.0, for_s=60.0))
+    with pytest.raises(CommandError, match="expected a number: the law of pointing needs it"):
+        night.tell(cmd.SetValue(name="derotator", value="left", for_s=60.0))
+    night.tell(cmd.SetValue(name="derotator", value=3.0, for_s=60.0))
+    assert night.problem == ""
+    assert np.rad2deg(night.state.alpha.law.nominal.rotation_rad) == pytest.approx(94.0)
+    night.wait(61.0)
+    assert "needs derotator" in night.problem
+
+
+def test_a_law_that_gives_no_number_is_named():
+    law = PointingLaw(magnification=Term("1 / (elevation - 50)"))
+    night = Night(policy=replace(POLICY, law=law)).meet(t_ns=START_NS)
+    night.point(at(100.0))
+    assert "the law of pointing gives no registration: 1 / (elevation - 50)" in night.problem
+
+
+def test_one_pointing_that_leaps_moves_nothing(night):
+    before = night.alpha
+    night.point(at(10.0))
+    assert night.problem.startswith("what the law of pointing is told leapt, and would move α by")
+    assert night.alpha == before
+    night.point(at(100.0))
+    assert (night.problem, night.alpha) == ("", before)
+
+
+def test_a_leap_that_lasts_is_believed_and_alpha_doubted(night):
+    night.point(at(10.0))
+    for _ in range(round(BELIEVED_S / 0.2)):
+        night.point(at(10.0))
+    registration = night.state.alpha.registration
+    assert registration.alpha.vector == pytest.approx(placed(10.0).vector)
+    assert registration.validity.level is Validity.INVALID
+    assert registration.doubt == "what the law of pointing is told has leapt"
+    assert night.state.alpha.dither_due_reason == registration.doubt
+    assert night.problem == ""
+    night.point(at(10.0), after_s=3.0)
+    night.window(placed(10.0))
+    assert night.state.alpha.registration.doubt == ""
+
+
+def test_a_telescope_that_nobody_asked_for_long_has_not_leapt(night):
+    night.point(at(160.0), after_s=60.0)
+    assert night.problem == ""
+    assert night.alpha.vector == pytest.approx(placed(160.0).vector)
+
+
+def test_after_a_restart_alpha_is_where_the_law_has_it_now(night):
+    saved = saved_of(night.state, night.now_ns)
+    fresh = tracker_state(system="flao", mode=night.state.operator.mode)
+    again = Night(state=resumed(fresh, saved, WITH_LAW, night.now_ns))
+    again.now_ns = night.now_ns
+    again.meet(t_ns=again.now_ns, session="s2")
+    again.point(at(340.0, 70.0), after_s=60.0)
+    found = again.alpha.vector
+    expected = placed(340.0, 70.0).vector
+    assert found[[0, 1, 3]] == pytest.approx(expected[[0, 1, 3]])
+    assert np.cos(found[2] - expected[2]) == pytest.approx(1.0)
+
+
+def test_shifts_of_the_law_are_in_the_subapertures_of_the_first_mode():
+    modes = {
+        "fine": SensorModePolicy(subaperture_m=0.2, n_controlled=None),
+        "pyramid-30": SensorModePolicy(subaperture_m=0.4, n_controlled=None),
+    }
+    night = Night(policy=replace(WITH_LAW, sensor_modes=modes)).meet(t_ns=START_NS)
+    night.point(at(100.0, 20.0))
+    assert night.state.alpha.law.nominal.shift_x_subap == pytest.approx(0.1)

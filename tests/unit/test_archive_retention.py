@@ -177,8 +177,12 @@ async def test_little_room_is_an_alarm_until_there_is_more(archive, quick, monke
 async def test_who_pins_a_matrix_and_why_is_kept_and_told(archive):
     lines = []
     tracker = tracker_state(system="small", in_use="cm-03")
+
+    async def audited(entry):
+        lines.append(entry)
+
     service = SimpleNamespace(
-        archive=archive, audit=lines.append, snapshot=lambda: SimpleNamespace(tracker=tracker)
+        archive=archive, audited=audited, snapshot=lambda: SimpleNamespace(tracker=tracker)
     )
     transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:

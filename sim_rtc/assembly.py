@@ -14,7 +14,9 @@ from service.errors import ConfigurationError, ModelError
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import KarhunenLoeve, Normalisation
+from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, analytic_basis
+from service.model.pointing_law import ANGLES
 from service.model.slopes import Orientation
 from service.model.surface import mirror_surface
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
@@ -93,6 +95,31 @@ def _modes(instrument: Instrument) -> ModalBasis:
     return kept if isinstance(kept, ModalBasis) else analytic_basis(instrument)
 
 
+def _law_of(options: Options, instrument: Instrument) -> Callable[[float], Misregistration] | None:
+    """Return where the instrument's law of pointing has the mirror at a time; None: it has none.
+
+    Raises
+    ------
+    ConfigurationError
+        If the law is of more than the pointing, which nobody tells here.
+    """
+    law, elevation = instrument.law, options.elevation
+    if law is None:
+        return None
+    others = sorted(law.names - set(ANGLES))
+    if others:
+        raise ConfigurationError(
+            f"{instrument.name}: found a law of {', '.join(others)}; the simulated telescope has a "
+            f"law of {' and '.join(ANGLES)} alone"
+        )
+
+    def nominal(time_s: float) -> Misregistration:
+        now = elevation.at(time_s)
+        return law.at({"azimuth": now.azimuth_deg, "elevation": now.elevation_deg})
+
+    return nominal
+
+
 def _binned(
     options: Options, basis: ModalBasis, instrument: Instrument
 ) -> tuple[ModalBasis, Instrument]:
@@ -158,8 +185,13 @@ def build_telescope(
             sky.turbulence.prepare(response)
 
     draw = far_registration if options.far else random_registration
+    law = _law_of(options, instrument)
+    nominal = instrument.start if law is None else law(0.0)
+    start = options.alpha or draw(alpha_rng, nominal.rotation_rad)
     schedule = Schedule(
-        start=options.alpha or draw(alpha_rng, instrument.start.rotation_rad),
+        start=start,
+        corners_s=() if law is None else options.elevation.corners_s,
+        law=None if law is None else lambda time_s: law(time_s).vector - law(0.0).vector,
         drift=options.drift,
         flexure=options.flexure,
         walk=replace(options.walk, seed=int(alpha_rng.integers(2**63))),
@@ -183,7 +215,7 @@ def build_telescope(
         optics=optics,
         detector=detector,
         identity=identity,
-        reconstructor=initial_reconstructor(instrument, basis, identity, n_controlled),
+        reconstructor=initial_reconstructor(instrument, basis, identity, n_controlled, nominal),
         settings=LoopSettings(
             frame_rate_hz=options.frame_rate_hz,
             delay_frames=options.delay_frames,

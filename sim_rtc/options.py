@@ -91,12 +91,20 @@ class Options:
     )
     pointing: Elevation = several(
         "--elevation DEG[,DEG_PER_MIN]",
-        "of the telescope, in the status; what it does to the registration is yours to say with "
-        "--drift, --jump or --flexure (default: 60)",
+        "of the telescope, in the status; what it does to the registration, besides what the "
+        "instrument's law of pointing says, is --drift, --jump or --flexure (default: 60)",
         lambda start, rate=0.0: Elevation(start_deg=start, rate_deg_per_minute=rate),
         lambda start, rate=0.0: 0.0 <= start <= 90.0 and abs(rate) <= 10.0,
         ", 0 to 90 degrees and at most 10 per minute either way",
         absent=Elevation(),
+    )
+    azimuth: tuple[float, float] = several(
+        "--azimuth DEG[,DEG_PER_MIN]",
+        "of the telescope, in the status (default: 180)",
+        lambda start, rate=0.0: (start, rate),
+        lambda start, rate=0.0: abs(start) <= 360.0 and abs(rate) <= 60.0,
+        ", at most 360 degrees and 60 per minute either way",
+        absent=(180.0, 0.0),
     )
     slews: tuple[tuple[float, float], ...] = several(
         "--slew T:DEG",
@@ -396,7 +404,13 @@ class Options:
     @property
     def elevation(self) -> Elevation:
         """Elevation of the telescope over the run."""
-        return replace(self.pointing, slews=self.slews)
+        start_deg, rate = self.azimuth
+        return replace(
+            self.pointing,
+            slews=self.slews,
+            azimuth_deg=start_deg,
+            azimuth_rate_deg_per_minute=rate,
+        )
 
     @property
     def seeing(self) -> SeeingSchedule:

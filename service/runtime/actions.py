@@ -27,6 +27,7 @@ from service.tracking import alarms, products
 from service.tracking import events as ev
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import MeasurementRecord
+from service.tracking.pointing_law import registration_ahead
 from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 
@@ -445,6 +446,7 @@ def _there(state: TrackerState) -> wire.Status:
 
 
 def _registered(state: TrackerState) -> Registration:
+    """Return what matrices are made and judged for."""
     if state.alpha.registration is None:
         raise CommandError("α is not known")
-    return state.alpha.registration
+    return registration_ahead(state, state.alpha.registration)

@@ -19,7 +19,7 @@ from service.tracking import events as ev
 from service.tracking.events import Event
 from service.tracking.operations.acquisition_stages import set_acquisition
 from service.tracking.policy import SECOND_NS
-from service.tracking.registration import LawLeap, LawState, Purpose, moved
+from service.tracking.registration import LawLeap, LawState, Purpose, Registration, moved
 from service.tracking.state import TrackerState
 from service.tracking.step_context import StepContext
 from service.tracking.validity import (
@@ -43,6 +43,15 @@ degrees a second at most. Further is a leap of what is told."""
 
 BELIEVED_S = 3.0
 """A leap of the pointing that has stood for so long is believed."""
+
+LEAD_S = 6.0
+"""A matrix is made for the law so far ahead: it is judged and sent in half of that."""
+
+MAX_LEAD = np.array([0.2, 0.2, np.deg2rad(0.5), 0.008])
+"""A law that moves further in that time is of a telescope that slews, numeric units."""
+
+RATE_OVER_NS = 2 * SECOND_NS
+"""Over so long the rate of the law is taken."""
 
 SMEARED = np.array([0.1, 0.1, np.deg2rad(0.3), 0.004])
 """A window in which the law moved further tells no one place."""
@@ -95,6 +104,37 @@ def start_of_fit(
     if now is None or then is None:
         return alpha
     return then if alpha is None else _stepped(alpha, difference(now, then))
+
+
+def registration_ahead(state: TrackerState, registration: Registration) -> Registration:
+    """Return what a matrix is to be made for: α half its life ahead, and σ for all of it.
+
+    α ± 3σ so returned holds α ± 3σ of now and of twice ``LEAD_S`` from now, as the law moves.
+    Nothing can be made for a slew: then, and where nothing moves, it is what is known now.
+    """
+    step = LEAD_S * _rate(state)
+    if not step.any() or np.any(np.abs(step) > MAX_LEAD):
+        return registration
+    third, sigma = np.abs(step) / 3.0, registration.sigma
+    added = third**2 + 2.0 * sigma * third  # the root of σ² and this is σ and a third
+    return replace(
+        registration,
+        alpha=_stepped(registration.alpha, step),
+        covariance=registration.covariance + np.diag(added),
+    )
+
+
+def _rate(state: TrackerState) -> Array:
+    """Return how the law moves ``(4,)``, numeric units a second."""
+    way = state.alpha.law.way
+    if len(way) < 2:
+        return np.zeros(4)
+    (last_ns, last), first_ns = way[-1], way[0][0]
+    since_ns = max(last_ns - RATE_OVER_NS, first_ns)
+    then = law_at(state, since_ns)
+    if then is None or since_ns >= last_ns:
+        return np.zeros(4)
+    return difference(then, last) * (SECOND_NS / (last_ns - since_ns))
 
 
 def why_smeared(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:

@@ -20,6 +20,7 @@ from service.errors import WireError
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import BasisKind, SignalKind
+from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.sensors.registry import kind_of
 from service.wire import (
@@ -231,10 +232,13 @@ def truncated_inverse(interaction: Array32) -> Array32:
 
 
 def initial_reconstructor(
-    instrument: Instrument, basis: ModalBasis, identity: Identity, n_controlled: int
+    instrument: Instrument,
+    basis: ModalBasis,
+    identity: Identity,
+    n_controlled: int,
+    aligned: Misregistration,
 ) -> Reconstructor:
-    """Return the matrix before any flexure: the nominal model's inverse."""
-    aligned = instrument.start
+    """Return the matrix before any flexure: the inverse of the model where all is aligned."""
     fineness = 3 * instrument.binning
     model = InteractionModel(instrument, basis, pupil_sampling=fineness, detector_nodes=fineness)
     interaction = model.interaction_matrix(aligned)

@@ -33,6 +33,9 @@ _WALK_STEP_S = 20.0
 """Between two knots of a random walk: about what exact optics take to compute, with a margin."""
 
 _LONGEST_SEGMENT_S = 20.0
+_LAW_SEGMENT_S = 4.0
+"""Of a law of pointing: a slew takes seconds."""
+
 _SEGMENTS_PER_PERIOD = 12
 """Straight pieces of a sine: they leave it by 3 % of its amplitude at most."""
 
@@ -129,14 +132,24 @@ class Schedule:
     jumps: tuple[Jump, ...] = ()
     """In any order."""
 
+    law: Callable[[float], Array] | None = None
+    """Departure since time 0 by the law of pointing, at a time, numeric units; None: there is no
+    law."""
+
+    corners_s: tuple[float, ...] = ()
+    """Times at which that begins to move otherwise."""
+
     @property
     def drifts(self) -> bool:
         """Whether the registration changes between the jumps."""
-        return bool(np.any([self.drift.vector, self.flexure.vector, self.walk.vector]))
+        departures = [self.drift.vector, self.flexure.vector, self.walk.vector]
+        return self.law is not None or bool(np.any(departures))
 
     @property
     def segment_s(self) -> float:
         """Longest stretch over which the movement between the jumps is as good as straight."""
+        if self.law is not None:
+            return _LAW_SEGMENT_S
         if np.any(self.flexure.vector):
             return min(_LONGEST_SEGMENT_S, self.flexure.period_s / _SEGMENTS_PER_PERIOD)
         return _LONGEST_SEGMENT_S
@@ -145,6 +158,8 @@ class Schedule:
         """Return the registration at this time; a jump belongs to the time after it."""
         vector = self.start.vector + self.drift.offset(time_s)
         vector = vector + self.flexure.offset(time_s) + self.walk.offset(time_s)
+        if self.law is not None:
+            vector = vector + self.law(time_s)
         for jump in self.jumps:
             if jump.time_s <= time_s:
                 vector = vector + jump.vector
@@ -285,7 +300,8 @@ class MovingOptics:
             first = self._optics(schedule.alpha_at(start_s))
         last = first
         if schedule.drifts:
-            stop_s = min(stop_s, start_s + schedule.segment_s)
+            corners_s = (corner_s for corner_s in schedule.corners_s if corner_s > start_s)
+            stop_s = min(stop_s, start_s + schedule.segment_s, *corners_s)
             last = self._optics(schedule.alpha_before(stop_s))
         return _Segment(start_s=start_s, stop_s=stop_s, first=first, last=last)
 

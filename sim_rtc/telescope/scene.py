@@ -122,7 +122,7 @@ _HIGHEST_DEG: Final = 90.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Elevation:
-    """The elevation over a run; the azimuth stays, and neither moves the registration."""
+    """The pointing over a run; it moves the registration where the instrument has a law of it."""
 
     start_deg: float = 60.0
     rate_deg_per_minute: float = 0.0
@@ -132,6 +132,13 @@ class Elevation:
     """When each begins, seconds of loop time, and by how many degrees it goes up."""
 
     azimuth_deg: float = 180.0
+    azimuth_rate_deg_per_minute: float = 0.0
+
+    @property
+    def corners_s(self) -> tuple[float, ...]:
+        """Times at which it begins or ceases to slew."""
+        ends = (begin_s + abs(by_deg) / SLEW_DEG_PER_S for begin_s, by_deg in self.slews)
+        return tuple(sorted((*(begin_s for begin_s, _ in self.slews), *ends)))
 
     def at(self, time_s: float) -> Pointing:
         """Return the pointing at this time; it goes no further than the zenith."""
@@ -139,6 +146,5 @@ class Elevation:
         for begin_s, by_deg in self.slews:
             done_deg = min(max(time_s - begin_s, 0.0) * SLEW_DEG_PER_S, abs(by_deg))
             elevation += done_deg if by_deg > 0.0 else -done_deg
-        return Pointing(
-            elevation_deg=min(max(elevation, 0.0), _HIGHEST_DEG), azimuth_deg=self.azimuth_deg
-        )
+        azimuth = self.azimuth_deg + self.azimuth_rate_deg_per_minute * time_s / 60.0
+        return Pointing(elevation_deg=min(max(elevation, 0.0), _HIGHEST_DEG), azimuth_deg=azimuth)

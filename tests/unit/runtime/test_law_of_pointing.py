@@ -1,0 +1,108 @@
+"""A night under a field that turns: the whole service follows the law, and a slew keeps α."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
+from service.errors import ConfigurationError
+from service.runtime.worker import OpticsWorker
+from service.tracking.state import Mode
+from sim_rtc.assembly import build_telescope
+from sim_rtc.options import parse_options
+from studies.campaign.observatory import Observatory
+from studies.campaign.observatory_dome import Dome
+from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
+
+LAW = '\n[law]\nrotation_deg = "azimuth - 12.984 + 0.25 * (elevation - 60)"\n'
+
+
+class PointedDome(Dome):
+    """A telescope whose RTC tells where it points, as the simulated one does over the network."""
+
+    def __init__(self, words):
+        super().__init__(words)
+        self.elevation = parse_options(words).elevation
+
+    def status(self):
+        return replace(super().status(), pointing=self.elevation.at(self.time_s))
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("law") / "law.toml"
+    path.write_text(INSTRUMENT.read_text(encoding="utf-8") + LAW, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def night(file):
+    """Two degrees of azimuth a minute, and a slew of 8 degrees in elevation after 15 seconds."""
+    nominal_deg = 30.0 - 12.984
+    words = [
+        f"--instrument={file}",
+        "--plant=linear",
+        "--imperfections=ideal",
+        f"--n-controlled={N_CONTROLLED}",
+        "--seed=1",
+        "--azimuth=30,2",
+        "--slew=15:8",
+        f"--alpha=0.06,-0.04,{nominal_deg + 0.15},1.002",
+    ]
+    given = {"control.n_modes_target": N_CONTROLLED}
+    instrument = load_instrument(file)
+    policy = policy_of(load_settings(None, {}, given), instrument)
+    with threadpool_limits(1):
+        bench = OpticsWorker(instrument, COMPUTE)
+        dome = PointedDome(words)
+        found = Observatory(words, policy, Mode.AUTO, bench, with_poles=False, dome=dome)
+        found.parts = []
+        for seconds in (14.0, 10.5, 15.0):
+            found.advance(seconds)
+            found.parts.append((found.state, found.dome.alpha))
+    return found
+
+
+def error_in_sigma(state, true):
+    registration = state.alpha.registration
+    return np.abs(registration.alpha.vector - true.vector) / registration.sigma
+
+
+def test_alpha_is_followed_while_the_field_turns(night):
+    state, true = night.parts[0]
+    assert state.alpha.registration.n_windows >= 3
+    assert (error_in_sigma(state, true) < 5.0).all()
+    turned = np.rad2deg(true.rotation_rad) - (30.0 - 12.984 + 0.15)
+    assert turned == pytest.approx(2.0 * 14.0 / 60.0, abs=0.05)
+
+
+def test_after_a_slew_alpha_is_where_the_law_has_it(night):
+    """Two degrees of rotation further, one second after the telescope has come to rest."""
+    (before, _), (state, true) = night.parts[0], night.parts[1]
+    step = np.rad2deg(
+        state.alpha.registration.alpha.rotation_rad - before.alpha.registration.alpha.rotation_rad
+    )
+    assert step == pytest.approx(2.0 + 2.0 * 10.5 / 60.0, abs=0.1)
+    assert (error_in_sigma(state, true) < 6.0).all()
+
+
+def test_the_reconstructor_follows_and_nothing_is_the_matter_at_the_end(night):
+    state, true = night.parts[-1]
+    assert (error_in_sigma(state, true) < 5.0).all()
+    used = state.reconstructor(state.matrices.in_use)
+    assert not used.is_rtcs
+    assert np.rad2deg(abs(used.alpha.rotation_rad - true.rotation_rad)) < 1.0
+    assert {alarm.name for alarm in state.alarms.active} == set()
+    assert "registration.jump-suspected" not in [entry.name for entry in state.log]
+
+
+def test_the_simulator_has_laws_of_pointing_alone(file, tmp_path):
+    path = tmp_path / "other.toml"
+    text = file.read_text(encoding="utf-8").replace("azimuth -", "derotator -")
+    path.write_text(text, encoding="utf-8")
+    options = parse_options([f"--instrument={path}", "--seed=1"])
+    with pytest.raises(ConfigurationError, match="found a law of derotator"):
+        build_telescope(options, load_instrument(path))

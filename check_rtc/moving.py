@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -251,6 +252,9 @@ _STANDING: Final = 5
 NOISY: Final = 0.3
 """What other modes measure, over a mode's own, from which on it tells nothing."""
 
+NEIGHBOURS: Final = 10
+"""Modes next to a measured one that tell how noisy it is."""
+
 LIKELY: Final = (0.2, 3.0)
 """What a mode measures of itself by the matrix in use: optical gain, double pass."""
 
@@ -388,7 +392,10 @@ def _measured(found: MeasuredMatrix, request: MeasureRequest, in_use: MatrixInUs
         )
     by_modes = in_use.matrix @ matrix
     of_itself = np.diag(by_modes[list(modes)])
-    noise = float(np.median(np.abs(np.delete(by_modes, modes, axis=0))))
+    noise = max(
+        float(np.median(np.abs(_beside(column, modes, mode))))
+        for column, mode in zip(by_modes.T, modes, strict=True)
+    )
     if noise > NOISY * np.abs(of_itself).max():
         return skipped("measure", f"{list(matrix.shape)}; too noisy to compare: {noise:.2g}")
     own = " and ".join(f"{share:.2f}" for share in of_itself)
@@ -396,6 +403,17 @@ def _measured(found: MeasuredMatrix, request: MeasureRequest, in_use: MatrixInUs
     if (of_itself < LIKELY[0]).any() or (of_itself > LIKELY[1]).any():
         return wrong("measure", f"{text}, expected {LIKELY[0]:g} to {LIKELY[1]:g}: sign or unit")
     return fine("measure", text)
+
+
+def _beside(
+    column: NDArray[np.floating], measured: Sequence[int], mode: int
+) -> NDArray[np.floating]:
+    """Return what a measured column has of the modes next to its own: all noise.
+
+    Modes far off have another noise: a sensor's own, or turbulence, has most of the lowest.
+    """
+    others = np.setdiff1d(np.arange(len(column)), measured)
+    return column[others[np.argsort(np.abs(others - mode), kind="stable")[:NEIGHBOURS]]]
 
 
 def _refusal_of(client: RtcClient, command: Command) -> str:

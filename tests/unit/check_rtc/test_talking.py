@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from check_rtc import moving
 from check_rtc.examine import Examination, examine
 from check_rtc.requirements import REQUIREMENTS, Moves, Outcome
 from service.wire import AckState, CommandKind
@@ -258,6 +259,14 @@ def test_a_measurement_that_drowns_in_noise_is_no_fault():
     check = asked(Pretend(noise=1e8), "measure")["measure"]
     assert check.outcome is Outcome.SKIPPED
     assert "too noisy" in check.found
+
+
+def test_the_noise_of_a_measured_mode_is_that_of_the_modes_next_to_it():
+    """The lowest modes drown, the others do not: between them the measured one shows nothing."""
+    column = np.where(np.arange(60) < 20, 0.5, 0.01)
+    beside = moving._beside(column, (8, 50), 8)
+    np.testing.assert_array_equal(beside, np.full(moving.NEIGHBOURS, 0.5))
+    np.testing.assert_array_equal(moving._beside(column, (8, 50), 50), np.full(10, 0.01))
 
 
 # --- safety

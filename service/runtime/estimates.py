@@ -17,7 +17,7 @@ from service.estimation.dither_windows import EndedWindow
 from service.estimation.loop import loop_numbers
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
-from service.estimation.windows import ClosedLoop, Telemetry, WindowRefused
+from service.estimation.windows import ClosedLoop, RefusalKind, Telemetry, WindowRefused
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
@@ -117,6 +117,13 @@ async def _outcome(
     rtc, registration = state.loop.rtc, state.alpha.registration
     alpha = None if registration is None else registration.alpha
     start = start_of_fit(state, alpha, window.t_end_ns_utc)
+    if rtc is not None and window.session != rtc.session:
+        # the model may be of another mode of the sensor by now
+        return WindowRefused(
+            reason="the RTC has restarted since",
+            t_ns_utc=window.t_end_ns_utc,
+            kind=RefusalKind.VOID,
+        )
     if isinstance(window, Correlated):
         return await workers.call(OpticsWorker.fit_random, window, start)
     if state.operations.acquisition.uses_wide_capture:

@@ -83,11 +83,21 @@ function show() {
 for (const name of ["state", "lost", "tick", "reconstructors"]) service.addEventListener(name, show);
 service.addEventListener("reconstructors", () => showReconstructors(service, orders));
 setInterval(() => showReconstructors(service, orders), 10_000); // how long ago each was made
-service.addEventListener("reset", async () => {
+async function drawMirror() {
   try {
     mirror.mirror = registration.mirror = await service.get("v1/mirror");
   } catch {
     // the next reset asks again
+  }
+}
+service.addEventListener("reset", drawMirror);
+// a sensor that is binned otherwise has other subapertures, once its model is there
+let drawn;
+service.addEventListener("state", () => {
+  const { config_id } = service.state;
+  if (config_id !== drawn && service.state.ready) {
+    if (drawn !== undefined) drawMirror();
+    drawn = config_id;
   }
 });
 

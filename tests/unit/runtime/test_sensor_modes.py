@@ -1,6 +1,7 @@
 """A night with two changes of binning: α stays, in the subapertures of each mode."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from threadpoolctl import threadpool_limits
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.errors import ModelError
+from service.estimation.windows import RefusalKind
 from service.model.misregistration import BOUNDARY_SCALE
+from service.runtime.estimates import fitted
 from service.runtime.worker import OpticsWorker
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
@@ -191,3 +194,11 @@ def test_a_worker_that_begins_anew_enters_the_mode_before_anything_else(tmp_path
     assert worker.describe().n_slopes == worker.enter_mode("coarse").n_slopes
     with pytest.raises(ModelError, match="found mode third, expected one of: fine, coarse"):
         worker.enter_mode("third")
+
+
+async def test_a_window_of_a_session_before_is_not_fitted(night):
+    """The worker has another model by then: of another mode, it could only fail."""
+    window = SimpleNamespace(session="before", t_end_ns_utc=7)
+    lost = await fitted(window, night.state, workers=None, matrix_of=None)
+    assert (lost.refused.reason, lost.refused.t_ns_utc) == ("the RTC has restarted since", 7)
+    assert lost.refused.kind is RefusalKind.VOID

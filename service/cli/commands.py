@@ -47,6 +47,7 @@ _OPTIONS = {
     "connect": "zenoh.connect",
     "host": "api.host",
     "port": "api.port",
+    "cluster": "compute.cluster",
     "log_format": "service.log_format",
 }
 """Command-line options that stand for a settings key."""

@@ -291,6 +291,8 @@ def _describe_run(run: argparse.ArgumentParser) -> None:
     run.add_argument("--connect", metavar="ENDPOINT", help=router, type=endpoint)
     run.add_argument("--host", metavar="HOST", help="address of the REST API, default 127.0.0.1")
     run.add_argument("--port", metavar="PORT", help="port of the REST API, default 8080", type=port)
+    dask = "tcp://HOST:PORT of a Dask scheduler whose workers help with large telescopes"
+    run.add_argument("--cluster", metavar="ADDRESS", help=dask)
     run.add_argument("--log-format", help=formats, choices=logs)
 
 

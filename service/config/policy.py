@@ -148,6 +148,7 @@ def compute_of(settings: Settings) -> Compute:
     table = settings.compute
     return Compute(
         threads=table.threads,
+        cluster=table.cluster,
         nice=table.nice,
         sampling=Sampling(table.pupil_sampling, table.detector_nodes, table.working_point_modes),
         method=InversionMethod(settings.control.method),

@@ -270,6 +270,10 @@ class ComputeTable(Table):
     threads: int = Field(default=2, ge=1, le=256)
     """Threads of the worker process."""
 
+    cluster: str | None = Field(default=None, pattern=r"^(tcp|tls)://\S+:\d+$")
+    """Dask scheduler, ``tcp://HOST:PORT``, whose workers help with D of telescopes of 60
+    subapertures and more (extra ``cluster``). None: the worker computes alone."""
+
     nice: int = Field(default=10, ge=0, le=19)
     """Niceness of the worker."""
 

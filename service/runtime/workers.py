@@ -19,7 +19,7 @@ from service.runtime.snapshot import WorkerLoad
 from service.runtime.worker import Done, OpticsWorker, run_job
 from service.runtime.worker.records import patience_s
 from service.tracking import events as ev
-from service.tracking.alarms import WORKER_BEHIND, WORKER_LOST
+from service.tracking.alarms import CLUSTER_LOST, WORKER_BEHIND, WORKER_LOST
 from service.tracking.state import TrackerState
 
 P = ParamSpec("P")
@@ -70,6 +70,9 @@ class WorkerPool:
         self.n_lost = 0
         self.problem = ""
         """What is wrong with the worker, until one has done a job again; empty: nothing."""
+
+        self.cluster_problem = ""
+        """What is wrong with the cluster that is to help it, by its last job; empty: nothing."""
 
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the worker by name of the job, seconds; a job that fails is not in."""
@@ -159,6 +162,7 @@ class WorkerPool:
         finally:
             self._busy_s, self._busy_since_s = self.busy_s, None
         self.problem = ""
+        self.cluster_problem = done.cluster_problem
         self.cpu_s[name] += done.cpu_s
         self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
         self._limit_s[name] = max(MIN_LIMIT_S, LIMIT_RATIO * self._longest_s[name])
@@ -295,10 +299,14 @@ class WorkerLoadMeter:
         if lost:
             lost = f"{lost}; another one takes over, what it was at is lost. If it comes again: is "
             lost += "there memory enough, and does the machine get to run it?"
+        alone = self._workers.cluster_problem
+        if alone:
+            alone += "; until then the worker computes alone"
         keeps_up = "the worker keeps up with the telemetry again"
         return [
             *ev.ConditionChanged.detect(state, WORKER_LOST, lost, "the worker does its work again"),
             *ev.ConditionChanged.detect(state, WORKER_BEHIND, self._why_behind(), keeps_up),
+            *ev.ConditionChanged.detect(state, CLUSTER_LOST, alone, "the cluster helps again"),
         ]
 
     def _why_behind(self) -> str:

@@ -13,10 +13,12 @@ from tests.system.night import ROOT, wait_for
 class DaskCluster:
     """What an observatory starts with ``dask scheduler`` and ``dask worker``."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, port=0):
         self.folder = folder
-        self.scheduler = self._started("scheduler", "--port", "0", "--scheduler-file", "told.json")
         told = folder / "told.json"
+        told.unlink(missing_ok=True)
+        words = ("--port", str(port), "--scheduler-file", told.name)
+        self.scheduler = self._started("scheduler", *words)
         wait_for(lambda: told.exists() and told.read_text(), what="no scheduler")
         self.address = json.loads(told.read_text())["address"]
         self.workers = []
@@ -26,7 +28,7 @@ class DaskCluster:
         self.workers.append(
             self._started("worker", self.address, "--nthreads", "1", "--no-nanny", root=root)
         )
-        log = self.folder / "worker.log"
+        log = self.folder / "worker.log"  # of all of them, of those before as well
         wait_for(
             lambda: log.read_text().count("Registered to:") >= len(self.workers),
             60,
@@ -53,9 +55,9 @@ class DaskCluster:
 
 
 @contextlib.contextmanager
-def dask_cluster(folder, n_workers=2):
+def dask_cluster(folder, n_workers=2, port=0):
     """Give a cluster for as long as the block lasts."""
-    cluster = DaskCluster(folder)
+    cluster = DaskCluster(folder, port)
     try:
         for _ in range(n_workers):
             cluster.add_worker()

@@ -1,4 +1,4 @@
-"""Campaigns on a real Dask scheduler, with workers that die, and a scheduler that does."""
+"""Campaigns and a service on a real Dask scheduler; its workers die, and so does it."""
 
 import json
 import shutil
@@ -9,8 +9,9 @@ import pytest
 
 from service.errors import ClusterError
 from service.runtime.cluster import Cluster
+from tests.system.cable import free_port
 from tests.system.dask_cluster import dask_cluster
-from tests.system.night import INSTRUMENT, ROOT, wait_for
+from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.long]
@@ -118,3 +119,25 @@ def test_a_worker_of_another_pyrcal_is_named(tmp_path):
         dask.add_worker(other)
         with pytest.raises(ClusterError, match=r"found pyrcal .*\(code \w+\), expected pyrcal"):
             Cluster(dask.address)
+
+
+def test_a_service_names_a_cluster_that_is_gone_and_works_on(tmp_path):
+    def alarm():
+        return night.alarms.get("cluster-lost")
+
+    port = free_port()
+    with a_night(tmp_path) as night:
+        address = f"tcp://127.0.0.1:{port}"
+        with night.settings.open("a") as file:
+            file.write(f'[compute]\ncluster = "{address}"\n')
+        night.service()
+        night.rtc()
+        wait_for(alarm, 40.0, "an alarm of the cluster that is not there")
+        assert alarm().startswith(f"{address}: found no Dask scheduler there")
+        night.wait_for_modes(N_TARGET)
+        with dask_cluster(tmp_path, n_workers=1, port=port) as dask:
+            assert dask.address == address
+            wait_for(lambda: alarm() is None, 60.0, alarm)
+        wait_for(alarm, 60.0, "an alarm of the cluster that is gone")
+        assert "start it and its workers again" in alarm()
+        assert "worker-lost" not in night.alarms

@@ -8,6 +8,7 @@ make it row by row of subapertures, and never have it whole.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -22,6 +23,18 @@ Array = NDArray[Any]
 
 Mapper = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
 """Like the builtin ``map``; an executor's ``map`` spreads the work over rows."""
+
+
+class RowTask(ABC):
+    """A function of rows that may be sent to another process: megabytes, and no threads in it.
+
+    A mapper may share its rows with other machines; those of any other function stay here.
+    """
+
+    @abstractmethod
+    def __call__(self, row: int) -> Array:
+        """Return what there is of a row."""
+
 
 KEPT_BYTES = 1e9
 """Enough for K of 40 subapertures at every sampling; of the ELT it takes 3.8 GB."""

@@ -46,6 +46,9 @@ class Done(Generic[R]):
     cpu_s: float
     """Processor time of the whole worker process, all its threads, seconds."""
 
+    cluster_problem: str = ""
+    """What is wrong with the cluster that is to help it; empty: nothing."""
+
 
 def start_worker(instrument: Instrument, compute: Compute, early: Worker | None = None) -> Worker:
     """Return a nice'd worker process; nothing runs before the first job but what began early."""
@@ -64,7 +67,8 @@ def run_job(
     finally:
         optics.tidy()
         _return_memory()
-    return Done(result=result, cpu_s=time.process_time() - before_s)
+    spent_s = time.process_time() - before_s
+    return Done(result=result, cpu_s=spent_s, cluster_problem=optics.rows.problem)
 
 
 def _return_memory() -> None:

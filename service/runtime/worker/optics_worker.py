@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TypeVar
 
@@ -47,6 +46,7 @@ from service.runtime.worker.records import (
     outer_of,
     waits,
 )
+from service.runtime.worker.rows import SharedRows
 from service.runtime.worker.sensor import REACH, SensorAtWork, length, near_enough
 
 MAX_APPROACHES = 5
@@ -84,7 +84,7 @@ class OpticsWorker:
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
         check_controllable(instrument)
         self._disk_cache = DiskCache(compute.cache)
-        self._threads = ThreadPoolExecutor(compute.threads)
+        self.rows = SharedRows(compute.threads, compute.cluster)
         self._compute = compute
         self._mode_response: NDArray[np.float64] | None = None
         self._basis = self._disk_cache.basis(instrument)
@@ -101,7 +101,7 @@ class OpticsWorker:
                 pupil_sampling=sampling * binning,
                 detector_nodes=nodes * binning,
                 working_point=at_work,
-                mapper=self._threads.map,
+                mapper=self.rows.map,
                 mode_response=self._mode_response,
             )
 
@@ -223,7 +223,7 @@ class OpticsWorker:
             self._basis,
             near=at,
             response=self._sensor.at_unit_gain(at).matrix,
-            mapper=self._threads.map,
+            mapper=self.rows.map,
         )
         if instrument.slopes.orientation is not None or dialect.found is None or dialect.wrong:
             return dialect
@@ -313,7 +313,7 @@ class OpticsWorker:
                     basis,
                     pupil_sampling=sampling * binning,
                     detector_nodes=sampling * binning,
-                    mapper=self._threads.map,
+                    mapper=self.rows.map,
                     mode_response=None if every is None else every[list(modes)],
                 )
                 for sampling in (FAR_SAMPLING, COARSE_SAMPLING)

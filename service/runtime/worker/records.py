@@ -65,6 +65,9 @@ class Compute:
     threads: int = 2
     """Threads that share the rows of a product; BLAS itself keeps to one."""
 
+    cluster: str | None = None
+    """Address of a Dask scheduler whose workers help with rows; None: nobody does."""
+
     nice: int = 10
     sampling: Sampling = field(default_factory=Sampling)
 

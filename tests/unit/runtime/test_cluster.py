@@ -22,7 +22,7 @@ def scheduler():
         processes=False,
         protocol="tcp://",
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
     ) as found:
         yield found
 
@@ -75,7 +75,7 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch):
 def test_a_worker_that_comes_later_with_another_version_does_nothing():
     expected = {**own_versions(), "numpy": "1.0"}
     with pytest.raises(ClusterError, match=rf"found numpy {own_versions()['numpy']}, expected "):
-        module._perform(halved, expected, 4)
+        module._perform(4, halved, expected)
 
 
 def test_without_the_extra_it_is_said_what_to_install(monkeypatch):

@@ -20,7 +20,8 @@ class Clocks:
 
     def __init__(self):
         self.now_s = self.service_s = 0.0
-        self.busy_s, self.cpu_s, self.problem = 0.0, {}, ""
+        self.busy_s, self.cpu_s = 0.0, {}
+        self.problem = self.cluster_problem = ""
 
     def monotonic(self):
         return self.now_s
@@ -86,6 +87,18 @@ def test_a_worker_that_does_not_keep_up_is_named_with_cause_and_cure(clocks):
     assert "1.80 s of processor time for each second of telemetry (fit 1.44, margin" in trouble.text
     assert "the machine is too slow" in trouble.text
     assert "Windows are now 2.0 s long" in trouble.text
+
+
+def test_a_cluster_that_does_not_help_is_named_for_as_long_as_that_lasts(clocks):
+    meter = WorkerLoadMeter(clocks)
+    clocks.cluster_problem = "tcp://there:8786: found no Dask scheduler there"
+    (trouble,) = meter.detect_changes(QUIET)
+    assert (trouble.name, trouble.over) == ("cluster-lost", False)
+    assert trouble.text == f"{clocks.cluster_problem}; until then the worker computes alone"
+    clocks.cluster_problem = ""
+    (over,) = meter.detect_changes(alarmed("cluster-lost"))
+    assert (over.name, over.over) == ("cluster-lost", True)
+    assert meter.detect_changes(QUIET) == []
 
 
 def test_a_loaded_machine_is_told_from_a_slow_one(clocks):

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ModelError
 from service.model.kinds import Normalisation, SignalKind
@@ -20,7 +22,7 @@ from service.model.local import LocalShapes, Patch, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import Mapper
+from service.model.sensors.sensor import Mapper, RowTask
 from service.model.slopes import PLAIN, SlopeRecipe
 
 Array = NDArray[Any]
@@ -141,33 +143,51 @@ class PyramidOptics:
         With ``shapes`` it is the response to them, and the gradient exists for one row of
         subapertures at a time.
         """
-        roof_y = self._roof(shift[1], nodes_y or Nodes.area(self.n_nodes))
-        roof_x = self._roof(shift[0], nodes_x or Nodes.area(self.n_nodes))
-        fields = self._fields(roof_y, roof_x)
-        images = self._images(fields, roof_y, roof_x)
-        along_y, along_x = self._tilts()
-        modulated_x = self._modulated_x(roof_x, along_x)
-        finish = self._finish(shapes)
-        ends = np.cumsum(valid.sum(axis=1))
+        of_row = RowResponse(
+            optics=self,
+            valid=valid,
+            shift=shift,
+            shapes=shapes,
+            nodes_y=nodes_y or Nodes.area(self.n_nodes),
+            nodes_x=nodes_x or Nodes.area(self.n_nodes),
+        )
+        images = of_row.shared.images  # once, before several threads ask
         n_out = int(self.pupil.lit.sum()) if shapes is None else shapes.shape[1]
         gradient = np.empty((self.recipe.kind.n_planes, int(valid.sum()), n_out), self.dtype)
-
-        def light_of(row: int) -> Array:
-            """Put the signals of a row into their place; return its light."""
-            columns = np.flatnonzero(valid[row])
-            lines = finish(*self._row_factors(row, columns, fields, roof_y, along_y, modulated_x))
-            n_signals = len(gradient) * len(columns)
-            place = slice(ends[row] - len(columns), ends[row])
-            gradient[:, place] = lines[:n_signals].reshape(len(gradient), -1, n_out)
-            return lines[n_signals:].copy()
-
-        light = list(mapper(light_of, (int(row) for row in np.flatnonzero(valid.any(axis=1)))))
+        rows, light, end = np.flatnonzero(valid.any(axis=1)).tolist(), [], 0
+        for row, lines in zip(rows, mapper(of_row, rows), strict=True):
+            begin, end = end, end + int(valid[row].sum())
+            n_signals = len(gradient) * (end - begin)
+            gradient[:, begin:end] = lines[:n_signals].reshape(len(gradient), -1, n_out)
+            light.append(lines[n_signals:].copy())
         return LightGradient(
             images=images,
             gradient=gradient.reshape(-1, n_out),
             flux_gradient=self._flux_gradient(light, int(valid.sum())),
             recipe=self.recipe,
         )
+
+    def prepare(self, of_row: RowResponse) -> PreparedRows:
+        """Return what all rows of subapertures share."""
+        roof_y = self._roof(of_row.shift[1], of_row.nodes_y)
+        roof_x = self._roof(of_row.shift[0], of_row.nodes_x)
+        fields_at_rest = self._fields(roof_y, roof_x)
+        along_y, along_x = self._tilts()
+        return PreparedRows(
+            images=self._images(fields_at_rest, roof_y, roof_x),
+            fields=fields_at_rest,
+            roof_y=roof_y,
+            along_y=along_y,
+            modulated_x=self._modulated_x(roof_x, along_x),
+            finish=self._finish(of_row.shapes),
+        )
+
+    def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
+        """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
+        factors = self._row_factors(
+            row, columns, rows.fields, rows.roof_y, rows.along_y, rows.modulated_x
+        )
+        return rows.finish(*factors)
 
     @property
     def n_pairs(self) -> int:
@@ -354,6 +374,46 @@ class PyramidOptics:
             return shapes.combined(by_function.T)
 
         return respond
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PreparedRows:
+    """What all rows of subapertures share."""
+
+    images: NDArray[np.float64]
+    fields: Array
+    roof_y: _Roof
+    along_y: Array
+    modulated_x: Array
+    finish: Callable[[Array, Array], Array]
+    """What makes of a row's factors its gradient, or its response to shapes."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RowResponse(RowTask):
+    """The response of any row of subapertures."""
+
+    optics: PyramidOptics
+    valid: NDArray[np.bool_]
+    shift: tuple[float, float]
+    shapes: Shapes | None
+    nodes_y: Nodes
+    nodes_x: Nodes
+
+    @override
+    def __call__(self, row: int) -> Array:
+        """Return ``(n_lines, n_shapes)``: the signals plane by plane, then what normalises them."""
+        return self.optics.lines(row, np.flatnonzero(self.valid[row]), self.shared)
+
+    @cached_property
+    def shared(self) -> PreparedRows:
+        """What all rows share."""
+        return self.optics.prepare(self)
+
+    @override
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out what whoever gets it prepares by himself."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 def enough_modulation_points(wfs: Pyramid) -> int:

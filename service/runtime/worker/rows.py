@@ -1,0 +1,140 @@
+"""Spread rows over the worker's own threads and, where it pays, a Dask cluster that helps.
+
+The cluster is never waited for: threads take rows from the first on, it takes them from the last,
+and a row that it has not answered when a thread is free is computed here as well. Whatever becomes
+of it costs time alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+from service.errors import ClusterError
+from service.model.sensors.sensor import RowTask
+from service.runtime.cluster import Cluster
+
+ROW_S = 0.2
+"""A row that takes less is not worth a task: Dask and the way there take some milliseconds,"""
+
+PAYS_S = 4.0
+"""nor is work that takes the threads here less: to send the shapes takes tenths of a second."""
+
+LOOK_S = 10.0
+"""Between two looks for the cluster, whether it is there or not."""
+
+Row = Callable[[int], Any]
+
+
+class SharedRows:
+    """A mapper of rows: threads here, and the cluster at an address, if one is given."""
+
+    def __init__(self, n_threads: int, address: str | None = None) -> None:
+        self._threads = ThreadPoolExecutor(n_threads)
+        self._n_threads = n_threads
+        self._cluster: Cluster | None = None
+        self.problem = ""
+        """What is wrong with the cluster; empty: nothing, or there is to be none."""
+
+        if address is not None:
+            threading.Thread(target=self._watch, args=(address,), daemon=True).start()
+
+    def map(self, function: Row, rows: Iterable[int]) -> Iterator[Any]:
+        """Yield what a function makes of each row, in their order."""
+        rows, cluster = list(rows), self._cluster
+        if cluster is None or len(rows) < 2 or not isinstance(function, RowTask):
+            yield from self._threads.map(function, rows)
+            return
+        begun = time.monotonic()
+        yield function(rows[0])
+        row_s = time.monotonic() - begun
+        if row_s < ROW_S or row_s * len(rows) / self._n_threads < PAYS_S:
+            yield from self._threads.map(function, rows[1:])
+        else:
+            yield from self._shared(cluster, function, rows[1:])
+
+    def _shared(self, cluster: Cluster, function: Row, rows: list[int]) -> Iterator[Any]:
+        answers: list[Future[Any]] = [Future() for _ in rows]
+        enough, places = threading.Event(), itertools.count()
+        help_out = partial(self._have_help, cluster, function, rows, answers, enough)
+        threading.Thread(target=help_out, daemon=True).start()
+        for _ in range(self._n_threads):
+            self._threads.submit(_compute, function, rows, answers, places, enough)
+        try:
+            for place in range(len(answers)):
+                yield answers[place].result()
+                answers[place] = _TAKEN
+        finally:
+            enough.set()
+
+    def _have_help(
+        self,
+        cluster: Cluster,
+        function: Row,
+        rows: list[int],
+        answers: list[Future[Any]],
+        enough: threading.Event,
+    ) -> None:
+        try:
+            backwards = cluster.each(function, rows[::-1], is_large=True, enough=enough)
+            for number, answer in backwards:
+                _give(answers[-1 - number], answer)
+        except ClusterError as error:
+            self._let_go(cluster, str(error))
+        except Exception as error:  # noqa: BLE001 - the same row is computed here, and may fail so
+            self._let_go(cluster, f"{cluster.address}: a row failed there: {error!r}")
+
+    def _watch(self, address: str) -> None:
+        """Connect, see that the cluster is still there, connect again, for good."""
+        while True:
+            cluster = self._cluster
+            try:
+                if cluster is None:
+                    self._cluster, self.problem = Cluster(address), ""
+                else:
+                    cluster.check()
+            except ClusterError as error:
+                self._let_go(cluster, str(error))
+            time.sleep(LOOK_S)
+
+    def _let_go(self, cluster: Cluster | None, problem: str) -> None:
+        if self._cluster is cluster:
+            self._cluster, self.problem = None, problem
+        if cluster is not None:
+            cluster.close()
+
+
+_TAKEN: Future[Any] = Future()
+"""In the place of an answer that is not needed any more."""
+_TAKEN.set_result(None)
+
+
+def _give(answer: Future[Any], found: Any) -> None:  # noqa: ANN401 - a row of anything
+    with contextlib.suppress(InvalidStateError):  # somebody else was faster
+        answer.set_result(found)
+
+
+def _compute(
+    function: Row,
+    rows: list[int],
+    answers: list[Future[Any]],
+    places: Iterator[int],
+    enough: threading.Event,
+) -> None:
+    """Compute one row after another that has no answer, though the cluster may be at it."""
+    for place in places:
+        if place >= len(rows) or enough.is_set():
+            return
+        answer = answers[place]
+        if not answer.done():
+            try:
+                _give(answer, function(rows[place]))
+            except BaseException as error:  # noqa: BLE001 - raised where rows are put together
+                with contextlib.suppress(InvalidStateError):
+                    answer.set_exception(error)

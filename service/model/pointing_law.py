@@ -2,7 +2,7 @@
 
 A mirror on a mount that turns, behind a derotator or below a bending tube has no nominal place but
 at one pointing. Expressions are arithmetic alone: nothing in them can be called but a few functions
-of numbers.
+of numbers. Quick to import: mathematics come with the answers.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Final
-
-import numpy as np
+from typing import TYPE_CHECKING, Final
 
 from service.errors import ModelError
-from service.model.misregistration import Misregistration
+
+if TYPE_CHECKING:
+    from service.model.misregistration import Misregistration
 
 ANGLES: Final = ("azimuth", "elevation")
 """Names of what the pointing tells, degrees."""
@@ -105,7 +105,11 @@ class Term:
             raise ModelError(f"{self.expression} is no number now: {error}") from error
         if isinstance(found, complex) or not math.isfinite(found):
             raise ModelError(f"{self.expression} is no number now: {found}")
-        return float(np.interp(found, self.at, self.values)) if self.at else found
+        if not self.at:
+            return found
+        from numpy import interp
+
+        return float(interp(found, self.at, self.values))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -131,6 +135,8 @@ class PointingLaw:
         ModelError
             If one of its numbers is none, or no registration can have it.
         """
+        from service.model.misregistration import Misregistration
+
         found = {
             field.name: term.value(reported)
             for field in fields(self)

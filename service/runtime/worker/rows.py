@@ -29,6 +29,9 @@ PAYS_S = 4.0
 LOOK_S = 10.0
 """Between two looks for the cluster, whether it is there or not."""
 
+HELP = "help of the cluster"
+"""Name of the thread that takes in what the cluster answers."""
+
 Row = Callable[[int], Any]
 
 
@@ -63,7 +66,7 @@ class SharedRows:
         answers: list[Future[Any]] = [Future() for _ in rows]
         enough, places = threading.Event(), itertools.count()
         help_out = partial(self._have_help, cluster, function, rows, answers, enough)
-        threading.Thread(target=help_out, daemon=True).start()
+        threading.Thread(target=help_out, name=HELP, daemon=True).start()
         for _ in range(self._n_threads):
             self._threads.submit(_compute, function, rows, answers, places, enough)
         try:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from service.control.loop import ControlLoop, loop_modes
@@ -22,6 +23,7 @@ from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]
 Coupling = NDArray[np.float32]
+Symmetric = NDArray[np.floating]
 
 NEAR = 0.02
 """Where everything is within the bound the largest radius is sought no closer than this: each point
@@ -32,6 +34,9 @@ ROUNDING = 1e-3
 
 _BORDER = 24
 """Points on each side of a rectangle."""
+
+_MANY = 1000
+"""Modes from which on a proven bound is cheaper than all eigenvalues."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,12 +174,58 @@ def _ceilings(
 
 
 def _extent(matrix: Coupling) -> NDArray[np.float64]:
-    """Return least and largest real part and largest imaginary part of the numerical range."""
+    """Return least and largest real part and largest imaginary part of the numerical range.
+
+    Of many modes they are bounds, about ``ROUNDING`` further out.
+    """
     even, odd = (matrix + matrix.T) / 2, (matrix - matrix.T) / 2
-    real = np.linalg.eigvalsh(even)
-    turn = np.sqrt(np.maximum(np.linalg.eigvalsh(odd.T @ odd)[-1], 0.0))
-    slack = ROUNDING * max(abs(real[0]), abs(real[-1]), turn)
-    return np.array([real[0] - slack, real[-1] + slack, turn + slack], dtype=np.float64)
+    ends = _ends if len(matrix) < _MANY else _proven_ends
+    low, high = ends(even)
+    turn = np.sqrt(max(ends(odd.T @ odd)[1], 0.0))
+    slack = ROUNDING * max(abs(low), abs(high), turn)
+    return np.array([low - slack, high + slack, turn + slack], dtype=np.float64)
+
+
+def _ends(symmetric: Symmetric) -> tuple[float, float]:
+    """Return the least and the largest eigenvalue."""
+    values = np.linalg.eigvalsh(symmetric)
+    return float(values[0]), float(values[-1])
+
+
+def _proven_ends(symmetric: Symmetric) -> tuple[float, float]:
+    """Return what no eigenvalue is below, and none above."""
+    return -_proven_largest(-symmetric), _proven_largest(symmetric)
+
+
+def _proven_largest(symmetric: Symmetric) -> float:
+    """Return what no eigenvalue exceeds, at a tenth of the cost of all of them.
+
+    Lanczos guesses the largest. That none lies beyond is proven: the matrix that is left of so many
+    times the identity has a Cholesky factor. A guess that is too low is raised until it has, up to
+    the largest sum of a row's sizes, which needs no proof.
+    """
+    surely = float(np.abs(symmetric).sum(axis=0).max())
+    typical = float(np.linalg.norm(symmetric)) / len(symmetric) ** 0.5
+    start = np.random.default_rng(0).standard_normal(len(symmetric)).astype(symmetric.dtype)
+    try:
+        largest = float(
+            scipy.sparse.linalg.eigsh(
+                symmetric, k=1, which="LA", v0=start, tol=ROUNDING, return_eigenvectors=False
+            )[0]
+        )
+    except scipy.sparse.linalg.ArpackError:
+        return surely
+    margin: float = ROUNDING * max(abs(largest), typical)
+    while largest + margin < surely:
+        rest = -symmetric
+        rest[np.diag_indices_from(rest)] += largest + margin
+        try:
+            scipy.linalg.cholesky(rest, overwrite_a=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            margin *= 2.0
+        else:
+            return largest + margin
+    return surely
 
 
 def _largest_on_border(extent: NDArray[np.float64], loop: ControlLoop) -> float:

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
+from service.control import gate
 from service.control.gate import FORGIVING_LEAK, HELD_LIMIT_M, LIMIT_M, NEAR, judge
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
@@ -294,8 +296,11 @@ def every_radius(matrix, truth, covariance, loop):
     return np.array(radii)
 
 
+@pytest.mark.parametrize("many", [False, True], ids=["few modes", "as of thousands"])
 @pytest.mark.parametrize("seed", range(30))
-def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed):
+def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed, many, monkeypatch):
+    if many:
+        monkeypatch.setattr(gate, "_MANY", 1)
     rng = np.random.default_rng(seed)
     away = rng.normal(0.0, [0.1, 0.1, 0.08, 0.01])
     truth = Misregistration.from_vector(Misregistration().vector + away)
@@ -314,6 +319,49 @@ def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed):
     assert found.worst_pole_radius <= radii.max() + 1e-3
     if found.accepted:
         assert found.worst_pole_radius >= radii.max() - NEAR
+
+
+def symmetric(kind, n=60):
+    rng = np.random.default_rng(4)
+    axes, _ = np.linalg.qr(rng.normal(size=(n, n)))
+    values = {
+        "spread": np.linspace(-3.0, 2.0, n),
+        "negative": np.linspace(-3.0, -1e-4, n),
+        "nearly all alike": np.append(np.full(n - 1, 0.5), 0.5 + 1e-5),
+        "one far out": np.append(np.zeros(n - 1), 7.0),
+        "nothing": np.zeros(n),
+    }[kind]
+    return (axes * values @ axes.T).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "kind", ["spread", "negative", "nearly all alike", "one far out", "nothing"]
+)
+def test_no_eigenvalue_is_beyond_a_proven_end_and_the_end_is_near(kind):
+    matrix = symmetric(kind)
+    values = np.linalg.eigvalsh(matrix.astype(float))
+    low, high = gate._proven_ends(matrix)
+    size = np.abs(values).max()
+    assert values[0] - 5e-3 * size - 1e-9 <= low <= values[0] + 1e-5 * size + 1e-9
+    assert values[-1] - 1e-5 * size - 1e-9 <= high <= values[-1] + 5e-3 * size + 1e-9
+
+
+def test_a_guess_that_is_too_low_is_raised_until_it_is_proven(monkeypatch):
+    """Lanczos may miss an end: then the proof fails, and the end is moved."""
+    monkeypatch.setattr(scipy.sparse.linalg, "eigsh", lambda *_, **__: np.array([1.0]))
+    matrix = symmetric("one far out")
+    assert gate._proven_largest(matrix) >= 7.0 - 1e-5
+
+
+def test_a_guess_that_does_not_come_leaves_the_largest_sum_of_a_row(monkeypatch):
+    def never(*_, **__):
+        raise scipy.sparse.linalg.ArpackNoConvergence("no", np.array([]), np.array([]))
+
+    monkeypatch.setattr(scipy.sparse.linalg, "eigsh", never)
+    matrix = symmetric("spread")
+    expected = float(np.abs(matrix).sum(axis=0).max())
+    assert gate._proven_largest(matrix) == pytest.approx(expected)
+    assert expected >= 2.0
 
 
 def test_a_fresh_matrix_is_judged_at_few_points(monkeypatch):

@@ -96,6 +96,7 @@ class InteractionModel:
         self._modes: _Last[Shapes] = _Last()
         local = isinstance(basis, ModalBasis) and basis.is_local
         self._tiles = tiles_of(self.pupil) if local else ()
+        self._combination = basis.coefficients.astype(dtype) if local else None
 
     def forget(self) -> None:
         """Give back the memory of the last response and the last rendered modes."""
@@ -263,7 +264,7 @@ class InteractionModel:
             patches=tuple(self._map(patch, range(len(self._tiles)))),
             n_points=int(self.pupil.lit.sum()),
             n_functions=len(basis.coefficients),
-            combination=basis.coefficients.astype(self._dtype),
+            combination=self._combination,
         )
         return shapes if shapes.is_cheaper else shapes.array()
 

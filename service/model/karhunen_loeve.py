@@ -12,6 +12,7 @@ from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.local import LocalShapes, Patch, tiles_of
 from service.model.pupil import instrument_pupil
+from service.model.sensors.sensor import by_rows
 from service.model.surface import Gaussian, Surface
 from service.model.turbulence import (
     SAMPLING,
@@ -30,7 +31,7 @@ _DEGENERATE = 1e-3
 _FINER = 4
 """Points a subaperture on which modes are orthonormal."""
 
-_WHOLE_BYTES = 1e9
+WHOLE_BYTES = 2.5e8
 """Functions of which a table over the pupil is larger are known tile by tile, if they end."""
 
 
@@ -69,7 +70,7 @@ def surface_statistics(instrument: Instrument, surface: Surface) -> tuple[Array,
     if functions is not None:
         return local_statistics(instrument, functions)
     influence = _influence(surface)
-    return pupil_statistics(instrument, lambda points: surface.basis(points) @ influence)
+    return pupil_statistics(instrument, lambda points: _heights(surface, influence, points))
 
 
 def _gram(instrument: Instrument, surface: Surface, strokes: Array) -> Array:
@@ -79,8 +80,14 @@ def _gram(instrument: Instrument, surface: Surface, strokes: Array) -> Array:
     if functions is not None:
         return np.asarray(strokes.T @ pupil_gram(functions, weights) @ strokes)
     points = instrument_pupil(instrument, _FINER).points
-    shapes = piston_free(surface.basis(points) @ (_influence(surface) @ strokes), weights)
+    heights = _heights(surface, _influence(surface) @ strokes, points)
+    shapes = piston_free(heights, weights)
     return np.asarray(shapes.T @ (shapes * weights[:, None]))
+
+
+def _heights(surface: Surface, coefficients: Array, points: Array) -> Array:
+    """Return shapes at points; the surface's own functions are never there for all of them."""
+    return by_rows(map, lambda some: surface.basis(some) @ coefficients, points)
 
 
 def _influence(surface: Surface) -> Array:
@@ -91,7 +98,7 @@ def _local(instrument: Instrument, surface: Surface, sampling: int) -> LocalShap
     """Return the actuators' functions tile by tile; None: they do not end, or are small whole."""
     pupil = instrument_pupil(instrument, sampling)
     n_points, n_functions = int(pupil.lit.sum()), len(surface.positions)
-    if not isinstance(surface, Gaussian) or 8.0 * n_points * n_functions < _WHOLE_BYTES:
+    if not isinstance(surface, Gaussian) or 8.0 * n_points * n_functions < WHOLE_BYTES:
         return None
     patches = []
     for tile in tiles_of(pupil):

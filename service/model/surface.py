@@ -70,12 +70,17 @@ class Gaussian:
     coupling: float
     """Height at one pitch, 0..1."""
 
+    @property
+    def reach(self) -> float:
+        """Distance at which a function is ``NOTHING`` high, in the units of ``positions``."""
+        return float(self.pitch * np.sqrt(np.log(NOTHING) / np.log(self.coupling)))
+
     def near(self, points: Array) -> NDArray[np.intp]:
         """Return which functions are higher than ``NOTHING`` at any of some points close together.
 
         ``points`` is ``(n_points, 2)``.
         """
-        reach = self.pitch * np.sqrt(np.log(NOTHING) / np.log(self.coupling))
+        reach = self.reach
         middle = points.mean(axis=0)
         around = np.linalg.norm(points - middle, axis=1).max()
         apart = np.linalg.norm(self.positions - middle, axis=1)

@@ -150,6 +150,7 @@ def compute_of(settings: Settings) -> Compute:
         threads=table.threads,
         cluster=table.cluster,
         nice=table.nice,
+        memory_gb=table.memory_gb,
         sampling=Sampling(table.pupil_sampling, table.detector_nodes, table.working_point_modes),
         method=InversionMethod(settings.control.method),
         max_condition=settings.control.max_condition,

@@ -283,6 +283,10 @@ class ComputeTable(Table):
     detector_nodes: int = Field(default=3, ge=1, le=16)
     """Quadrature nodes per detector pixel and axis (nd of the model)."""
 
+    memory_gb: Positive = 4.0
+    """Memory that modes, D and its derivatives may take, GB: an instrument that needs more is
+    refused before it is begun. A sensor keeps its own gradient within a quarter of it."""
+
     working_point_modes: int | None = Field(default=None, ge=1)
     """Use the response around the residual of a loop of this many modes at the instrument's r0:
     less biased on sky, and slower. None: around a flat wavefront."""

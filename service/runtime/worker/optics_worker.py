@@ -82,7 +82,7 @@ class OpticsWorker:
     """
 
     def __init__(self, instrument: Instrument, compute: Compute) -> None:
-        check_controllable(instrument)
+        check_controllable(instrument, compute)
         self._disk_cache = DiskCache(compute.cache)
         self.rows = SharedRows(compute.threads, compute.cluster)
         self._compute = compute
@@ -101,6 +101,7 @@ class OpticsWorker:
                 pupil_sampling=sampling * binning,
                 detector_nodes=nodes * binning,
                 working_point=at_work,
+                kept_bytes=compute.kept_bytes,
                 mapper=self.rows.map,
                 mode_response=self._mode_response,
             )

@@ -18,9 +18,12 @@ from service.estimation.description import Actuators
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
 from service.model.kinds import Influence
+from service.model.memory import GB, work_of
 from service.model.misregistration import Determination
 from service.model.modes import ModalBasis
+from service.model.pupil import instrument_pupil
 from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import Fineness
 
 _Job = TypeVar("_Job", bound=Callable[..., Any])
 
@@ -69,6 +72,9 @@ class Compute:
     """Address of a Dask scheduler whose workers help with rows; None: nobody does."""
 
     nice: int = 10
+    memory_gb: float = 4.0
+    """That modes, D and its derivatives may take; a quarter of it for what a sensor keeps."""
+
     sampling: Sampling = field(default_factory=Sampling)
 
     method: InversionMethod = InversionMethod.SVD
@@ -86,6 +92,11 @@ class Compute:
 
     cache: Path | None = None
     """Folder of what is prepared once; None: it is computed every time."""
+
+    @property
+    def kept_bytes(self) -> float:
+        """What a sensor may keep for the next matrix; the worker has up to four of them."""
+        return self.memory_gb * GB / 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,13 +142,13 @@ def outer_of(model: RtcInteractionModel) -> NDArray[np.float64] | None:
     return actuators.strokes[actuators.outer]
 
 
-def check_controllable(instrument: Instrument) -> None:
-    """Refuse what can be fitted offline, but not controlled with.
+def check_controllable(instrument: Instrument, compute: Compute) -> None:
+    """Refuse what can be fitted offline, but not controlled with, and what does not fit in memory.
 
     Raises
     ------
     ModelError
-        If the stroke is unknown, or the RTC delivers frames.
+        If the stroke is unknown, the RTC delivers frames, or D is too large.
     """
     if not instrument.mirror.stroke_known:
         raise ModelError(
@@ -148,6 +159,23 @@ def check_controllable(instrument: Instrument) -> None:
         raise ModelError(
             f"{instrument.name}: found wfs.input = frames; expected slopes, which is what an RTC "
             "sends (pyrcal fit takes frames)"
+        )
+    _check_memory(instrument, compute)
+
+
+def _check_memory(instrument: Instrument, compute: Compute) -> None:
+    """Refuse what would not fit, before any of it is taken."""
+    sampling, nodes, _ = compute.sampling
+    pupil = instrument_pupil(instrument, sampling * instrument.binning)
+    fineness = Fineness(n_nodes=nodes * instrument.binning, kept_bytes=compute.kept_bytes)
+    sensor = kind_of(instrument).sensor(instrument, pupil, fineness)
+    needed = work_of(instrument, sensor, pupil)
+    if needed.memory_bytes > compute.memory_gb * GB:
+        raise ModelError(
+            f"{instrument.name}: found {sensor.n_signals} slopes and {instrument.modes.n_modes} "
+            f"modes, whose D and derivatives take {needed.memory_bytes / GB:.1f} GB and "
+            f"{needed.flop / 1e12:.2g} TFLOP; expected at most compute.memory_gb = "
+            f"{compute.memory_gb:g}: allow more, or ask for fewer modes or a coarser pupil_sampling"
         )
 
 

@@ -1,0 +1,85 @@
+"""What an instrument's matrices take in memory and work, known before anything is computed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.model.instrument import Instrument, Mirror
+from service.model.karhunen_loeve import WHOLE_BYTES
+from service.model.local import TILE_SUBAP
+from service.model.pupil import PupilGrid
+from service.model.sensors.sensor import Sensor, Work
+from service.model.surface import Gaussian, mirror_surface
+
+GB = 1e9
+
+PROGRAM_BYTES = 0.13e9
+"""Python with its libraries."""
+
+_N_MATRICES = 5
+"""D and its four derivatives."""
+
+_OF_STATISTICS = 7.5
+"""Squares of the actuators, float64, while KL modes are made of functions known tile by tile."""
+
+
+def work_of(instrument: Instrument, sensor: Sensor, pupil: PupilGrid) -> Work:
+    """Return what the modes, and then D with its four derivatives, take at their largest.
+
+    All in one thread, the program included; its libraries may keep a little more.
+    """
+    n_points, n_modes = float(pupil.lit.sum()), instrument.modes.n_modes
+    kept, making = _of_modes(instrument)
+    near = _near(instrument)
+    n_functions = _n_functions(instrument)
+    by_tiles = n_points * near + float(n_functions * n_modes)
+    product = 2.0 * sensor.n_signals * min(by_tiles, n_points * n_modes)
+    together = 1 if sensor.keeps_gradient else _N_MATRICES
+    if by_tiles < n_points * n_modes:
+        shapes = 4.0 * n_functions * n_modes + 12.0 * together * n_points * near
+    else:
+        shapes = 20.0 * n_points * n_modes
+    results = _N_MATRICES * 4.0 * sensor.n_signals * n_modes
+    response = sensor.work(0)
+    linearising = kept + results + max(response.memory_bytes + shapes, results)
+    return Work(
+        memory_bytes=PROGRAM_BYTES + max(making, linearising),
+        flop=response.flop + _N_MATRICES * product,
+    )
+
+
+def _n_functions(instrument: Instrument) -> int:
+    mirror = instrument.mirror
+    return len(mirror.positions_m) if isinstance(mirror, Mirror) else instrument.modes.n_modes
+
+
+def _of_modes(instrument: Instrument) -> tuple[float, float]:
+    """Return bytes of the modes as they are kept, and while they are made."""
+    mirror = instrument.mirror
+    if not isinstance(mirror, Mirror):
+        return 2.0 * mirror.cube.nbytes, 3.0 * mirror.cube.nbytes
+    n_actuators = float(len(mirror.positions_m))
+    surface = mirror_surface(mirror, instrument.subaperture_m)
+    local = isinstance(surface, Gaussian)
+    kept = (1.0 if local else 2.0) * 8.0 * n_actuators * instrument.modes.n_modes
+    n_points = 9.0 * np.pi / 4 * instrument.wfs.pupil_diameter**2
+    whole = 8.0 * n_points * n_actuators
+    if local and whole >= WHOLE_BYTES:
+        return kept, kept + _OF_STATISTICS * 8.0 * n_actuators**2
+    n_modes = instrument.modes.n_modes
+    tables = max(3.3 * n_actuators, 3.0 * (4 / 3) ** 2 * n_modes)
+    return kept, kept + 8.0 * (n_points * tables + 3.0 * n_actuators**2)
+
+
+def _near(instrument: Instrument) -> float:
+    """Return how many functions reach a tile of the pupil, about."""
+    mirror = instrument.mirror
+    if not isinstance(mirror, Mirror):
+        return float(instrument.modes.n_modes)
+    surface = mirror_surface(mirror, instrument.subaperture_m)
+    n_actuators = float(len(mirror.positions_m))
+    if not isinstance(surface, Gaussian):
+        return n_actuators
+    reach = surface.reach
+    area = TILE_SUBAP**2 + 4 * TILE_SUBAP * reach + np.pi * reach**2
+    return float(min(n_actuators, area / surface.pitch**2))

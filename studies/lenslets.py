@@ -27,6 +27,7 @@ from service.estimation.reference import Reference
 from service.model.instrument import Instrument
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import ModalBasis, modal_basis
+from service.model.pupil import instrument_pupil
 from studies.peers import KEPT, ROOT, environment
 
 Array = NDArray[Any]
@@ -91,9 +92,13 @@ class Case:
     told: bool = True
     """Whether the instrument file tells it, so that partly lit subapertures are left out."""
 
+    binary: bool = False
+    """Whether a cell of the peer's pupil is lit or dark, as shipped; else the share that is lit."""
+
 
 CASES = (
     *(Case(peer=peer, truth=truth) for peer in ("oopao", "specula") for truth in TRUTHS),
+    Case(peer="oopao", truth="small", binary=True),
     Case(peer="oopao", truth="small", threshold=0.01),
     Case(peer="oopao", truth="small", threshold=0.01, told=False),
     Case(peer="specula", truth="small", threshold=0.01),
@@ -125,7 +130,7 @@ def basis() -> ModalBasis:
 def measured(case: Case) -> tuple[Array, Array]:
     """Return the peer's matrix and its valid subapertures, measured now unless kept."""
     folder = KEPT / case.peer
-    kept = folder / f"lenslets-{case.truth}-{case.threshold:g}.npz"
+    kept = folder / f"lenslets-{case.truth}-{case.threshold:g}{'-binary' * case.binary}.npz"
     if not kept.exists():
         about, alpha = instrument(case), TRUTHS[case.truth]
         side = SAMPLING * about.wfs.n_subapertures
@@ -135,13 +140,16 @@ def measured(case: Case) -> tuple[Array, Array]:
         rows = np.array_split(on_mirror, 64)
         modes = basis().subset(MODES)
         shapes = np.concatenate([modes.render(some).astype(np.float32) for some in rows])
+        amplitude = instrument_pupil(about, SAMPLING).amplitude
+        if case.binary:
+            amplitude = (amplitude >= 0.5).astype(float)
         job = folder / "lenslets-job.npz"
         job.parent.mkdir(parents=True, exist_ok=True)
         np.savez(
             job,
             shapes=shapes.T.reshape(-1, side, side),
             diameter_m=about.diameter_m,
-            obscuration_ratio=about.obscuration_ratio,
+            amplitude=amplitude,
             wavelength_m=WAVELENGTH_M,
             n_subapertures=about.wfs.n_subapertures,
             n_pixels=6,
@@ -180,7 +188,7 @@ def row(case: Case) -> str:
     cells = " | ".join(f"{e:+.5f} ± {s:.5f}" for e, s in zip(error, sigma, strict=True))
     threshold = f"{case.threshold:g}{'' if case.told or not case.threshold else ', not told'}"
     return (
-        f"| {case.peer} | {case.truth} | {threshold} | {cells} | "
+        f"| {case.peer}{', binary pupil' * case.binary} | {case.truth} | {threshold} | {cells} | "
         f"{found.residual_fraction:.2%} | {seconds:.1f} |"
     )
 

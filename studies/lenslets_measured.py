@@ -28,10 +28,12 @@ def oopao(job: dict[str, Array]) -> tuple[Measure, Array]:
     from OOPAO.Source import Source
     from OOPAO.Telescope import Telescope
 
+    amplitude = job["amplitude"]
     telescope = Telescope(
-        resolution=job["shapes"].shape[-1],
+        resolution=len(amplitude),
         diameter=float(job["diameter_m"]),
-        centralObstruction=float(job["obscuration_ratio"]),
+        pupil=amplitude > 0.0,
+        pupilReflectivity=amplitude**2,
     )
     star = Source(optBand="I", magnitude=0)
     star * telescope
@@ -64,13 +66,11 @@ def specula(job: dict[str, Array]) -> tuple[Measure, Array]:
     from specula.processing_objects.sh_slopec import ShSlopec
     from specula.processing_objects.sh_subap_calibrator import ShSubapCalibrator
 
-    side, n = job["shapes"].shape[-1], int(job["n_subapertures"])
+    side, n = len(job["amplitude"]), int(job["n_subapertures"])
     n_pixels, pitch_m = int(job["n_pixels"]), float(job["diameter_m"]) / side
     scale = np.degrees(float(job["wavelength_m"]) * n / float(job["diameter_m"])) * 3600
     field = ElectricField(side, side, pitch_m, S0=1e6)
-    along = (np.arange(side) - (side - 1) / 2) / (side / 2)
-    radius = np.hypot(along, along[:, None])
-    field.A = ((radius <= 1.0) & (radius >= float(job["obscuration_ratio"]))).astype(float)
+    field.A = job["amplitude"]
     sensor = SH(
         wavelengthInNm=float(job["wavelength_m"]) * 1e9,
         subap_wanted_fov=n_pixels * scale,

@@ -60,7 +60,7 @@ def errors(model, ours, brute, lit):
 def test_the_matrix_is_that_of_spots_transformed(lenslets, basis, centroid):
     """Full lenslets: 0.5 % are the sums over pixels here, 1 % of mode 60 the model's three points.
 
-    Where the edge cuts, the fine cells here are black or white, and the model's light is smooth.
+    Where the edge cuts, the fine cells here are black or white, and the model goes on beyond it.
     """
     wfs = replace(lenslets.wfs, centroid=centroid, threshold=0.05)
     about = replace(lenslets, wfs=wfs)
@@ -73,7 +73,7 @@ def test_the_matrix_is_that_of_spots_transformed(lenslets, basis, centroid):
     full = errors(model, ours, brute, light > 0.999)
     assert np.all(full < [0.006, 0.006, 0.007, 0.018]), full
     cut = errors(model, ours, brute, (light <= 0.999) & (light > 0.5))
-    assert np.all(cut < 0.05), cut
+    assert np.all(cut < [0.009, 0.009, 0.010, 0.03]), cut
 
 
 def test_a_finer_pupil_is_nearer_to_them(lenslets, basis):

@@ -1,8 +1,9 @@
 """The Shack-Hartmann's signals: one sparse matrix from pupil points to centroids.
 
-A lenslet reads light and wavefront between the points of the pupil at nodes of its own, which move
-over the pupil with its image, so the derivative by the shift is exact. Beyond the edge the
-wavefront goes on as a plane through what is lit nearby: next to no light is there.
+A lenslet reads wavefronts between the points of the pupil at nodes of its own, which move over the
+pupil with its image, so the derivative by the shift is exact; light it reads on a finer grid, for
+where the edge cuts a lenslet, light is what moves its spot. Beyond the edge the wavefront goes on
+as a parabola through what is lit nearby.
 """
 
 from __future__ import annotations
@@ -17,18 +18,21 @@ from numpy.typing import NDArray
 
 from service.model.instrument import Instrument
 from service.model.local import Shapes
-from service.model.pupil import PupilGrid, valid_subapertures
+from service.model.pupil import Illumination, PupilGrid, instrument_pupil, valid_subapertures
 from service.model.sensors.sensor import Work
 from service.model.sensors.shack_hartmann.description import shack_hartmann_in
 from service.model.sensors.shack_hartmann.spots import Spots
 
 Array = NDArray[Any]
 
+_LIGHT_SAMPLING = 12
+"""Points of the light's grid along a subaperture, at least."""
+
 _BEYOND = 3
 """Points beyond the edge that a node next to it may read."""
 
-_NEIGHBOURS = 9
-"""Lit points that the plane beyond the edge goes through."""
+_NEIGHBOURS = 16
+"""Lit points that the parabola beyond the edge goes through, in least squares."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,9 +70,27 @@ class ShackHartmannSensor:
         )
 
     @cached_property
-    def amplitude(self) -> NDArray[np.float64]:
-        """``(n, n)`` amplitude on the pupil's grid with ``_BEYOND`` points more on each side."""
-        return np.pad(self.pupil.amplitude, _BEYOND)
+    def light_grid(self) -> PupilGrid:
+        """The pupil on the light's grid, as evenly lit as on its own.
+
+        A pupil that is not drawn on the instrument's own grid is taken as it is.
+        """
+        drawn = instrument_pupil(self.instrument, self.pupil.sampling)
+        if drawn.amplitude.shape != self.pupil.amplitude.shape:
+            return self.pupil
+        times = -(-_LIGHT_SAMPLING // self.pupil.sampling)
+        fine = instrument_pupil(self.instrument, times * self.pupil.sampling)
+        root = np.divide(
+            self.pupil.amplitude,
+            drawn.amplitude,
+            where=drawn.lit,
+            out=np.ones_like(drawn.amplitude),
+        )
+        nearest = scipy.ndimage.distance_transform_edt(
+            ~drawn.lit, return_distances=False, return_indices=True
+        )
+        intensity = root[tuple(nearest)] ** 2
+        return fine.lit_by(Illumination(coordinates=drawn.coordinates, intensity=intensity))
 
     @cached_property
     def continued(self) -> Any:  # noqa: ANN401 - scipy has no types
@@ -78,9 +100,9 @@ class ShackHartmannSensor:
         inside, beyond = np.argwhere(lit), np.argwhere(near)
         n = min(_NEIGHBOURS, len(inside))
         _, nearest = scipy.spatial.cKDTree(inside).query(beyond, n)
-        places = inside[nearest] - beyond[:, None]
-        planes = np.concatenate([np.ones((*places.shape[:2], 1)), places], axis=2)
-        height = np.linalg.pinv(planes)[:, 0]
+        y, x = np.moveaxis(inside[nearest] - beyond[:, None], 2, 0)
+        shapes = np.stack([np.ones(x.shape), x, y, x**2, x * y, y**2], axis=2)
+        height = np.linalg.pinv(shapes)[:, 0]
         rows = np.concatenate([np.flatnonzero(lit), np.repeat(np.flatnonzero(near), n)])
         columns = np.concatenate([np.arange(len(inside)), nearest.reshape(-1)])
         values = np.concatenate([np.ones(len(inside)), height.reshape(-1)])
@@ -103,16 +125,16 @@ class ShackHartmannSensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Interpolation:
-    """How the nodes of every lenslet read the pupil's grid, along one axis."""
+    """How the nodes of every lenslet read wavefronts on the pupil's grid, along one axis."""
 
     first: NDArray[np.intp]
     """``(n,)`` first point of the grid that the nodes of each lenslet read."""
 
-    light: tuple[Array, Array]
-    """``(n_nodes, n_read)`` weights of amplitudes, straight from point to point; their rate."""
+    weights: Array
+    """``(n_nodes, n_read)``, cubic."""
 
-    wavefront: tuple[Array, Array]
-    """``(n_nodes, n_read)`` weights of wavefronts, cubic; their rate by the image's shift."""
+    rate: Array
+    """Of the weights, by the image's shift."""
 
 
 def interpolation(sensor: ShackHartmannSensor, shift: float) -> Interpolation:
@@ -125,36 +147,42 @@ def interpolation(sensor: ShackHartmannSensor, shift: float) -> Interpolation:
     cell = np.floor(places)
     part = (places - cell)[:, None]
     columns = (cell - first - 1).astype(np.intp)[:, None] + np.arange(4)
-    cubic = np.hstack(
-        [
-            -part * (part - 1) * (part - 2) / 6,
-            (part + 1) * (part - 1) * (part - 2) / 2,
-            -(part + 1) * part * (part - 2) / 2,
-            (part + 1) * part * (part - 1) / 6,
-        ]
-    )
-    cubic_rate = np.hstack(
-        [
-            -(3 * part**2 - 6 * part + 2) / 6,
-            (3 * part**2 - 4 * part - 1) / 2,
-            -(3 * part**2 - 2 * part - 2) / 2,
-            (3 * part**2 - 1) / 6,
-        ]
-    )
-    straight, straight_rate = np.zeros((2, *cubic.shape))
-    straight[:, 1:3] = np.hstack([1 - part, part])
-    straight_rate[:, 1:3] = [-1.0, 1.0]
+    cubic = [
+        -part * (part - 1) * (part - 2) / 6,
+        (part + 1) * (part - 1) * (part - 2) / 2,
+        -(part + 1) * part * (part - 2) / 2,
+        (part + 1) * part * (part - 1) / 6,
+    ]
+    cubic_rate = [
+        -(3 * part**2 - 6 * part + 2) / 6,
+        (3 * part**2 - 4 * part - 1) / 2,
+        -(3 * part**2 - 2 * part - 2) / 2,
+        (3 * part**2 - 1) / 6,
+    ]
+    weights, rate = np.zeros((2, len(places), sampling + 4))
+    np.put_along_axis(weights, columns, np.hstack(cubic), axis=1)
+    np.put_along_axis(rate, columns, -sampling * np.hstack(cubic_rate), axis=1)
+    return Interpolation(first=first + sampling * np.arange(n), weights=weights, rate=rate)
 
-    def spread(values: Array) -> Array:
-        weights = np.zeros((len(places), sampling + 4))
-        np.put_along_axis(weights, columns, values, axis=1)
-        return weights
 
-    return Interpolation(
-        first=first + sampling * np.arange(n),
-        light=(spread(straight), -sampling * spread(straight_rate)),
-        wavefront=(spread(cubic), -sampling * spread(cubic_rate)),
-    )
+def light_at_nodes(sensor: ShackHartmannSensor, shift: float) -> tuple[Any, Any]:
+    """Return how the nodes of all lenslets read the light's grid along an axis, and its rate.
+
+    ``(n n_nodes, n_grid)`` each, sparse: straight from point to point, dark beyond the grid.
+    """
+    n, grid = sensor.instrument.wfs.n_subapertures, sensor.light_grid
+    centres = np.arange(n) - (n - 1) / 2 - shift
+    places = (centres[:, None] + sensor.spots.nodes[0]).reshape(-1)
+    distance = (places - grid.coordinates[0]) * grid.sampling
+    cell = np.floor(distance)
+    part, row = distance - cell, np.arange(len(places))
+    values = np.concatenate([1 - part, part])
+    rates = np.repeat([grid.sampling, -grid.sampling], len(places)).astype(np.float64)
+    rows, columns = np.tile(row, 2), np.concatenate([cell, cell + 1]).astype(np.intp)
+    known = (columns >= 0) & (columns < len(grid.coordinates))
+    shape = (len(places), len(grid.coordinates))
+    at = (rows[known], columns[known])
+    return tuple(scipy.sparse.csr_matrix((each[known], at), shape) for each in (values, rates))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,8 +204,7 @@ class ShackHartmannResponse:
         Of a full lenslet, wings beyond its field counted, it is 1.
         """
         n, spots = len(self.sensor.valid), self.sensor.spots
-        y, x = np.indices((n, n)).reshape(2, -1)
-        light = spots.images(self._amplitudes(y, x)[0])
+        light = spots.images(self._amplitudes[0].reshape(n * n, *self._amplitudes[0].shape[2:]))
         return light.reshape(n, n, *light.shape[1:]).swapaxes(1, 2)
 
     def lit(self, light: NDArray[np.float64]) -> ShackHartmannResponse:
@@ -200,7 +227,7 @@ class ShackHartmannResponse:
     @cached_property
     def _matrix(self) -> Any:  # noqa: ANN401 - scipy has no types
         pulls, light, _ = self._pulls
-        on_x, on_y = (axis.wavefront[0] for axis in self._read)
+        on_x, on_y = (axis.weights for axis in self._read)
         return self._sparse([on_y.T @ (pull / light) @ on_x for pull in pulls])
 
     @cached_property
@@ -208,7 +235,7 @@ class ShackHartmannResponse:
         """Return the rates of the matrix by both shifts."""
         spots = self.sensor.spots
         pulls, light, (amplitude, *moved) = self._pulls
-        (on_x, rate_x), (on_y, rate_y) = (axis.wavefront for axis in self._read)
+        (on_x, rate_x), (on_y, rate_y) = ((axis.weights, axis.rate) for axis in self._read)
         rates = []
         for change, of_y, of_x in ((moved[0], on_y, rate_x), (moved[1], rate_y, on_x)):
             dimmer = 2.0 * spots.light(amplitude, change)[:, None, None] / light
@@ -233,26 +260,29 @@ class ShackHartmannResponse:
     def _pulls(self) -> tuple[tuple[Array, Array], Array, tuple[Array, Array, Array]]:
         """Return pulls along x and y, the light that counts, amplitudes and their rates."""
         spots = self.sensor.spots
-        amplitudes = self._amplitudes(*np.nonzero(self.sensor.valid))
-        amplitude = amplitudes[0]
+        amplitude, *rates = (each[self.sensor.valid] for each in self._amplitudes)
         # a subaperture without light says nothing, and is not divided by
         light = np.maximum(spots.light(amplitude, amplitude), 1e-9)[:, None, None]
-        return spots.pull(amplitude, amplitude), light, amplitudes
+        return spots.pull(amplitude, amplitude), light, (amplitude, rates[0], rates[1])
 
-    def _amplitudes(self, y: Array, x: Array) -> tuple[Array, Array, Array]:
-        """Return amplitudes at nodes of lenslets, and their rates along x and y."""
-        rows, columns, inside = self._window(y, x)
-        window = np.where(inside, self.sensor.amplitude[rows, columns], 0.0)
-        (on_x, rate_x), (on_y, rate_y) = (axis.light for axis in self._read)
-        return (
-            on_y @ window @ on_x.T,
-            on_y @ window @ rate_x.T,
-            rate_y @ window @ on_x.T,
-        )
+    @cached_property
+    def _amplitudes(self) -> tuple[Array, Array, Array]:
+        """Return amplitudes ``(n, n, n_nodes, n_nodes)`` at nodes, their rates along x and y."""
+        sensor, n = self.sensor, len(self.sensor.valid)
+        (on_x, rate_x), (on_y, rate_y) = (light_at_nodes(sensor, shift) for shift in self.shift)
+
+        def seen(of_y: Any, of_x: Any) -> Array:  # noqa: ANN401 - scipy has no types
+            along = of_y @ sensor.light_grid.amplitude @ of_x.T
+            return np.asarray(along).reshape(n, len(along) // n, n, -1).swapaxes(1, 2)
+
+        return seen(on_y, on_x), seen(on_y, rate_x), seen(rate_y, on_x)
 
     def _window(self, y: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return rows and columns of the grid that lenslets read, and which exist."""
-        side, read = len(self.sensor.amplitude), np.arange(self.sensor.pupil.sampling + 4)
+        side, read = (
+            len(self.sensor.pupil.coordinates) + 2 * _BEYOND,
+            np.arange(self.sensor.pupil.sampling + 4),
+        )
         along_x, along_y = (axis.first for axis in self._read)
         rows = (along_y[y][:, None] + read)[:, :, None]
         columns = (along_x[x][:, None] + read)[:, None, :]
@@ -264,7 +294,7 @@ class ShackHartmannResponse:
         sensor = self.sensor
         y, x = np.nonzero(sensor.valid)
         rows, columns, inside = self._window(y, x)
-        places = np.where(inside, rows * len(sensor.amplitude) + columns, 0)
+        places = np.where(inside, rows * (len(sensor.pupil.coordinates) + 2 * _BEYOND) + columns, 0)
         values = np.concatenate([np.where(inside, plane, 0.0) for plane in planes])
         values *= 2 * np.pi / sensor.instrument.wfs.wavelength_m
         n_read = values[0].size
@@ -274,6 +304,6 @@ class ShackHartmannResponse:
                 np.tile(places.reshape(-1), len(planes)),
                 n_read * np.arange(len(values) + 1),
             ),
-            shape=(len(values), sensor.amplitude.size),
+            shape=(len(values), (len(sensor.pupil.coordinates) + 2 * _BEYOND) ** 2),
         )
         return (matrix @ sensor.continued).astype(sensor.dtype)

@@ -14,7 +14,12 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from service.model.pupil import instrument_pupil, valid_subapertures
+from service.model.pupil import (
+    Illumination,
+    fully_lit_subapertures,
+    instrument_pupil,
+    valid_subapertures,
+)
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import CannotTell, Fineness
 from tests.numerics import SOMEWHERE
@@ -85,6 +90,22 @@ def test_derivatives_are_those_of_the_matrix(lenslets, stop):
         )
         difference = (more - less) / 2e-4
         assert np.linalg.norm(derivative - difference) < 1e-5 * np.linalg.norm(difference)
+
+
+def test_uneven_light_is_read_as_it_lies_in_the_pupil(lenslets):
+    """A ramp: a subaperture has the light of its middle."""
+    pupil = instrument_pupil(lenslets, 3)
+    ramp = Illumination(
+        coordinates=pupil.coordinates,
+        intensity=np.broadcast_to(1.0 + 0.1 * pupil.coordinates, pupil.amplitude.shape),
+    )
+    even, uneven = (
+        kind_of(lenslets).sensor(lenslets, one, DOUBLE).at((0.0, 0.0)).light.sum(axis=(1, 3))
+        for one in (pupil, pupil.lit_by(ramp))
+    )
+    middle = np.broadcast_to(1.0 + 0.1 * (np.arange(12) - 5.5), (12, 12))
+    full = fully_lit_subapertures(lenslets)
+    np.testing.assert_allclose(uneven[full], middle[full] * even[full], rtol=3e-3)
 
 
 def test_k_is_what_is_applied(lenslets):

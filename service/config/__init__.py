@@ -28,9 +28,18 @@ def instrument_path(name_or_path: str | Path) -> Path:
     ConfigurationError
         If it is a name, and no packaged one.
     """
-    path = Path(name_or_path)
-    is_name = path.suffix != ".toml" and path.name == str(name_or_path)
+    name, _ = and_sensor_mode(name_or_path)
+    path = Path(name)
+    is_name = path.suffix != ".toml" and path.name == name
     return packaged_file(path.name) if is_name else path
+
+
+def and_sensor_mode(name_or_path: str | Path) -> tuple[str, str | None]:
+    """Return an instrument's name or path, and the mode of its sensor behind an ``@``, or None."""
+    name, at, mode = str(name_or_path).rpartition("@")
+    if not at or Path(name_or_path).exists():
+        return str(name_or_path), None
+    return name, mode
 
 
 def packaged_file(name: str) -> Path:

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from service.config import and_sensor_mode, packaged_file
 from service.config import instrument_schema as schema
-from service.config import packaged_file
 from service.config.laws import LawTable, law_of
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.pupils import read_pupil
 from service.config.sources import read_dataset, refuse
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, ModelError
 from service.model.instrument import (
     Instrument,
     Mirror,
@@ -33,7 +33,8 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     """Return the instrument that a packaged name (``flao-lbt``) or a TOML file describes.
 
     Anything that has a folder or ends in ``.toml`` is a path; references to datasets in it
-    (``mask.h5:/valid_subapertures``) are relative to the file.
+    (``mask.h5:/valid_subapertures``) are relative to the file. ``soul-lbt@soul-bin2`` is in that
+    mode of its sensor, without one in the first.
 
     Raises
     ------
@@ -67,7 +68,12 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
         remarks=(*about_mirror, *_assumed(said, sensor, mirror)),
     )
-    return _in_first_mode(instrument, wfs, kind)
+    whole = _in_first_mode(instrument, wfs, kind)
+    _, mode = and_sensor_mode(name_or_path)
+    try:
+        return whole if mode is None else whole.in_mode(mode)
+    except ModelError as error:
+        raise ConfigurationError(f"{wfs.path}: {error}") from error
 
 
 def _in_first_mode(

@@ -436,6 +436,24 @@ def test_modes_belong_to_slopes(write):
     assert 'mode: belongs to input = "slopes"' in refusal(load_instrument, write(text))
 
 
+def test_a_mode_may_be_named_behind_the_file(write, tmp_path):
+    path = write(ABOUT + APART + FOUR + MIRROR + MODES)
+    assert load_instrument(f"{path}@b4").config_id == "b4"
+    assert load_instrument("soul-lbt@soul-bin3").wfs.n_subapertures == 14
+    assert len(load_instrument(f"{path}@b4").sensor_modes) == 4
+    assert "bench.toml: bench: found mode b3, expected one of: b1, b2" in refusal(
+        load_instrument, f"{path}@b3"
+    )
+    assert "flao-lbt: found mode b1, expected one of: no mode" in refusal(
+        load_instrument, "flao-lbt@b1"
+    )
+    assert "neither a packaged name" in refusal(load_instrument, "nobody@b1")
+    at = tmp_path / "a@b"
+    at.mkdir()
+    (at / "bench.toml").write_text(path.read_text())
+    assert load_instrument(at / "bench.toml").config_id == "b1"
+
+
 def test_an_unknown_mode_names_those_that_are_known(write):
     bench = load_instrument(write(ABOUT + APART + FOUR + MIRROR + MODES))
     with pytest.raises(ModelError, match="bench: found mode b3, expected one of: b1, b2, b4, b5"):

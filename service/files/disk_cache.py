@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from service.model import instrument as model_code
 from service.model.instrument import Instrument, Mirror, instrument_sha256
 from service.model.kinds import BasisKind
-from service.model.modes import Basis, ModalBasis, modal_basis
-from service.model.sensor_modes import in_subapertures
+from service.model.modes import Basis, ModalBasis, in_subapertures, modal_basis
 from service.model.surface import mirror_surface
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -64,10 +63,7 @@ class DiskCache:
         Only Karhunen-Loeve modes are kept: others are a matter of milliseconds. They are found on
         the finest subapertures of its sensor: on binned ones they could not be told apart.
         """
-        finest = instrument.finest
-        basis = self._found(finest)
-        same = finest.subaperture_m == instrument.subaperture_m
-        return basis if same else in_subapertures(basis, instrument)
+        return in_subapertures(self._found(instrument.finest), instrument)
 
     def _found(self, instrument: Instrument) -> Basis:
         mirror = instrument.mirror

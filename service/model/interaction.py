@@ -83,10 +83,11 @@ class InteractionModel:
     ) -> None:
         self.instrument = instrument
         self.basis = basis
-        pupil = instrument_pupil(instrument, pupil_sampling)
+        binning = instrument.binning  # of the finest subapertures, so fine are points and nodes
+        pupil = instrument_pupil(instrument, pupil_sampling * binning)
         self.pupil = pupil if illumination is None else pupil.lit_by(illumination)
         fineness = Fineness(
-            n_nodes=detector_nodes, dtype=dtype, mapper=mapper, kept_bytes=kept_bytes
+            n_nodes=detector_nodes * binning, dtype=dtype, mapper=mapper, kept_bytes=kept_bytes
         )
         kind = kind_of(instrument)
         self.sensor: Sensor = kind.sensor(instrument, self.pupil, fineness, working_point)

@@ -137,9 +137,24 @@ def modal_basis(instrument: Instrument) -> Basis:
     ModelError
         If the mirror has fewer modes than were asked for, or its table is too coarse.
     """
-    if isinstance(instrument.mirror, TabulatedModes):
-        return tabulated_basis(instrument, instrument.mirror)
-    return analytic_basis(instrument)
+    finest = instrument.finest
+    if isinstance(finest.mirror, TabulatedModes):
+        return in_subapertures(tabulated_basis(finest, finest.mirror), instrument)
+    return in_subapertures(analytic_basis(finest), instrument)
+
+
+def in_subapertures(basis: Basis, instrument: Instrument) -> Basis:
+    """Return the mirror's modes in coordinates of the subapertures that an instrument has now.
+
+    The modes are those that were found with the finest ones: coarser ones cannot tell them apart.
+    """
+    wider = instrument.subaperture_m / instrument.finest.subaperture_m
+    if wider == 1.0:
+        return basis
+    if isinstance(basis, ModalBasis):
+        surface = mirror_surface(instrument.analytic_mirror, instrument.subaperture_m)
+        return basis.of_surface(surface)
+    return replace(basis, instrument=instrument, step_subap=basis.step_subap / wider)
 
 
 def analytic_basis(instrument: Instrument) -> ModalBasis:

@@ -239,9 +239,7 @@ def initial_reconstructor(
     aligned: Misregistration,
 ) -> Reconstructor:
     """Return the matrix before any flexure: the inverse of the model where all is aligned."""
-    fineness = 3 * instrument.binning
-    model = InteractionModel(instrument, basis, pupil_sampling=fineness, detector_nodes=fineness)
-    interaction = model.interaction_matrix(aligned)
+    interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
     matrix = truncated_inverse(interaction[:, :n_controlled])
     name = f"initial-{n_controlled}-{checksum(matrix)[:8]}"
     made_ns, alpha = time.time_ns(), aligned.to_boundary()

@@ -92,14 +92,14 @@ class OpticsWorker:
 
     def _equip(self, instrument: Instrument) -> None:
         """Make the models of an instrument, all but its modes."""
-        basis, compute, binning = self._basis, self._compute, instrument.binning
+        basis, compute = self._basis, self._compute
 
         def model(sampling: int, nodes: int, at_work: WorkingPoint | None) -> RtcInteractionModel:
             return RtcInteractionModel(
                 instrument,
                 basis,
-                pupil_sampling=sampling * binning,
-                detector_nodes=nodes * binning,
+                pupil_sampling=sampling,
+                detector_nodes=nodes,
                 working_point=at_work,
                 kept_bytes=compute.kept_bytes,
                 mapper=self.rows.map,
@@ -111,7 +111,7 @@ class OpticsWorker:
             lambda at_work: model(sampling, nodes, at_work),
             instrument,
             working_point_modes,
-            sampling * binning,
+            sampling * instrument.binning,
         )
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
@@ -307,13 +307,12 @@ class OpticsWorker:
         modes = spectra.plan.modes
         if modes not in self._wide_capture:
             basis, every = self._model.basis.subset(np.array(modes)), self._mode_response
-            binning = self._model.instrument.binning
             self._wide_capture[modes] = tuple(
                 RtcInteractionModel(
                     self._model.instrument,
                     basis,
-                    pupil_sampling=sampling * binning,
-                    detector_nodes=sampling * binning,
+                    pupil_sampling=sampling,
+                    detector_nodes=sampling,
                     mapper=self.rows.map,
                     mode_response=None if every is None else every[list(modes)],
                 )

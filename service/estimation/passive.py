@@ -222,12 +222,20 @@ class Passive(PassiveSums):
     @override
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""
-        if self.delay_frames >= MIN_DELAY_FRAMES:
-            return None
-        return (
-            f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
-            f"{MIN_DELAY_FRAMES} are needed to tell the mirror's response from noise"
-        )
+        if self.delay_frames < MIN_DELAY_FRAMES:
+            return (
+                f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
+                f"{MIN_DELAY_FRAMES} are needed to tell the mirror's response from noise"
+            )
+        least = MIN_FRAMES_PER_MODE * self.n_modes
+        if self.memory_frames + CHUNK_FRAMES < least:
+            # they would never be fitted, and cost two cores at the size of the ELT
+            return (
+                f"no passive estimate: {least} frames are needed for {self.n_modes} modes, and its "
+                f"memory of {PASSIVE_MEMORY_S:g} s has {self.memory_frames:.0f}; only a dither "
+                "tells α"
+            )
+        return None
 
 
 def accumulate(state: Passive, block: FrameBlock) -> Passive:

@@ -159,6 +159,16 @@ def test_a_loop_without_two_frames_of_delay_is_not_summed_and_says_why():
     assert young().why_unusable is None
 
 
+def test_more_modes_than_its_memory_can_tell_are_not_summed_and_it_says_why():
+    """4300 modes at 500 Hz: 21,500 frames are needed, 5000 are remembered."""
+    telling = Passive(n_modes=1000, memory_frames=5000.0)
+    assert telling.why_unusable is None
+    extreme = Passive(n_modes=4300, memory_frames=5000.0)
+    assert "21500 frames are needed for 4300 modes" in extreme.why_unusable
+    assert "10 s has 5000; only a dither" in extreme.why_unusable
+    assert accumulate(extreme, random_block(2000)) is extreme
+
+
 @pytest.mark.parametrize("size", [100, 500, 6000])
 def test_samples_are_one_in_128_frames_however_they_come_and_bounded(size):
     assert len(fed(random_block(6000), size).samples) == pytest.approx(6000 // 128, abs=1)

@@ -321,6 +321,21 @@ def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed, many, mo
         assert found.worst_pole_radius >= radii.max() - NEAR
 
 
+def test_many_modes_are_tried_at_fewer_points_for_the_same_word(monkeypatch):
+    """Of a matrix that is no longer where the mirror is: a bound for each point, one by one."""
+    tried = []
+    eigenvalues = np.linalg.eigvals
+    monkeypatch.setattr(
+        np.linalg, "eigvals", lambda a: (a.ndim == 2 and tried.append(a)) or eigenvalues(a)
+    )
+    moved = Misregistration(shift_x_subap=0.15, rotation_rad=0.002)
+    of_few, n_few = verdict(made_for=Misregistration(), truth=moved), len(tried)
+    monkeypatch.setattr(gate, "_MANY", 1)
+    of_many, n_many = verdict(made_for=Misregistration(), truth=moved), len(tried) - n_few
+    assert of_few == of_many
+    assert n_many < n_few
+
+
 def symmetric(kind, n=60):
     rng = np.random.default_rng(4)
     axes, _ = np.linalg.qr(rng.normal(size=(n, n)))

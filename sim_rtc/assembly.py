@@ -17,6 +17,7 @@ from service.model.kinds import KarhunenLoeve, Normalisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, analytic_basis
 from service.model.pointing_law import ANGLES
+from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation
 from service.model.surface import mirror_surface
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
@@ -28,6 +29,7 @@ from sim_rtc.options import Options
 from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.telescope.detector import Detector, PixelDetector, binned
 from sim_rtc.telescope.diffractive import DiffractivePlant
+from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.influence import read_influence
 from sim_rtc.telescope.linear import LinearPlant
 from sim_rtc.telescope.mirror import MirrorDrive
@@ -254,7 +256,7 @@ def build_plant(
     cube, pitch_m = options.influence_cube, options.influence_pitch_m
     made: Departures = {
         "rng": rng,
-        "imperfections": options.imperfections,
+        "imperfections": departures_of(options, instrument),
         "scene": options.scene,
         "faults": options.mirror_faults,
         "influence": None if cube is None else read_influence(cube, instrument, pitch_m),
@@ -267,6 +269,18 @@ def build_plant(
             "--preset: a binned sensor needs --plant diffractive; found --plant linear"
         )
     return LinearPlant(instrument, basis, **made)
+
+
+def departures_of(options: Options, instrument: Instrument) -> Imperfections:
+    """Return how the telescope departs from its drawing: with an optical gain where it has one.
+
+    A linear plant invents that of a pyramid. A centroid moves as far in turbulence as without:
+    where none is asked for, its gain is 1.
+    """
+    found = options.imperfections
+    if options.optical_gain is not None or kind_of(instrument).loses_gain:
+        return found
+    return replace(found, lowest_optical_gain=1.0, highest_optical_gain=1.0)
 
 
 def build_sky(

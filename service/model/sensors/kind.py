@@ -75,6 +75,9 @@ class SensorKind(ABC):
     normalised: ClassVar[bool] = False
     """Whether signals are divided by a flux, by which one ``slopes.normalisation`` says."""
 
+    loses_gain: ClassVar[bool] = False
+    """Whether it answers less the larger the residual wavefront is."""
+
     edge_slips: ClassVar[bool] = False
     """Whether it can take the mirror's edge for one a fringe away, and hold it there."""
 

@@ -39,6 +39,7 @@ class PyramidKind(SensorKind):
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
     normalised = True
+    loses_gain = True
     edge_slips = True
 
     @override

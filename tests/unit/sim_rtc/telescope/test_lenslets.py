@@ -12,6 +12,8 @@ from service.model.pupil import fully_lit_subapertures, valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.sensors.shack_hartmann.table import Centroid
 from service.model.slopes import PLAIN
+from sim_rtc.assembly import departures_of
+from sim_rtc.options import parse_options
 from sim_rtc.telescope.detector import Camera, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractivePlant, centred_pupil
 from sim_rtc.telescope.imperfections import SETS
@@ -88,6 +90,19 @@ def test_noise_of_centroids_is_that_of_their_photons_and_pixels(lenslets, magnit
     told = kind_of(lenslets).slope_noise(lenslets, own, read_noise)
     assert slopes[:, full].std() == pytest.approx(told, rel=0.3)
     assert abs(slopes[:, full].mean()) < 5 * told / np.sqrt(slopes[:, full].size)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "gains"),
+    [
+        (str(FILE), (), (1.0, 1.0)),
+        (str(FILE), ("--optical-gain=0.7,0.8",), (0.7, 0.8)),
+        ("flao-lbt", (), (0.6, 0.9)),
+    ],
+)
+def test_only_a_pyramid_is_given_an_optical_gain_unasked(name, words, gains):
+    found = departures_of(parse_options([f"--instrument={name}", *words]), load_instrument(name))
+    assert (found.lowest_optical_gain, found.highest_optical_gain) == gains
 
 
 def test_a_threshold_keeps_the_noise_of_dark_pixels_out(lenslets):

@@ -51,9 +51,11 @@ def _timed(what: str, run: Callable[[], Iterable[Outcome]]) -> None:
     done = list(run())
     clock_s, here_s = time.monotonic() - begun, time.process_time() - begun_cpu
     lasted_s, cpu_s = (sum(one[which] for one in done) for which in (0, 1))
+    least_s = min(one[1] for one in done)
+    idle = 1.0 - lasted_s / (N_WORKERS * clock_s)
     print(
         f"{what}: {len(done)} tasks of {lasted_s / len(done):.2f} s, {cpu_s / len(done):.2f} of "
-        f"a processor, in {clock_s:.1f} s: {1.0 - lasted_s / (N_WORKERS * clock_s):.1%} of two "
+        f"a processor (at least {least_s:.2f}), in {clock_s:.1f} s: {idle:.1%} of two "
         f"workers without one; {here_s:.2f} s of processor here"
     )
 

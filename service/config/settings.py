@@ -271,7 +271,7 @@ class ComputeTable(Table):
     """Threads of the worker process."""
 
     cluster: str | None = Field(default=None, pattern=r"^(tcp|tls)://\S+:\d+$")
-    """Dask scheduler, ``tcp://HOST:PORT``, whose workers help with D of telescopes of 60
+    """Dask scheduler, ``tcp://HOST:PORT``, whose workers help with D of telescopes of 70
     subapertures and more (extra ``cluster``). None: the worker computes alone."""
 
     nice: int = Field(default=10, ge=0, le=19)

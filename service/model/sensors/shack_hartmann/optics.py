@@ -25,6 +25,10 @@ from service.model.sensors.shack_hartmann.spots import Spots
 
 Array = NDArray[Any]
 
+_DARK = 0.1
+"""Light over that of a full subaperture below which a slope fades: of next to no light it tells of
+the very edge, and no RTC divides by it."""
+
 _LIGHT_SAMPLING = 12
 """Points of the light's grid along a subaperture, at least."""
 
@@ -239,6 +243,7 @@ class ShackHartmannResponse:
         rates = []
         for change, of_y, of_x in ((moved[0], on_y, rate_x), (moved[1], rate_y, on_x)):
             dimmer = 2.0 * spots.light(amplitude, change)[:, None, None] / light
+            dimmer[spots.light(amplitude, amplitude) < light[:, 0, 0]] = 0.0
             parts = zip(
                 pulls,
                 spots.pull(change, amplitude),
@@ -261,8 +266,9 @@ class ShackHartmannResponse:
         """Return pulls along x and y, the light that counts, amplitudes and their rates."""
         spots = self.sensor.spots
         amplitude, *rates = (each[self.sensor.valid] for each in self._amplitudes)
-        # a subaperture without light says nothing, and is not divided by
-        light = np.maximum(spots.light(amplitude, amplitude), 1e-9)[:, None, None]
+        full = np.ones((1, *amplitude.shape[1:]))
+        light = np.maximum(spots.light(amplitude, amplitude), _DARK * spots.light(full, full))
+        light = light[:, None, None]
         return spots.pull(amplitude, amplitude), light, (amplitude, rates[0], rates[1])
 
     @cached_property

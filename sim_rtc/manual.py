@@ -124,7 +124,7 @@ examples
   pyrcal sim --plant diffractive --influence p45.h5:/influence --dead-actuators 14,222
       the mirror as the laboratory has measured it, two of its actuators off
   pyrcal sim --plant diffractive --snapshot loop.png
-      a picture of pupil images, slopes and residual wavefront as the loop closes
+      a picture of the sensor's light, slopes and residual wavefront as the loop closes
 
 exit status
   0 it ended as asked (time is up, SIGINT, SIGTERM); 2 an option that cannot be.

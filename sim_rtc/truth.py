@@ -243,7 +243,7 @@ class Moment:
     """Number of the frame since the loop was closed."""
 
     images: Array
-    """``(2 n, 2 n)`` light in the four pupil images, over that of a fully lit pixel."""
+    """Light on the detector, over that of a fully lit pixel: four pupil images, or spots."""
 
     slopes: tuple[Array, Array]
     """``(n, n)`` along x and along y."""

@@ -79,10 +79,10 @@ def main() -> None:
     """Print the table; exit with 1 when the three estimators together miss the target."""
     given = _arguments()
     with threadpool_limits(1):
-        blocks = list(_blocks(given.block, given.frames))
+        blocks = list(blocks_of(given.block, given.frames))
         costs = {part.name: _cost_us(part, blocks, given.repeats) for part in _parts()}
         whole = _cost_us(_bank(), blocks, given.repeats)
-        few = list(_blocks(1, 200))
+        few = list(blocks_of(1, 200))
         plain = {part.name: _cost_us(part, few, given.repeats) for part in _plain()}
     sys.stdout.write(_table(costs, plain, given.block))
     sys.stdout.write(f"| **{BANK}** | **{whole:.1f}** | - | - |\n")
@@ -97,7 +97,7 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _blocks(n_block: int, n_frames: int) -> Iterator[FrameBlock]:
+def blocks_of(n_block: int, n_frames: int) -> Iterator[FrameBlock]:
     """Yield contiguous telemetry of a dithered loop: what it holds does not change its cost."""
     rng = np.random.default_rng(1)
     shape = (max(n_block, 200), N_SLOPES)

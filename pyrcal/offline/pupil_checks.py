@@ -62,7 +62,10 @@ class PupilNumber:
         low, high = (limit**self.power for limit in self.range)
         for _ in range(_STEPS):
             there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
-            light += float(few.step(matrix, (there - matrix) / self.step)[-1])
+            rate = (there - matrix) / self.step
+            if not few.tells(matrix, rate):
+                break
+            light += float(few.step(matrix, rate)[-1])
             light = float(np.clip(light, low, high))
             matrix = few.matrix(few.of(self.changed(few.models.instrument, light)))
         return light ** (1.0 / self.power), matrix
@@ -117,6 +120,10 @@ class Few:
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, those given by a derivative included."""
         return float(self.target.project(matrix, self._with(more)).chi_at_best)
+
+    def tells(self, matrix: Array, rate: Array) -> bool:
+        """Return whether what was measured depends on a number: it may cut no subaperture."""
+        return bool(self.target.project(matrix, rate[None]).normal[0, 0] > 0.0)
 
     def step(self, matrix: Array, *more: Array) -> Array:
         """Return the best step of all of them."""

@@ -8,7 +8,7 @@ import pytest
 
 from service.web.keys import KeyFile, KeyScope
 from tests.system.browser import LAPTOP, NARROW, NEEDS_A_BROWSER, WIDE, Keys, Page, a_browser
-from tests.system.night import a_night
+from tests.system.night import a_night, wait_for
 from tests.system.pace import patience
 
 TINY = Path(__file__).parents[1] / "data" / "tiny"
@@ -302,10 +302,14 @@ def test_once_there_are_keys_the_page_asks_for_one_and_says_why_it_may_not_order
     page.says("#answer", "mode is hold")
     assert page.js("document.cookie") == "", "no script can read it"
     headers = {"Authorization": f"Bearer {order}"}
-    trail = page.night.client.get("/v1/audit", headers=headers).json()["entries"]
-    told = [(e["name"], e["who"], e["address"], e["channel"]) for e in trail]
-    assert ("SetMode.answered", "orders", "127.0.0.1", "page") in told
-    assert ("request.wrong-key", "127.0.0.1", "127.0.0.1", "page") in told
+
+    def told():
+        trail = page.night.client.get("/v1/audit", headers=headers).json()["entries"]
+        return {(e["name"], e["who"], e["address"], e["channel"]) for e in trail}
+
+    # the answer is written down after it was given
+    wait_for(lambda: ("SetMode.answered", "orders", "127.0.0.1", "page") in told(), 5.0, "its line")
+    assert ("request.wrong-key", "127.0.0.1", "127.0.0.1", "page") in told()
     page.click("#who")
     page.until("document.querySelector('#login').open")
     keys.path.unlink()

@@ -114,8 +114,19 @@ class Page:
         wait_for(done, 10.0, lambda: f"{selector} at rest; {self.text()}", every_s=0.02)
 
     def press(self, keys):
-        """Type with whatever has the focus."""
-        self.driver.switch_to.active_element.send_keys(keys)
+        """Type with whatever has the focus, once it takes keys: a dialog may be closing."""
+
+        def typed():
+            try:
+                self.driver.switch_to.active_element.send_keys(keys)
+            except (
+                errors.ElementNotInteractableException,
+                errors.StaleElementReferenceException,
+            ):
+                return False
+            return True
+
+        wait_for(typed, 5.0, lambda: f"something that takes keys; {self.text()}", every_s=0.02)
 
     def dialog(self, *words):
         """Wait until a dialog is open that says this: what is pressed before goes nowhere."""

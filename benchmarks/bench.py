@@ -15,7 +15,6 @@ import platform
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -29,6 +28,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks import plant
 from benchmarks.bench_page import Row, page, plot
+from benchmarks.peer_rounds import cpu_s
 from pyrcal.offline.fit_file import fit_file
 from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.report import FitReport
@@ -38,7 +38,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from studies.peers import ROOT, environment, measured
+from studies.peers import ROOT, environment, measured, variables
 from studies.peers_cases import N_MODES, SMALL, Case, bench, in_degrees, instrument, job_arrays
 from studies.peers_files import LISTINGS, write_instrument, write_reference
 from studies.peers_fits import error
@@ -63,9 +63,6 @@ FOUND = (0.01, 0.01, 0.03, 0.002)
 
 PRODUCT = 2000
 PAGE = ROOT / "docs" / "results" / "bench.md"
-_ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
 
 
 class PeerProcess:
@@ -81,7 +78,7 @@ class PeerProcess:
         self._process = subprocess.Popen(
             [str(environment(peer)), "-m", "benchmarks.peer_rounds", peer, str(job)],
             cwd=ROOT,
-            env={**os.environ, **_ONE_THREAD, "MPLBACKEND": "Agg"},
+            env=variables(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -156,8 +153,8 @@ def play(n_rounds: int, peers: Sequence[PeerProcess]) -> tuple[Rounds, dict[str,
             "slopes594": partial(every.linearise, _turned(-step)),
         }
         for name, job in jobs.items():
-            rounds.own_s.setdefault(name, []).append(_cpu_s(job))
-        rounds.gflops.append(2 * PRODUCT**3 / _cpu_s(lambda: factor @ factor) / 1e9)
+            rounds.own_s.setdefault(name, []).append(cpu_s(job)[0])
+        rounds.gflops.append(2 * PRODUCT**3 / cpu_s(lambda: factor @ factor)[0] / 1e9)
         for peer in peers:
             answer, seen[peer.peer] = peer.ask(do="push", modes=MODES)
             rounds.peer_s.setdefault(peer.peer, []).append(float(np.median(answer["seconds"])))
@@ -238,9 +235,10 @@ def _fit(
     reference, toml = folder / "reference.h5", folder / "instrument.toml"
     write_reference(reference, found, cube)
     write_instrument(toml, reference, case, found, LISTINGS[case.peer], case.stop)
-    begun = time.process_time()
-    report = fit_file(load_instrument(str(toml)), reference, options, threads=1)
-    return report, time.process_time() - begun
+    took_s, report = cpu_s(
+        lambda: fit_file(load_instrument(str(toml)), reference, options, threads=1)
+    )
+    return report, took_s
 
 
 def matrix_rows(rounds: Rounds, seen: dict[str, Measured], folder: Path) -> list[Row]:
@@ -326,12 +324,6 @@ def _shifted(step: float) -> Misregistration:
 
 def _turned(step: float) -> Misregistration:
     return Misregistration(shift_x_subap=step, rotation_rad=step, magnification=1.0 + step / 10)
-
-
-def _cpu_s(work: Callable[[], object]) -> float:
-    begun = time.process_time()
-    work()
-    return time.process_time() - begun
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from studies.peers_pushpull import Array, Bench, Peer, read_job
 
 if TYPE_CHECKING:
     from studies.peers_oopao import Oopao
+
+Result = TypeVar("Result")
 
 PEERS = {"oopao": "Oopao", "hcipy": "Hcipy", "specula": "Specula"}
 N_SPRINT = 20
@@ -67,7 +69,8 @@ def _pushed(peer: Peer, shapes_m: Array, bench: Bench, asked: dict[str, Any]) ->
     return {"seconds": took_s}
 
 
-def _cpu_s(work: Callable[[], Any]) -> tuple[float, Any]:
+def cpu_s(work: Callable[[], Result]) -> tuple[float, Result]:
+    """Return the processor time that something takes, and what comes of it."""
     begun = time.process_time()
     done = work()
     return time.process_time() - begun, done
@@ -77,44 +80,29 @@ class Sprint:
     """OOPAO's SPRINT on its own mirror: four parameters, sensitivities at the origin."""
 
     def __init__(self, peer: Oopao, arrays: dict[str, Array], bench: Bench) -> None:
-        from OOPAO.DeformableMirror import DeformableMirror
         from OOPAO.SPRINT import SPRINT
 
-        from studies.peers_oopao import COUPLING
+        from studies import peers_oopao
 
-        telescope = peer.telescope
-        self.tel, self.ngs, self.wfs = telescope, telescope.src, peer.sensor
-        self.subaperture_m = (
-            telescope.D / bench.n_subapertures * bench.n_pupil / (bench.n_pupil - 1)
+        self._oopao, self._bench, self._valid = peers_oopao, bench, peer.valid
+        self.tel, self.ngs, self.wfs = peer.telescope, peer.telescope.src, peer.sensor
+        self.dm = peers_oopao.mirror_of(
+            peer, bench, arrays["positions_m"], float(arrays["pitch_m"])
         )
-        self.dm = DeformableMirror(
-            telescope=telescope,
-            nSubap=round(telescope.D / float(arrays["pitch_m"])),
-            coordinates=arrays["positions_m"],
-            pitch=float(arrays["pitch_m"]),
-            mechCoupling=COUPLING,
-            print_dm_properties=False,
-        )
-        self._valid = peer.valid
         self._basis = type("Basis", (), {"modes": arrays["mode_to_actuator"][:, :N_SPRINT]})()
         self._basis.extra = "KL"
-        self.setup_s, self._sprint = _cpu_s(lambda: SPRINT(self, self._basis, n_mis_reg=4))
+        self.setup_s, self._sprint = cpu_s(lambda: SPRINT(self, self._basis, n_mis_reg=4))
 
     def found(self, alpha: list[float], matrix: Path) -> dict[str, Any]:
         """Move the mirror, measure, write the matrix, and have SPRINT find where it is."""
         from OOPAO.mis_registration_identification_algorithm import computeMetaSensitivyMatrix
-        from OOPAO.MisRegistration import MisRegistration
 
-        moved = MisRegistration()
-        # its shifts move the mirror the other way
-        moved.shiftX, moved.shiftY = (-self.subaperture_m * shift for shift in alpha[:2])
-        moved.rotationAngle, moved.magnification = alpha[2], alpha[3] - 1.0
-        elsewhere = self.dm.apply_mis_registration(moved)
+        moved = self._oopao.misregistration(self._bench, alpha)
         measured = computeMetaSensitivyMatrix.interaction_matrix(
-            self.ngs, self.tel, elsewhere, self.wfs, self._basis.modes
+            self.ngs, self.tel, self.dm.apply_mis_registration(moved), self.wfs, self._basis.modes
         ).D
         np.savez(matrix, matrix=measured, valid=self._valid, wavelength_m=self.ngs.wavelength)
-        seconds, out = _cpu_s(
+        seconds, out = cpu_s(
             lambda: self._sprint.estimate(
                 self,
                 measured,
@@ -124,12 +112,10 @@ class Sprint:
                 plot=False,
             )
         )
-        shifts = [-float(m) / self.subaperture_m for m in (out.shiftX, out.shiftY)]
-        alpha_out = [*shifts, float(out.rotationAngle), 1.0 + float(out.magnification)]
         return {
             "setup_s": self.setup_s,
             "seconds": seconds,
-            "alpha": alpha_out,
+            "alpha": self._oopao.from_misregistration(self._bench, out),
             "converged": bool(self._sprint.validity_flag),
         }
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import time
 from collections.abc import Callable
@@ -31,6 +30,7 @@ from sim_rtc.computer.feed import BATCH_FRAMES, message_frames
 from sim_rtc.computer.telemetry import frames_of
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
+from studies.peers import variables
 
 _PEER = Path(__file__).with_name("plant_oopao.py")
 _PEER_SAMPLINGS = (2, 4)
@@ -43,7 +43,6 @@ _TARGET_LINEAR = 0.25
 
 _TARGET_FPS = 150.0
 _TARGET_RATIO = 10.0
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,7 +140,7 @@ def measure_oopao(python: str, sampling: int) -> Cost:
     """Return what the same frame costs OOPAO, run by the interpreter it is installed for."""
     done = subprocess.run(
         [python, str(_PEER), str(sampling)],
-        env={**os.environ, **dict.fromkeys(_ONE_THREAD, "1")},
+        env=variables(),
         capture_output=True,
         text=True,
         timeout=_PEER_TIMEOUT_S,

@@ -28,7 +28,7 @@ PAGE = KEPT / "peers.md"
 REQUIREMENTS = {"oopao": "OOPAO==1.0.0", "hcipy": "hcipy==0.7.1", "specula": "specula==1.1.0"}
 """What is installed for each peer."""
 
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def environment(peer: str) -> Path:
@@ -41,6 +41,11 @@ def environment(peer: str) -> Path:
         subprocess.run([*pip, REQUIREMENTS[peer]], check=True)
         stamp.write_text(REQUIREMENTS[peer])
     return interpreter
+
+
+def variables() -> dict[str, str]:
+    """Return the environment variables of a peer's process: one thread, no window."""
+    return {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "MPLBACKEND": "Agg"}
 
 
 def measured(case: Case) -> Path:
@@ -56,7 +61,7 @@ def measured(case: Case) -> Path:
         subprocess.run(
             command,
             cwd=ROOT,
-            env={**os.environ, **_ONE_THREAD, "MPLBACKEND": "Agg"},
+            env=variables(),
             stdout=subprocess.DEVNULL,
             check=True,
         )

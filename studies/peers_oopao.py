@@ -6,6 +6,7 @@ Run by an interpreter that has OOPAO, from the repository's root:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.metadata import version
 
 import numpy as np
@@ -88,19 +89,9 @@ def _modulation(bench: Bench) -> float:
     return bench.modulation_lambda_over_d * (bench.n_pupil - 1) / bench.n_pupil
 
 
-def own_mirror(
-    peer: Oopao, bench: Bench, positions_m: Array, pitch_m: float
-) -> tuple[Array, Array]:
-    """Return its influence functions ``(n_actuators, n, n)``: registered, and misregistered.
-
-    Its shifts are in metres and move the mirror the other way; its pixels are 1 / (n - 1) of the
-    pupil wide, so that its mirror and its shifts come out smaller by (n - 1) / n.
-    """
-    if bench.misregistration is None:
-        raise ValueError("OOPAO's own mirror: found no misregistration in the job")
-    x_subap, y_subap, rotation_deg, magnification = bench.misregistration
-    subaperture_m = bench.diameter_m / bench.n_subapertures * bench.n_pupil / (bench.n_pupil - 1)
-    mirror = DeformableMirror(
+def mirror_of(peer: Oopao, bench: Bench, positions_m: Array, pitch_m: float) -> DeformableMirror:
+    """Return its own mirror, with its Gaussian influence functions."""
+    return DeformableMirror(
         telescope=peer.telescope,
         nSubap=round(bench.diameter_m / pitch_m),
         coordinates=positions_m,
@@ -108,10 +99,43 @@ def own_mirror(
         mechCoupling=COUPLING,
         print_dm_properties=False,
     )
+
+
+def subaperture_m(bench: Bench) -> float:
+    """Return the width of a subaperture in its metres.
+
+    Its pixels are 1 / (n - 1) of the pupil wide, so that its mirror and its shifts come out smaller
+    by (n - 1) / n.
+    """
+    return bench.diameter_m / bench.n_subapertures * bench.n_pupil / (bench.n_pupil - 1)
+
+
+def misregistration(bench: Bench, alpha: Sequence[float]) -> MisRegistration:
+    """Return shift x, y (subapertures), rotation (degrees) and magnification as it has them.
+
+    Its shifts are in metres and move the mirror the other way.
+    """
+    x_subap, y_subap, rotation_deg, magnification = alpha
     moved = MisRegistration()
-    moved.shiftX, moved.shiftY = -x_subap * subaperture_m, -y_subap * subaperture_m
+    moved.shiftX, moved.shiftY = -x_subap * subaperture_m(bench), -y_subap * subaperture_m(bench)
     moved.rotationAngle, moved.magnification = rotation_deg, magnification - 1.0
-    elsewhere = mirror.apply_mis_registration(moved)
+    return moved
+
+
+def from_misregistration(bench: Bench, found: MisRegistration) -> list[float]:
+    """Return what it has for a registration as ``misregistration`` takes it."""
+    shifts = [-float(m) / subaperture_m(bench) for m in (found.shiftX, found.shiftY)]
+    return [*shifts, float(found.rotationAngle), 1.0 + float(found.magnification)]
+
+
+def own_mirror(
+    peer: Oopao, bench: Bench, positions_m: Array, pitch_m: float
+) -> tuple[Array, Array]:
+    """Return its influence functions ``(n_actuators, n, n)``: registered, and misregistered."""
+    if bench.misregistration is None:
+        raise ValueError("OOPAO's own mirror: found no misregistration in the job")
+    mirror = mirror_of(peer, bench, positions_m, pitch_m)
+    elsewhere = mirror.apply_mis_registration(misregistration(bench, bench.misregistration))
     shape = (-1, bench.n_pupil, bench.n_pupil)
     return mirror.modes.T.reshape(shape), elsewhere.modes.T.reshape(shape)
 

@@ -73,7 +73,7 @@ def invert(
         factor = scipy.linalg.cho_factor(normal, overwrite_a=True)
         return Inversion(
             matrix=_by_slopes(controlled, lambda some: scipy.linalg.cho_solve(factor, some.T)),
-            condition_number=float(np.sqrt(power[-1] / power[0])),
+            condition_number=_condition_of(power),
             n_truncated=0,
         )
     if n_modes >= _MANY and max_condition <= _WELL:
@@ -91,16 +91,14 @@ def invert(
 def _of_eigenvectors(controlled: Array, normal: Array, max_condition: float) -> Inversion:
     """Return the truncated inverse by the eigenvectors of the normal equations.
 
-    Their eigenvalues are the squares of the singular values, good to 1e-16 of the largest: a
-    condition beyond 1e8 cannot be told, and is told as that.
+    Their eigenvalues are the squares of the singular values.
     """
     power, axes = np.linalg.eigh(normal)
     kept = power * max_condition**2 > power[-1]
     inverse = (axes[:, kept] / power[kept]) @ axes[:, kept].T
-    smallest = max(power[0], np.finfo(np.float64).eps * power[-1])
     return Inversion(
         matrix=_by_slopes(controlled, lambda some: inverse @ some.T),
-        condition_number=float(np.sqrt(power[-1] / smallest)),
+        condition_number=_condition_of(power),
         n_truncated=int(np.count_nonzero(~kept)),
     )
 
@@ -119,7 +117,14 @@ def _condition(controlled: Array) -> float:
     if controlled.shape[1] < _MANY:
         singular = scipy.linalg.svdvals(controlled)
         return float(singular[0] / singular[-1])
-    power = np.linalg.eigvalsh(controlled.T @ controlled)
+    return _condition_of(np.linalg.eigvalsh(controlled.T @ controlled))
+
+
+def _condition_of(power: NDArray[np.floating]) -> float:
+    """Return the same of the normal equations' rising eigenvalues, good to 1e-16 of the largest.
+
+    A condition beyond 1e8 cannot be told, and is told as that.
+    """
     return float(np.sqrt(power[-1] / max(power[0], np.finfo(np.float64).eps * power[-1])))
 
 

@@ -28,7 +28,6 @@ from service.estimation.windows import (
     WindowRefused,
 )
 from service.model.interaction import Linearisation
-from service.model.misregistration import Misregistration
 
 Array = NDArray[Any]
 
@@ -264,7 +263,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     covariance = every[:4, :4]
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
     return LockInEstimate(
-        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        alpha=linearisation.alpha.stepped(step),
         covariance=(covariance + covariance.T) / 2,
         optical_gain=gains,
         lag_frames=-np.angle(gains) / turns,

@@ -227,7 +227,7 @@ def _registered(
             seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
         )
         step = np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-        alpha = Misregistration.from_vector(alpha.vector + step)
+        alpha = alpha.stepped(step)
         if np.all(np.abs(step) < SETTLED):
             break
     return alpha, near

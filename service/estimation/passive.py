@@ -420,7 +420,7 @@ def fit_matrix(
     spread = (scores @ found.shape).reshape(4, -1) @ scores.reshape(4, -1).T
     covariance = variance * normal @ spread @ normal
     return PassiveEstimate(
-        alpha=Misregistration.from_vector(near.vector + step),
+        alpha=near.stepped(step),
         covariance=(1.0 - SHRUNK) * covariance + SHRUNK * np.diag(np.diag(covariance)),
         optical_gain=seen.gains,
         misfit=variance,

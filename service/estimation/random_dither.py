@@ -29,7 +29,6 @@ from service.estimation.windows import (
     WindowRefused,
 )
 from service.model.interaction import Linearisation
-from service.model.misregistration import Misregistration
 
 Array = NDArray[Any]
 
@@ -331,7 +330,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
         parts = _residuals_of_batches(sums, seen.gains * response, noise)
     spread = _scatter(_scores(parts, seen), normal)
     return RandomEstimate(
-        alpha=Misregistration.from_vector(linearisation.alpha.vector + step),
+        alpha=linearisation.alpha.stepped(step),
         covariance=inverse @ spread @ inverse.T,
         optical_gain=seen.gains,
         gain_sigma=_gain_sigma(parts, response, power),

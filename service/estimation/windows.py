@@ -27,6 +27,9 @@ class ClosedLoop(ControlLoop):
 SETTLING_S = 0.3
 """Of the loop, after a dither has begun, before the first window."""
 
+OTHER_SESSION = "the RTC has restarted since"
+"""Why a window is of no use: what it holds belongs to the session before."""
+
 CHUNK_FRAMES = 512
 """Frames multiplied at once: the sums, some MB, are read from memory once for all of them."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,6 +244,24 @@ class Instrument(Telescope):
                 "(mirror.layout), whose actuators are known"
             )
         return self.mirror
+
+
+_Sensor = TypeVar("_Sensor", bound=SensorDescription)
+
+
+def sensor_of_kind(instrument: Instrument, kind: type[_Sensor]) -> _Sensor:
+    """Return the sensor of an instrument that has one of this kind.
+
+    Raises
+    ------
+    ModelError
+        If its sensor is another.
+    """
+    if not isinstance(instrument.wfs, kind):
+        raise ModelError(
+            f"{instrument.name}: found wfs.kind = {instrument.wfs.kind}, expected {kind.kind}"
+        )
+    return instrument.wfs
 
 
 _LATER = frozenset({"unknown", "sensor_modes", "law", "pupil", "spiders_m", "spiders_deg"})

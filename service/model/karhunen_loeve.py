@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.local import LocalShapes, Patch, tiles_of
-from service.model.pupil import instrument_pupil
+from service.model.pupil import PupilGrid, instrument_pupil
 from service.model.sensors.sensor import by_rows
 from service.model.surface import Gaussian, Surface
 from service.model.turbulence import (
@@ -54,35 +54,33 @@ def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Arr
             f"fewer than the {len(positions_m)} actuators (piston is left out)"
         )
     gram, covariance = surface_statistics(instrument, surface)
-    amplitude = instrument_pupil(instrument, _FINER).amplitude
+    fine = instrument_pupil(instrument, _FINER)
     sectors = [scipy.sparse.eye_array(len(positions_m), format="csc")]
-    if np.allclose(amplitude, amplitude[::-1], rtol=0.0, atol=1e-9):
+    if np.allclose(fine.amplitude, fine.amplitude[::-1], rtol=0.0, atol=1e-9):
         sectors = _parity_sectors(positions_m)
     strokes, variance = _diagonalise(gram, covariance, sectors, n_modes)
-    strokes = _unit_rms(strokes, _gram(instrument, surface, strokes))
+    strokes = _unit_rms(strokes, _gram(surface, strokes, fine))
     strokes = _tilts_along_axes(strokes, positions_m)
     return _fix_signs(strokes, positions_m), variance
 
 
 def surface_statistics(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
     """Return Gram matrix of the actuators' functions and covariance of turbulence on them."""
-    functions = _local(instrument, surface, SAMPLING)
+    functions = _local(surface, instrument_pupil(instrument, SAMPLING))
     if functions is not None:
         return local_statistics(instrument, functions)
     influence = _influence(surface)
     return pupil_statistics(instrument, lambda points: _heights(surface, influence, points))
 
 
-def _gram(instrument: Instrument, surface: Surface, strokes: Array) -> Array:
-    """Return the Gram matrix of modes on the finer grid."""
-    weights = instrument_pupil(instrument, _FINER).weights
-    functions = _local(instrument, surface, _FINER)
+def _gram(surface: Surface, strokes: Array, pupil: PupilGrid) -> Array:
+    """Return the Gram matrix of modes on a pupil."""
+    functions = _local(surface, pupil)
     if functions is not None:
-        return np.asarray(strokes.T @ pupil_gram(functions, weights) @ strokes)
-    points = instrument_pupil(instrument, _FINER).points
-    heights = _heights(surface, _influence(surface) @ strokes, points)
-    shapes = piston_free(heights, weights)
-    return np.asarray(shapes.T @ (shapes * weights[:, None]))
+        return np.asarray(strokes.T @ pupil_gram(functions.sparse(), pupil.weights) @ strokes)
+    heights = _heights(surface, _influence(surface) @ strokes, pupil.points)
+    shapes = piston_free(heights, pupil.weights)
+    return np.asarray(shapes.T @ (shapes * pupil.weights[:, None]))
 
 
 def _heights(surface: Surface, coefficients: Array, points: Array) -> Array:
@@ -94,9 +92,8 @@ def _influence(surface: Surface) -> Array:
     return surface.coefficients(np.eye(len(surface.positions)))
 
 
-def _local(instrument: Instrument, surface: Surface, sampling: int) -> LocalShapes | None:
+def _local(surface: Surface, pupil: PupilGrid) -> LocalShapes | None:
     """Return the actuators' functions tile by tile; None: they do not end, or are small whole."""
-    pupil = instrument_pupil(instrument, sampling)
     n_points, n_functions = int(pupil.lit.sum()), len(surface.positions)
     if not isinstance(surface, Gaussian) or 8.0 * n_points * n_functions < WHOLE_BYTES:
         return None

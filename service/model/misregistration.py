@@ -86,6 +86,10 @@ class Misregistration:
         names = (field.name for field in fields(cls))
         return cls(**{name: float(v) for name, v in zip(names, vector, strict=True)})
 
+    def stepped(self, step: NDArray[np.float64]) -> Self:
+        """Return the registration a step ``(4,)`` further, numeric units."""
+        return self.from_vector(self.vector + step)
+
     @classmethod
     def from_boundary(cls, values: dict[str, float]) -> Self:
         """Build from the four named numbers used on the wire, in files and in REST (degrees)."""

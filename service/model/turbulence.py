@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy
@@ -97,16 +98,18 @@ def local_statistics(instrument: Instrument, functions: LocalShapes) -> tuple[Ar
         covariance[start : columns.stop] = (block * weights) @ functions
     piston = spread(places, weights) * weights
     # without their means: (f - m)' W B W (f - m), m the mean of each function
-    mean, on_piston = weights @ functions.sparse(), piston @ functions.sparse()
+    mean, on_piston = weights @ heights, piston @ heights
     covariance -= np.outer(mean, on_piston)
     covariance -= np.outer(on_piston, mean)
     covariance += piston.sum() * np.outer(mean, mean)
-    return pupil_gram(functions, weights), (covariance + covariance.T) / 2
+    return pupil_gram(heights, weights), (covariance + covariance.T) / 2
 
 
-def pupil_gram(functions: LocalShapes, weights: Array) -> Array:
-    """Return the Gram matrix of functions that end, without their means, ``(n, n)``."""
-    heights = functions.sparse()
+def pupil_gram(heights: Any, weights: Array) -> Array:  # noqa: ANN401 - scipy has no types
+    """Return the Gram matrix of functions that end, without their means, ``(n, n)``.
+
+    ``heights`` is ``(n_points, n)``, sparse.
+    """
     mean = weights @ heights
     weighted = scipy.sparse.diags_array(weights) @ heights
     return np.asarray((heights.T @ weighted).toarray() - np.outer(mean, mean))

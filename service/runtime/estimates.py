@@ -17,7 +17,13 @@ from service.estimation.dither_windows import EndedWindow
 from service.estimation.loop import loop_numbers
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
-from service.estimation.windows import ClosedLoop, RefusalKind, Telemetry, WindowRefused
+from service.estimation.windows import (
+    OTHER_SESSION,
+    ClosedLoop,
+    RefusalKind,
+    Telemetry,
+    WindowRefused,
+)
 from service.model.instrument import Instrument
 from service.model.misregistration import Misregistration
 from service.runtime.ports import StorePort, WorkerPort
@@ -120,7 +126,7 @@ async def _outcome(
     if rtc is not None and window.session != rtc.session:
         # the model may be of another mode of the sensor by now
         return WindowRefused(
-            reason="the RTC has restarted since",
+            reason=OTHER_SESSION,
             t_ns_utc=window.t_end_ns_utc,
             kind=RefusalKind.VOID,
         )

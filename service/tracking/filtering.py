@@ -13,7 +13,7 @@ from service.estimation.estimate import DitheredEstimate, model_error
 from service.estimation.kalman import Drift, Joint, begin_joint, predicted
 from service.estimation.lockin import MAX_LAG_FRAMES
 from service.estimation.random_dither import RandomEstimate
-from service.estimation.windows import RefusalKind, Why
+from service.estimation.windows import OTHER_SESSION, RefusalKind, Why
 from service.model.misregistration import Misregistration
 from service.tracking import mode_proof, validity
 from service.tracking.alarms import Interlock, blocking_alarm
@@ -336,7 +336,7 @@ def why_no_window(
 ) -> Why | None:
     """Return why a window's estimate must not be used, or None."""
     if context.rtc is None or estimate.session != context.rtc.session:
-        return RefusalKind.VOID, "the RTC has restarted since"
+        return RefusalKind.VOID, OTHER_SESSION
     reason = why_no_measurement(context.state, when)
     if reason is not None:
         return RefusalKind.VOID, reason

@@ -103,7 +103,7 @@ def start_of_fit(
     now, then = state.alpha.law.nominal, law_at(state, t_ns_utc)
     if now is None or then is None:
         return alpha
-    return then if alpha is None else _stepped(alpha, difference(now, then))
+    return then if alpha is None else alpha.stepped(difference(now, then))
 
 
 def registration_ahead(state: TrackerState, registration: Registration) -> Registration:
@@ -119,7 +119,7 @@ def registration_ahead(state: TrackerState, registration: Registration) -> Regis
     added = third**2 + 2.0 * sigma * third  # the root of σ² and this is σ and a third
     return replace(
         registration,
-        alpha=_stepped(registration.alpha, step),
+        alpha=registration.alpha.stepped(step),
         covariance=registration.covariance + np.diag(added),
     )
 
@@ -158,7 +158,7 @@ def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
         return way[min(later, len(way) - 1)][1]
     (before_ns, before), (after_ns, after) = way[later - 1], way[later]
     share = (t_ns_utc - before_ns) / (after_ns - before_ns)
-    return _stepped(before, share * difference(before, after))
+    return before.stepped(share * difference(before, after))
 
 
 def difference(one: Misregistration, other: Misregistration) -> Array:
@@ -177,11 +177,7 @@ def _of_now(
     then = law_at(state, middle_ns)
     if now is None or then is None:
         return alpha
-    return _stepped(alpha, difference(then, now))
-
-
-def _stepped(alpha: Misregistration, step: Array) -> Misregistration:
-    return Misregistration.from_vector(alpha.vector + step) if step.any() else alpha
+    return alpha.stepped(difference(then, now))
 
 
 def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
@@ -266,7 +262,7 @@ def _carry(context: StepContext, now: Misregistration) -> None:
             registration = moved(registration, difference(registration.nominal, now))
         store_registration(context, replace(registration, nominal=now))
     if acquisition.alpha is not None and before is not None and before != now:
-        found = _stepped(acquisition.alpha, difference(before, now))
+        found = acquisition.alpha.stepped(difference(before, now))
         set_acquisition(context, replace(acquisition, alpha=found))
     state = LawState(nominal=now, worked_out_ns_utc=context.now_ns, way=_way(context, now))
     if state != context.alpha.law:

@@ -332,7 +332,7 @@ def moved(registration: Registration, step: Array) -> Registration:
     """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""
     return replace(
         registration,
-        alpha=_further(registration.alpha, step),
+        alpha=registration.alpha.stepped(step),
         previous_estimate=_previous_moved(registration.previous_estimate, step),
         suspected_jump=_moved(registration.suspected_jump, step),
         biases=tuple(
@@ -347,18 +347,14 @@ def _previous_moved(previous: PreviousEstimate | None, step: Array) -> PreviousE
         return None
     return replace(
         previous,
-        alpha=_further(previous.alpha, step),
+        alpha=previous.alpha.stepped(step),
         next_window=_moved(previous.next_window, step),
         previous_estimate=_previous_moved(previous.previous_estimate, step),
     )
 
 
 def _moved(estimate: _Timed | None, step: Array) -> _Timed | None:
-    return None if estimate is None else replace(estimate, alpha=_further(estimate.alpha, step))
-
-
-def _further(alpha: Misregistration, step: Array) -> Misregistration:
-    return Misregistration.from_vector(alpha.vector + step)
+    return None if estimate is None else replace(estimate, alpha=estimate.alpha.stepped(step))
 
 
 class OffloadState(StrEnum):

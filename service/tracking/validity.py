@@ -118,7 +118,7 @@ def shift_estimate(context: StepContext, step: Array, spread: Array, still_ns_ut
         context,
         replace(
             registration,
-            alpha=Misregistration.from_vector(registration.alpha.vector + step),
+            alpha=registration.alpha.stepped(step),
             covariance=registration.covariance + np.diag(spread**2),
             n_windows=0,
             previous_estimate=None,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument, SensorMode
+from service.model.instrument import Instrument, SensorMode, sensor_of_kind
 from service.model.kinds import LoopFacts
 from service.model.sensors.pyramid.table import PyramidMode, PyramidNumbers, PyramidTable
 
@@ -81,6 +81,16 @@ def modes_of(table: PyramidTable, sensor: Pyramid) -> tuple[tuple[SensorMode, st
     )
 
 
+def binned(sensor: Pyramid, binning: int) -> Pyramid:
+    """Return the pyramid whose subapertures are ``binning`` of the finest along each axis."""
+    return replace(
+        sensor,
+        n_subapertures=sensor.n_subapertures // binning,
+        pupil_separation_subap=sensor.image_separation_subap / binning,
+        pupil_diameter_subap=sensor.pupil_diameter / binning,
+    )
+
+
 def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
     n, binning = sensor.n_subapertures, mode.binning
     if mode.n_subapertures is None and n % binning:
@@ -97,10 +107,8 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
         )
     modulation = mode.modulation_lambda_over_d
     wfs = replace(
-        sensor,
+        binned(sensor, binning),
         n_subapertures=across,
-        pupil_separation_subap=sensor.image_separation_subap / binning,
-        pupil_diameter_subap=diameter,
         modulation_lambda_over_d=(
             sensor.modulation_lambda_over_d if modulation is None else modulation
         ),
@@ -117,11 +125,7 @@ def pyramid_in(instrument: Instrument) -> Pyramid:
     ModelError
         If its sensor is another.
     """
-    if not isinstance(instrument.wfs, Pyramid):
-        raise ModelError(
-            f"{instrument.name}: found wfs.kind = {instrument.wfs.kind}, expected pyramid"
-        )
-    return instrument.wfs
+    return sensor_of_kind(instrument, Pyramid)
 
 
 def frames_of(table: PyramidTable, given: frozenset[str]) -> FrameWindows | None:

@@ -110,12 +110,9 @@ class PyramidKind(SensorKind):
 
     @override
     def binned(self, sensor: Pyramid, binning: int) -> Pyramid:
-        return replace(
-            sensor,
-            n_subapertures=sensor.n_subapertures // binning,
-            pupil_separation_subap=sensor.image_separation_subap / binning,
-            pupil_diameter_subap=sensor.pupil_diameter / binning,
-        )
+        from service.model.sensors.pyramid.description import binned
+
+        return binned(sensor, binning)
 
     @override
     def slope_noise(

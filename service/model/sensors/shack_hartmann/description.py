@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, sensor_of_kind
 from service.model.sensors.shack_hartmann.table import (
     Centroid,
     PartlyLit,
@@ -100,11 +100,7 @@ def shack_hartmann_in(instrument: Instrument) -> ShackHartmann:
     ModelError
         If its sensor is another.
     """
-    if not isinstance(instrument.wfs, ShackHartmann):
-        raise ModelError(
-            f"{instrument.name}: found wfs.kind = {instrument.wfs.kind}, expected shack-hartmann"
-        )
-    return instrument.wfs
+    return sensor_of_kind(instrument, ShackHartmann)
 
 
 def pixel_places(sensor: ShackHartmann, valid: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -62,6 +62,11 @@ class ShackHartmannSensor:
         """That K, which is sparse, is kept."""
         return True
 
+    @property
+    def side(self) -> int:
+        """Points across the grid of wavefronts that lenslets read: the pupil's, and beyond."""
+        return len(self.pupil.coordinates) + 2 * _BEYOND
+
     @cached_property
     def spots(self) -> Spots:
         """Pixels and centroid."""
@@ -285,10 +290,7 @@ class ShackHartmannResponse:
 
     def _window(self, y: Array, x: Array) -> tuple[Array, Array, Array]:
         """Return rows and columns of the grid that lenslets read, and which exist."""
-        side, read = (
-            len(self.sensor.pupil.coordinates) + 2 * _BEYOND,
-            np.arange(self.sensor.pupil.sampling + 4),
-        )
+        side, read = self.sensor.side, np.arange(self.sensor.pupil.sampling + 4)
         along_x, along_y = (axis.first for axis in self._read)
         rows = (along_y[y][:, None] + read)[:, :, None]
         columns = (along_x[x][:, None] + read)[:, None, :]
@@ -300,7 +302,7 @@ class ShackHartmannResponse:
         sensor = self.sensor
         y, x = np.nonzero(sensor.valid)
         rows, columns, inside = self._window(y, x)
-        places = np.where(inside, rows * (len(sensor.pupil.coordinates) + 2 * _BEYOND) + columns, 0)
+        places = np.where(inside, rows * sensor.side + columns, 0)
         values = np.concatenate([np.where(inside, plane, 0.0) for plane in planes])
         values *= 2 * np.pi / sensor.instrument.wfs.wavelength_m
         n_read = values[0].size
@@ -310,6 +312,6 @@ class ShackHartmannResponse:
                 np.tile(places.reshape(-1), len(planes)),
                 n_read * np.arange(len(values) + 1),
             ),
-            shape=(len(values), (len(sensor.pupil.coordinates) + 2 * _BEYOND) ** 2),
+            shape=(len(values), sensor.side**2),
         )
         return (matrix @ sensor.continued).astype(sensor.dtype)

@@ -77,7 +77,7 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
     axes.axvline(1.0, color="#222222", linewidth=0.8)
     axes.set_xlabel("processor time of the peer over pyrcal's")
     axes.grid(axis="x", alpha=0.4)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=90)
 
 
 def _figure(value: float) -> str:

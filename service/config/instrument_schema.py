@@ -78,6 +78,9 @@ class MirrorTable(kinds.InfluenceShape):
     diameter_m: kinds.Positive | None = None
     """Grid and hexagonal: actuators beyond this circle do not exist."""
 
+    hole_m: kinds.Positive | None = None
+    """Hexagonal only: diameter of a hole in the middle, where there are no actuators."""
+
     positions: str | None = None
     """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
 

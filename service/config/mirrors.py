@@ -26,7 +26,7 @@ _KINDS = ("layout", "modes", "influence_functions")
 _LAYOUT_KEYS = {
     "rings": {"first_ring", "last_ring", "pitch_m"},
     "grid": {"n_across", "pitch_m", "diameter_m"},
-    "hexagonal": {"pitch_m", "diameter_m"},
+    "hexagonal": {"pitch_m", "diameter_m", "hole_m"},
     "positions": {"positions", "pitch_m"},
 }
 
@@ -202,7 +202,7 @@ def _grid(file: MirrorSection) -> NDArray[np.float64]:
 
 def _hexagonal(file: MirrorSection) -> NDArray[np.float64]:
     pitch_m, diameter_m = _mandatory(file, ("pitch_m", "diameter_m"))
-    positions = hexagonal(pitch_m, diameter_m)
+    positions = hexagonal(pitch_m, diameter_m, file.said.hole_m or 0.0)
     _check_number(len(positions), f"{file.path}: mirror")
     return positions
 
@@ -284,18 +284,20 @@ def grid(n_across: int, pitch_m: float, diameter_m: float) -> NDArray[np.float64
     return _inside(x, y, diameter_m)
 
 
-def hexagonal(pitch_m: float, diameter_m: float) -> NDArray[np.float64]:
+def hexagonal(pitch_m: float, diameter_m: float, hole_m: float = 0.0) -> NDArray[np.float64]:
     """Return the points of a triangular lattice inside a circle, ``(n_actuators, 2)``, metres.
 
     Each has six neighbours at ``pitch_m``. One lies at the centre, rows run along +x, from the
-    lowest y up: the layout is its own mirror image under y -> -y.
+    lowest y up: the layout is its own mirror image under y -> -y. Points closer to the centre than
+    half of ``hole_m`` are left out.
     """
     rows = int(diameter_m / 2 / (pitch_m * np.sqrt(0.75)) + 1e-9)
     row = np.arange(-rows, rows + 1)
     columns = int(diameter_m / 2 / pitch_m) + 1
     along = np.arange(-columns, columns + 1) + 0.5 * (row % 2)[:, None]
     y = np.broadcast_to((row * pitch_m * np.sqrt(0.75))[:, None], along.shape)
-    return _inside(along * pitch_m, y, diameter_m)
+    points = _inside(along * pitch_m, y, diameter_m)
+    return np.asarray(points[np.linalg.norm(points, axis=1) >= hole_m / 2])
 
 
 def _inside(

@@ -95,6 +95,13 @@ def test_a_hexagonal_layout_has_six_neighbours_each_and_one_in_the_middle():
     assert mirrored.min(axis=1).max() < 1e-12
 
 
+def test_a_hole_leaves_out_what_is_nearer_to_the_middle_than_half_of_it():
+    every, around = hexagonal(0.5, 4.0), hexagonal(0.5, 4.0, 1.01)
+    inner = np.linalg.norm(every, axis=1) < 0.505
+    assert inner.sum() == 7
+    np.testing.assert_array_equal(around, every[~inner])
+
+
 def test_a_file_may_ask_for_a_hexagonal_layout(write):
     mirror = '[mirror]\nlayout = "hexagonal"\npitch_m = 0.5\ndiameter_m = 8.5\n'
     bench = load_instrument(write(ABOUT + APART + mirror + MODES))
@@ -174,6 +181,30 @@ def test_every_value_of_the_packaged_gpao_names_its_source():
     values = [line for line in lines if "=" in line and not line.startswith("#")]
     named = re.compile(r"# (\[[AW]\]|ours)")
     assert [value for value in values if not named.search(value)] == ['name = "gpao-ut"']
+
+
+def test_the_packaged_aof_is_what_its_sources_say():
+    """Of SynIM's own file: 160 x 0.05 m, 40 x 40 with six pixels of 0.85", 589 nm, 1 ms."""
+    aof = load_instrument("aof-ut4")
+    assert aof.diameter_m == pytest.approx(160 * 0.05)
+    assert aof.wfs.kind == "shack-hartmann"
+    assert (aof.wfs.n_subapertures, aof.wfs.pixels_per_subaperture) == (40, 6)
+    assert 6 * aof.wfs.pixel_scale_arcsec == pytest.approx(5.1)
+    assert aof.wfs.wavelength_m == 589e-9
+    assert len(aof.mirror.positions_m) == 1170
+    # its 10192 slopes are of four sensors; a mask of 1274 has no symmetry that ours could have
+    assert int(valid_subapertures(aof).sum()) == pytest.approx(10192 / 8, rel=0.005)
+    assert 1 / aof.loop.frame_rate_hz == 0.001
+    assert aof.modes.outer_scale_m == 25.0
+    assert aof.modes.r0_m == pytest.approx(0.98 * 500e-9 / np.deg2rad(0.644 / 3600), rel=0.01)
+    assert not aof.remarks
+
+
+def test_every_value_of_the_packaged_aof_names_its_source():
+    lines = packaged_file("aof-ut4").read_text(encoding="utf-8").splitlines()
+    values = [line for line in lines if "=" in line and not line.startswith("#")]
+    named = re.compile(r"# (\[[SE]\]|ours)")
+    assert [value for value in values if not named.search(value)] == ['name = "aof-ut4"']
 
 
 def test_a_users_file_gives_an_instrument(write):
@@ -461,7 +492,7 @@ def test_an_unknown_mode_names_those_that_are_known(write):
 
 
 def test_an_unknown_packaged_name_lists_the_known_ones():
-    assert "neither a packaged name (flao-lbt, gpao-ut, soul-lbt)" in refusal(
+    assert "neither a packaged name (aof-ut4, flao-lbt, gpao-ut, soul-lbt)" in refusal(
         load_instrument, "flao-lbtt"
     )
 

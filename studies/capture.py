@@ -70,8 +70,8 @@ def captured(
     found = refused = false = 0
     before = bench.counter.n
     for start in starts:
-        landing = land(bench, target, start)
-        place = landing.best.vector
+        landing = land(bench, target, Misregistration.from_vector(start))
+        place = landing.best.alpha.vector
         known = [fit for where, fit in places if np.all(np.abs(where - place) < 0.1 * SAME)]
         if known:
             fit = known[0]

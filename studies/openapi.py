@@ -304,8 +304,11 @@ class FitDocument(BaseModel):
     """Begins with "accepted" or "refused"; names what was left out."""
 
     anamorphosis: list[float] | None = None
-    """Half the stretch along x over that along y, and along 45 deg over 135 deg; null: not
-    asked for."""
+    """Stretch of the mirror's image along x over the mean of both axes, less 1, and along 45 deg;
+    null: the modes do not tell, or it was not to be fitted."""
+
+    anamorphosis_sigma: list[float] | None = None
+    """1 σ of both; null: it was not to be fitted."""
 
     instrument_found: dict[str, dict[str, float | None]] = {}
     """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""

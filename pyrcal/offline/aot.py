@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError, WireError
 from service.files.recording import RecordedKind, Recording
 from service.model.instrument import Instrument, Mirror
-from service.model.misregistration import Misregistration, rotation
+from service.model.misregistration import Misregistration
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.slopes import to_conventions
@@ -196,7 +196,7 @@ def affine(alpha: Misregistration, subaperture_m: float) -> NDArray[np.float64]:
     """Return ``(3, 3)``: from ``(x, y, 1)`` on the mirror to the sensor, metres in the pupil."""
     shift_m = np.array([alpha.shift_x_subap, alpha.shift_y_subap]) * subaperture_m
     matrix = np.eye(3)
-    matrix[:2, :2] = alpha.magnification * rotation(alpha.rotation_rad)
+    matrix[:2, :2] = alpha.image
     matrix[:2, 2] = shift_m
     return matrix
 

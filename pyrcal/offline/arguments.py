@@ -122,7 +122,8 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     add(
         fit,
         words("--gain-map", "also fit a smooth gain over the pupil"),
-        words("--anamorphosis", "also fit a stretched image"),
+        words("--no-anamorphosis", "take the image for as stretched as the instrument file says"),
+        words("--anamorphosis", "as without it: the stretch is always fitted"),
         words("--json", "print one JSON object, not a table"),
         words("--plot FILE.png", "write the paper's figures", type=Path),
         words("--output FILE.h5", "write everything found", type=Path),

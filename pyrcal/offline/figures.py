@@ -21,7 +21,7 @@ from pyrcal.offline.report import FitReport, verdict_line
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.kinds import SignalKind
-from service.model.misregistration import Misregistration, rotation
+from service.model.misregistration import Misregistration
 from service.model.slopes import as_maps, side_by_side
 
 if TYPE_CHECKING:
@@ -155,8 +155,7 @@ def registration(axes: Axes, fit: Fit, instrument: Instrument) -> None:
 
 def landed(points: Array, alpha: Misregistration) -> Array:
     """Return where points of the mirror ``(n, 2)`` fall on the sensor, in subapertures."""
-    turned = points @ rotation(alpha.rotation_rad).T
-    return np.asarray(alpha.magnification * turned + alpha.vector[:2])
+    return np.asarray(points @ alpha.image.T + alpha.vector[:2])
 
 
 def _shown(fit: Fit) -> str:

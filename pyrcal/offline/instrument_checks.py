@@ -17,7 +17,6 @@ from pyrcal.offline.models import BETTER, CHEAP, FitModels, Optic, Other
 from pyrcal.offline.pupil_checks import Few, other_pupils
 from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import Uncertainty
-from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]
 
@@ -130,7 +129,7 @@ def rivals(settled: Settled) -> tuple[Rival, ...]:
     for change, other in settled.models.other_instruments.items():
         share, moved = few.left(few.matrix(other)) / own, np.zeros(4)
         if change.believed <= share < 1.0 / BETTER:
-            there = refine(other, settled.target, solution.vector, settled.nuisances)
+            there = refine(other, settled.target, solution.alpha, settled.nuisances)
             moved = there.vector - solution.vector if there.converged else moved
         found.append(Rival(change=change, share=share, moved=moved))
     return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
@@ -150,7 +149,7 @@ def doubt_of_width(settled: Settled) -> Array:
     few = target.column_subset(modes)
     subset = models.model(CHEAP, models.basis.subset(modes))
     models.counter.n += 1
-    wider = subset.width_derivative(Misregistration.from_vector(solution.vector))
+    wider = subset.width_derivative(solution.alpha)
     known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
     steps = [
         few.project(solution.matrix[:, modes], derivatives).best_step[:4]
@@ -186,7 +185,7 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
 def as_told(models: FitModels, settled: Settled) -> AsTold:
     """Return the fit with the instrument that the file describes; ``models`` are its."""
     nothing = replace(settled.nuisances, optics=())
-    there = refine(models, settled.target, settled.solution.vector, nothing)
+    there = refine(models, settled.target, settled.solution.alpha, nothing)
     return AsTold(
         share=settled.solution.projection.chi / there.projection.chi,
         moved=there.vector - settled.solution.vector,

@@ -31,7 +31,7 @@ from pyrcal.offline.noise import structure
 from pyrcal.offline.pupil_checks import Few, left_by_light
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
-from pyrcal.offline.solver import nuisances_of
+from pyrcal.offline.solver import ANAMORPHOSIS_SIGMA, nuisances_of
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
@@ -50,6 +50,9 @@ from service.model.pupil import Illumination, rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
+
+TOLD = 0.5
+"""1 σ of an anamorphosis over what is expected of any, below which modes tell of it."""
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -74,8 +77,8 @@ class FitOptions:
     gain_map: bool = False
     """Whether a smooth gain over the pupil, common to all modes, is unknown too."""
 
-    anamorphosis: bool = False
-    """Whether stretches of the mirror's image along and across 0 and 45 deg are unknown too."""
+    anamorphosis: bool = True
+    """Whether the anamorphosis of the mirror's image is unknown too."""
 
     illumination: Illumination | None = None
     """Measured light of the beam, in the axes of conventions.md; None: even."""
@@ -146,14 +149,21 @@ class Fit(Determination):
     gain_map: NDArray[np.float64] | None = None
     """``(n, n)`` gain over the pupil common to all modes, mean 1; None: not asked for."""
 
-    anamorphosis: NDArray[np.float64] | None = None
-    """``(2,)`` half the stretch along x over that along y, and along 45 deg over 135 deg."""
+    anamorphosis_sigma: NDArray[np.float64] | None = None
+    """``(2,)`` 1 σ of the anamorphosis of ``alpha``; None: it was not fitted."""
 
     optics: tuple[FoundOptic, ...] = ()
     """What of the instrument was fitted, too: coupling or width, modulation."""
 
     paper_table: tuple[ScanStep, ...] | None = None
     """The scans, in their order; None for the other methods."""
+
+    @property
+    def anamorphosis(self) -> NDArray[np.float64] | None:
+        """``(2,)`` as α has it; None where the modes do not tell, or it was not fitted."""
+        sigma = self.anamorphosis_sigma
+        told = sigma is not None and bool(np.all(sigma < TOLD * ANAMORPHOSIS_SIGMA))
+        return self.alpha.stretches if told else None
 
 
 def fit_matrix(
@@ -232,11 +242,12 @@ def _fitted(
     )
     tell("fit")
     if options.start is not None:
-        start = options.start.vector
+        start = options.start
     else:
-        start = instrument.start.vector
-        start[2] = rotation_rad if rotation_rad is not None else start[2]
-    found = _found(models, target, start, options)
+        start = instrument.start
+        if rotation_rad is not None:
+            start = replace(start, rotation_rad=rotation_rad)
+    found = _found(models, target, instrument.with_anamorphosis(start), options)
     tell("verdict")
     return _answer(models, found, usable, untold, reported)
 
@@ -311,25 +322,28 @@ class _Found:
     table: tuple[ScanStep, ...] | None = None
 
 
-def _found(models: FitModels, target: Target, start: Array, options: FitOptions) -> _Found:
+def _found(
+    models: FitModels, target: Target, start: Misregistration, options: FitOptions
+) -> _Found:
     nuisances = nuisances_of(
         target.valid,
         models.instrument.slopes.kind,
         gain_map=options.gain_map,
         anamorphosis=options.anamorphosis,
+        nominal=models.instrument.with_anamorphosis(models.instrument.start),
         optics=models.optics,
         unknown=models.unknown,
     )
     match options.method:
         case Method.JOINT:
             landing = land(models, target, start)
-            settled = settle(models, target, landing.best.vector, nuisances)
+            settled = settle(models, target, landing.best.alpha, nuisances)
             return _Found(settled=settled, landing=landing)
         case Method.SENSITIVITY:
             return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
         case Method.PAPER:
-            vector, table = scan(models, target, start)
-            return _Found(settled=settle_at(models, target, vector, nuisances), table=table)
+            alpha, table = scan(models, target, start)
+            return _Found(settled=settle_at(models, target, alpha, nuisances), table=table)
 
 
 def _answer(
@@ -377,7 +391,7 @@ def _answer(
     )
     accepted, verdict = judged(findings)
     return Fit(
-        alpha=Misregistration.from_vector(solution.vector),
+        alpha=solution.alpha,
         covariance=sure.covariance,
         gains=seen.gains,
         residual_fraction=residual_fraction,
@@ -404,7 +418,7 @@ def _answer(
         measured=target.matrix,
         valid=target.valid,
         gain_map=nuisances.gain_map(solution.nuisances, target.valid),
-        anamorphosis=nuisances.stretches(solution.nuisances),
+        anamorphosis_sigma=nuisances.stretch_sigma(sure.nuisance_sigma),
         optics=optics,
         paper_table=found.table,
     )

@@ -127,14 +127,14 @@ class Landing:
     """Other minima nearly as good."""
 
 
-def land(models: FitModels, target: Target, start: Array) -> Landing:
+def land(models: FitModels, target: Target, start: Misregistration) -> Landing:
     """Return where a start leads; if that explains little, where the best of many leads."""
     matrix = models.low_order.measured(target.matrix)
     low = Columns(
         matrix=matrix, weights=1.0 / np.sum(matrix[target.rows] ** 2, axis=0), rows=target.rows
     )
     found: list[Approach] = []
-    for tried in (start, *_other_starts(start)):
+    for tried in (start, *map(start.moved_to, _other_starts(start.vector))):
         found.append(approach(models.far, low, tried))
         models.counter.n += found[-1].n_matrices
         if found[-1].converged and found[-1].misfit < GOOD:
@@ -145,7 +145,7 @@ def land(models: FitModels, target: Target, start: Array) -> Landing:
         for one in found
         if one.converged
         and one.misfit < NEARLY_AS_GOOD * best.misfit
-        and np.any(np.abs(one.vector - best.vector) > SAME)
+        and np.any(np.abs(one.alpha.vector - best.alpha.vector) > SAME)
     ]
     return Landing(best=best, rivals=tuple(rivals))
 
@@ -177,7 +177,9 @@ class Settled:
         return float(np.sqrt(np.mean(self.by_mode**2)))
 
 
-def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances) -> Settled:
+def settle(
+    models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances
+) -> Settled:
     """Return the minimum on the fine grid.
 
     What is found of the instrument is linear only close by, so the fit is done again about it. A
@@ -191,10 +193,10 @@ def settle(models: FitModels, target: Target, start: Array, nuisances: Nuisances
     for _ in range(MAX_REPEATS):
         if models is settled.models:
             models, nuisances = _adjusted(settled)
-        there = _known(models, target, settled.solution.vector)
+        there = _known(models, target, settled.solution.alpha)
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             break
-        solution = refine(models, there, settled.solution.vector, nuisances)
+        solution = refine(models, there, settled.solution.alpha, nuisances)
         settled = Settled(solution=solution, target=there, models=models, nuisances=nuisances)
     return settled
 
@@ -216,13 +218,12 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     modes = spread(settled.target.n_modes)
     few = settled.target.column_subset(modes)
     subset = replace(models, basis=models.basis.subset(modes))
-    here = Misregistration.from_vector(solution.vector)
     every = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
 
     def left(change: float) -> float:
         models.counter.n += 1
         changed = subset.adjusted(Optic.SENSOR, change) if change else subset
-        return few.project(changed.cheap.interaction_matrix(here), every).chi_at_best
+        return few.project(changed.cheap.interaction_matrix(solution.alpha), every).chi_at_best
 
     found = [left(change) for change in CHANGES]
     best = int(np.argmin(found))
@@ -256,41 +257,42 @@ def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
     return models, replace(nuisances, optics=tuple(optics))
 
 
-def settle_at(models: FitModels, target: Target, vector: Array, nuisances: Nuisances) -> Settled:
+def settle_at(
+    models: FitModels, target: Target, alpha: Misregistration, nuisances: Nuisances
+) -> Settled:
     """Return the model as it stands at a registration that another method has found."""
-    seen = _known(models, target, vector)
-    there = refine(models, seen, vector, nuisances, max_steps=0)
-    solution = replace(there, converged=within_limits(vector))
+    seen = _known(models, target, alpha)
+    there = refine(models, seen, alpha, nuisances, max_steps=0)
+    solution = replace(there, converged=within_limits(alpha.vector))
     return Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
 
 
 def project_on_sensitivities(
-    models: FitModels, target: Target, start: Array, nuisances: Nuisances
+    models: FitModels, target: Target, start: Misregistration, nuisances: Nuisances
 ) -> Settled:
     """Return the end of projections on sensitivities from one start."""
     for _ in range(MAX_REPEATS):
         settled = settle(models, target, start, nuisances)
-        vector = settled.solution.vector
-        if not settled.solution.converged or np.all(np.abs(vector - start) < REACH * SETTLED):
+        step = settled.solution.vector - start.vector
+        if not settled.solution.converged or np.all(np.abs(step) < REACH * SETTLED):
             break
-        start = vector
+        start = settled.solution.alpha
     return settled
 
 
-def scan(models: FitModels, target: Target, start: Array) -> tuple[Array, tuple[ScanStep, ...]]:
-    """Return the end of the scans from a start, and each of them.
-
-    ``start`` is ``(4,)`` in numeric units.
-    """
+def scan(
+    models: FitModels, target: Target, start: Misregistration
+) -> tuple[Misregistration, tuple[ScanStep, ...]]:
+    """Return the end of the scans from a start, and each of them."""
     first = N_LEFT_OUT if target.n_modes >= 3 * N_LEFT_OUT else 0
     columns = np.arange(first, target.n_modes)
     model = models.model(2, models.basis.subset(columns))
     target = target.column_subset(columns)
-    values = start * BOUNDARY_SCALE
+    values = start.vector * BOUNDARY_SCALE
     table = []
 
     def chi(tried: Array) -> float:
-        return target.misfit(models.matrix(model, tried / BOUNDARY_SCALE))
+        return target.misfit(models.matrix(model, start.moved_to(tried / BOUNDARY_SCALE)))
 
     for steps in ROUNDS:
         for index in ORDER:
@@ -300,12 +302,12 @@ def scan(models: FitModels, target: Target, start: Array) -> tuple[Array, tuple[
                 values[index] = step.minimum
                 if step.samples[0] < step.minimum < step.samples[-1]:
                     break
-    return values / BOUNDARY_SCALE, tuple(table)
+    return start.moved_to(values / BOUNDARY_SCALE), tuple(table)
 
 
-def _known(models: FitModels, target: Target, vector: Array) -> Target:
+def _known(models: FitModels, target: Target, alpha: Misregistration) -> Target:
     """Return the target without slopes that see surface a table of modes does not know."""
-    return target.without(models.fine.unknown_rows(Misregistration.from_vector(vector)))
+    return target.without(models.fine.unknown_rows(alpha))
 
 
 def _other_starts(start: Array) -> list[Array]:

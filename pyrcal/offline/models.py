@@ -117,10 +117,9 @@ class FitModels:
         """Decides."""
         return self.model(FINE)
 
-    def matrix(self, model: InteractionModel, vector: Array) -> NDArray[np.float32]:
+    def matrix(self, model: InteractionModel, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D of one of the models, ``(n_slopes, n_modes)``, and count it."""
         self.counter.n += 1
-        alpha = Misregistration.from_vector(vector)
         return np.asarray(model.interaction_matrix(alpha), dtype=np.float32)
 
     @property

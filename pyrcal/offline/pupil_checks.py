@@ -16,7 +16,6 @@ from pyrcal.offline.methods import Settled, spread
 from pyrcal.offline.models import BETTER, CHEAP, FAR_BETTER, FitModels, Other
 from pyrcal.offline.solver import nuisances_of
 from service.model.instrument import Instrument
-from service.model.misregistration import Misregistration
 
 Array = NDArray[np.float64]
 
@@ -102,7 +101,7 @@ class Few:
         self.residual_fraction = settled.share
         self.modes = spread(settled.target.n_modes)
         self.target = settled.target.column_subset(self.modes)
-        self.here = Misregistration.from_vector(solution.vector)
+        self.here = solution.alpha
         known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])
         self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
         """Of the instrument as it is: they hardly depend on the hypothesis."""

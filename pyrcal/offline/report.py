@@ -79,6 +79,9 @@ def document(report: FitReport) -> dict[str, Any]:
         "converged": bool(fit.converged),
         "verdict": verdict_line(fit),
         "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
+        "anamorphosis_sigma": None
+        if fit.anamorphosis_sigma is None
+        else _plain(fit.anamorphosis_sigma),
         "instrument_found": {
             one.key if one.found is not None else _WIDTH: {
                 "found": _plain(one.found if one.found is not None else np.exp(one.change)),
@@ -159,6 +162,11 @@ def _registration(fit: Fit) -> Iterator[str]:
         yield f"{name:15s}{numbers}  {unit}"
 
 
+def _anamorphosis(found: NDArray[np.float64], sigma: NDArray[np.float64]) -> str:
+    (along, askew), (one, other) = 100.0 * found, 100.0 * sigma
+    return f"{along:+.3f} +- {one:.3f} % along x, {askew:+.3f} +- {other:.3f} % along 45 deg"
+
+
 def _number(value: float, decimals: int) -> str:
     return f"{value:11.{decimals}f}" if np.isfinite(value) else f"{'-':>11s}"
 
@@ -187,9 +195,10 @@ def _extras(fit: Fit) -> Iterator[str]:
             stated = "unknown" if one.reported is None else f"{one.reported:g}"
             words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
             yield f"{one.key[:19]:20s}{words} (the instrument file says {stated})"
-    if fit.anamorphosis is not None:
-        along, across = 100.0 * fit.anamorphosis
-        yield f"{'anamorphosis':20s}{along:+.3f} % along x, {across:+.3f} % along 45 deg"
+    if fit.anamorphosis_sigma is not None:
+        words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
+        told = "" if fit.anamorphosis is not None else "not observable with these modes: "
+        yield f"{'anamorphosis':20s}{told}{words}"
     if fit.gain_map is not None:
         gains = fit.gain_map[fit.valid]
         yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"
@@ -240,7 +249,8 @@ _DESCRIPTIONS = {
     "measured": "(n_slopes, n_used) the reference in the same axes and unit",
     "valid": "(n, n) [row, column] subapertures the slopes belong to",
     "gain_map": "(n, n) gain over the pupil common to all modes",
-    "anamorphosis": "(2,) half the stretch of x over y, and of 45 deg over 135 deg",
+    "anamorphosis": "(2,) stretch along x over the mean of both axes, less 1, and along 45 deg",
+    "anamorphosis_sigma": "(2,) 1 sigma of it",
 }
 
 
@@ -391,8 +401,11 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
     words = values["orientation"]
     sign = words["sign"]
     sign_x, sign_y = sign if isinstance(sign, list) else (sign, sign)
+    alpha = Misregistration.from_boundary(values)
+    if values.get("anamorphosis") is not None:
+        alpha = alpha.stretched(np.array(values["anamorphosis"], dtype=np.float64))
     return KnownFit(
-        alpha=Misregistration.from_boundary(values),
+        alpha=alpha,
         covariance=np.array(values["covariance"], dtype=np.float64) / COVARIANCE_SCALE,
         orientation=Orientation(
             **{name: words[name] for name in FLIPS}, sign_x=sign_x, sign_y=sign_y

@@ -9,7 +9,7 @@ the lowest 40.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,20 @@ GAIN_MAP_SIGMA = 0.3
 ANAMORPHOSIS_SIGMA = 0.02
 """Half the stretch of the mirror's image along one axis over the other."""
 
+STRETCHES = slice(1, 3)
+"""Where they stand among the nuisances, when they are unknown: behind the turn of the axes."""
+
+LONGEST_STRETCH = 0.03
+"""A longer step of one trusts the derivatives too far: 0.45 subapertures at the edge of 30."""
+
+SETTLED_STRETCH = 1e-5
+"""Fits end with steps shorter than this: 1.5e-4 subapertures there."""
+
+STRETCH_FLOOR = 1e-4
+"""No anamorphosis is surer, as no magnification is: both are lengths of the image."""
+
+NOMINAL = Misregistration()
+
 OPTIC_SIGMA = {Optic.WIDTH: 0.25, Optic.SENSOR: 0.5}
 """How far what a file says of an instrument may be off, as a logarithm: a coupling of 0.35 might be
 0.18 or 0.53."""
@@ -63,6 +77,9 @@ class Nuisances:
 
     anamorphosis: bool
     """Whether the two stretches are unknown."""
+
+    nominal: Array = field(default_factory=lambda: np.zeros(2))
+    """``(2,)`` where they are expected."""
 
     optics: tuple[tuple[Optic, float], ...] = ()
     """What of the instrument is unknown, and how far the models are already from what the file
@@ -90,6 +107,8 @@ class Nuisances:
     def from_prior(self, values: Array) -> Array:
         """Return values ``(n_nuisances,)`` as distances from what is expected of them."""
         distance = values.astype(float)
+        if self.anamorphosis:
+            distance[STRETCHES] -= self.nominal
         for k, (_, offset) in enumerate(self.optics, self.first_optic):
             distance[k] += offset
         return distance
@@ -113,6 +132,7 @@ class Nuisances:
         along_x, along_y = slopes_of(matrix, kind)
         found = [signals_of_slopes(np.stack([-along_y, along_x]), kind)]
         if self.anamorphosis:
+            models.counter.n += 2
             found += list(model.stretch_derivatives(alpha))
         found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
         found += [pattern[:, None] * matrix for pattern in self.maps]
@@ -127,9 +147,28 @@ class Nuisances:
         gain[valid] = 1.0 + coefficients @ self.maps[:, : int(valid.sum())]
         return gain
 
-    def stretches(self, values: Array) -> Array | None:
-        """Return the two stretches; None when they are not unknown."""
-        return values[1:3].copy() if self.anamorphosis else None
+    def begin(self, start: Misregistration) -> Array:
+        """Return their values ``(n_nuisances,)`` before the first step."""
+        values = np.zeros(len(self.sigma))
+        if self.anamorphosis:
+            values[STRETCHES] = start.stretches
+        return values
+
+    def at(self, start: Misregistration, vector: Array, values: Array) -> Misregistration:
+        """Return the registration of a 4-vector and the stretches among the values."""
+        moved = start.moved_to(vector)
+        return moved.stretched(values[STRETCHES]) if self.anamorphosis else moved
+
+    def stretch_sigma(self, sigma: Array) -> Array | None:
+        """Return the ``(2,)`` among 1 σ of all; None when they are not unknown."""
+        return np.hypot(sigma[STRETCHES], STRETCH_FLOOR) if self.anamorphosis else None
+
+    def linear(self, values: Array) -> Array:
+        """Return values ``(n_nuisances,)`` less those that the model itself has at hand."""
+        rest = values.copy()
+        if self.anamorphosis:
+            rest[STRETCHES] = 0.0
+        return rest
 
 
 def nuisances_of(
@@ -138,30 +177,36 @@ def nuisances_of(
     *,
     gain_map: bool = False,
     anamorphosis: bool = False,
+    nominal: Misregistration = NOMINAL,
     optics: Sequence[Optic] = (),
     unknown: frozenset[Optic] = frozenset(),
 ) -> Nuisances:
     """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
-    as_told = tuple((optic, 0.0) for optic in optics)
+    unknowns = Nuisances(
+        maps=np.empty((0, kind.n_planes * int(valid.sum()))),
+        anamorphosis=anamorphosis,
+        nominal=nominal.stretches,
+        optics=tuple((optic, 0.0) for optic in optics),
+        unknown=unknown,
+    )
+    if not gain_map:
+        return unknowns
     n = len(valid)
     y, x = (np.stack(np.nonzero(valid)) - (n - 1) / 2) / (n / 2)
-    if not gain_map:
-        none = np.empty((0, kind.n_planes * len(x)))
-        return Nuisances(maps=none, anamorphosis=anamorphosis, optics=as_told, unknown=unknown)
     order = GAIN_MAP_ORDER
     powers = [x**i * y**j for i in range(order + 1) for j in range(order + 1 - i) if i + j > 0]
     centred = np.array(powers) - np.mean(powers, axis=1, keepdims=True)
     orthonormal, _ = np.linalg.qr(centred.T)
     maps = np.tile(orthonormal.T * np.sqrt(valid.sum()), kind.n_planes)
-    return Nuisances(maps=maps, anamorphosis=anamorphosis, optics=as_told, unknown=unknown)
+    return replace(unknowns, maps=maps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solution:
     """Minimum on the fine grid."""
 
-    vector: Array
-    """``(4,)`` numeric units."""
+    alpha: Misregistration
+    """Its anamorphosis stays where it began when that is not unknown."""
 
     nuisances: Array
     """``(n_nuisances,)``."""
@@ -178,11 +223,16 @@ class Solution:
     projection: Projection
     converged: bool
 
+    @property
+    def vector(self) -> Array:
+        """``(4,)`` of α, numeric units."""
+        return self.alpha.vector
+
 
 def refine(
     models: FitModels,
     columns: Columns,
-    start: Array,
+    start: Misregistration,
     nuisances: Nuisances,
     max_steps: int = MAX_NEAR_STEPS,
 ) -> Solution:
@@ -191,12 +241,11 @@ def refine(
     Near the minimum the derivatives' own error only slows the last steps down: what decides is
     the residual, and that is the fine grid's.
     """
-    vector, values = start.astype(float), np.zeros(len(nuisances.sigma))
-    here = Misregistration.from_vector(vector)
+    vector, values = start.vector, nuisances.begin(start)
     models.counter.n += 4
-    frozen = models.cheap.derivatives(here)
-    matrix = models.matrix(models.fine, vector)
-    extra = nuisances.derivatives(models, here, matrix)
+    frozen = models.cheap.derivatives(start)
+    matrix = models.matrix(models.fine, start)
+    extra = nuisances.derivatives(models, start, matrix)
     every = np.concatenate([frozen, extra])
     seen, converged = columns.project(matrix, every), False
     for _ in range(max_steps):
@@ -204,13 +253,17 @@ def refine(
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
-        matrix = models.matrix(models.fine, vector)
-        seen = columns.project(matrix + np.tensordot(values, extra, axes=1), every)
-        if np.all(np.abs(_bounded_step(seen, values, nuisances)[:4]) < SETTLED):
+        matrix = models.matrix(models.fine, nuisances.at(start, vector, values))
+        linear = np.tensordot(nuisances.linear(values), extra, axes=1)
+        seen = columns.project(matrix + linear, every)
+        next_step = _bounded_step(seen, values, nuisances)
+        stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
+        at_rest = np.all(np.abs(next_step[:4]) < SETTLED)
+        if at_rest and np.all(np.abs(stretching) < SETTLED_STRETCH):
             converged = True
             break
     return Solution(
-        vector=vector,
+        alpha=nuisances.at(start, vector, values),
         nuisances=values,
         matrix=matrix,
         derivatives=frozen,
@@ -227,6 +280,8 @@ def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Arra
     pull = prior * np.concatenate([np.zeros(4), nuisances.from_prior(values)])
     step = np.linalg.solve(seen.normal + np.diag(prior), seen.scores.sum(axis=1) - pull)
     excess = np.abs(step[:4]) / LONGEST_STEP
+    stretches = step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
     first = 4 + nuisances.first_optic
     optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP
-    return np.asarray(step / max(1.0, float(np.max(np.concatenate([excess, optics])))))
+    longest = [*excess, *optics, *(np.abs(stretches) / LONGEST_STRETCH)]
+    return np.asarray(step / max(1.0, *longest))

@@ -18,7 +18,7 @@ from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
 from pyrcal.offline.methods import Landing
 from pyrcal.offline.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
 from pyrcal.offline.uncertainty import Uncertainty
-from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.misregistration import BOUNDARY_SCALE
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ def _unexplained(findings: FitFindings) -> str:
 def _another_minimum(findings: FitFindings) -> str:
     if findings.landing is None or not findings.landing.rivals:
         return ""
-    rival = Misregistration.from_vector(findings.landing.rivals[0].vector).to_boundary()
+    rival = findings.landing.rivals[0].alpha.to_boundary()
     return (
         f"another minimum is nearly as good: shift {rival['shift_x_subap']:.2f}, "
         f"{rival['shift_y_subap']:.2f} subaperture, {rival['rotation_deg']:.1f} deg, "

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ArchiveError, ModelError, StorageError
-from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE, Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE
 from service.tracking.filtering import joint_of
 from service.tracking.registration import Purpose, Registration
 from service.tracking.state import Saved
@@ -27,7 +27,7 @@ NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
 _OF_THIS_RUN = "judged"
 """What a restarted service must find out anew."""
 
-_NUMERIC = tuple(field.name for field in fields(Misregistration))
+_NUMERIC = ("shift_x_subap", "shift_y_subap", "rotation_rad", "magnification")
 _RADIANS, _DEGREES, _DEGREES_PER_RADIAN = "rotation_rad", "rotation_deg", float(BOUNDARY_SCALE[2])
 
 _TOTAL = "total_m"

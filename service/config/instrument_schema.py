@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Sign = Literal[-1, 1]
 
+Stretch = Annotated[float, Field(ge=-0.2, le=0.2)]
+"""Beyond a fifth the image is another one, and no fit leads there."""
+
 
 def _auto_is_none(value: object) -> object:
     return None if value == "auto" else value
@@ -92,6 +95,10 @@ class MirrorTable(kinds.InfluenceShape):
 
     nominal_rotation_deg: float | None = None
     """Where a fit starts; None: found from tip and tilt."""
+
+    nominal_anamorphosis: tuple[Stretch, Stretch] | None = None
+    """Stretch of the mirror's turned image along the sensor's x over the mean of both axes, ratio
+    less 1, and along 45 deg: where a fit starts; None: 0."""
 
     parity: Sign | None = None
     """-1: the mirror is seen from behind; None: found from tip and tilt."""

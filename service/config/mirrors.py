@@ -114,6 +114,7 @@ def _mount(table: MirrorTable) -> dict[str, Any]:
     degrees = table.nominal_rotation_deg
     return {
         "nominal_rotation_rad": None if degrees is None else float(np.deg2rad(degrees)),
+        "nominal_anamorphosis": table.nominal_anamorphosis,
         "parity": table.parity,
         "stroke_known": table.stroke == "known",
     }

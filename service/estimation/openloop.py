@@ -103,12 +103,12 @@ def find(spectra: Spectra, search: WideCaptureSearch) -> WideCaptureEstimate | W
     reason = "no start was given"
     for tried, start in enumerate(search.starts, start=1):
         landed = solver.approach(
-            search.coarse, columns, start.vector, approached=APPROACHED, allowed=search.contains
+            search.coarse, columns, start, approached=APPROACHED, allowed=search.contains
         )
         if not landed.converged:
             reason = f"steps from {start} do not converge"
             continue
-        there = search.fine.linearise(Misregistration.from_vector(landed.vector))
+        there = search.fine.linearise(landed.alpha)
         estimate = fit_window(alone, there, loop)
         left = _unexplained(columns, noise, search.fine.interaction_matrix(estimate.alpha))
         found = WideCaptureEstimate(estimate=estimate, unexplained=left, n_starts=tried)

@@ -153,9 +153,7 @@ class Projection:
 class Approach:
     """Minimum on the coarse grid."""
 
-    vector: Array
-    """``(4,)`` numeric units."""
-
+    alpha: Misregistration
     misfit: float
     """Share of χ² not explained, 0..1."""
 
@@ -172,7 +170,7 @@ def within_limits(vector: Array) -> bool:
 def approach(
     model: InteractionModel,
     columns: Columns,
-    start: Array,
+    start: Misregistration,
     *,
     approached: Array = APPROACHED,
     allowed: Callable[[Array], bool] = within_limits,
@@ -182,12 +180,12 @@ def approach(
     A step that makes the misfit worse is halved; a start from which none makes it better has
     failed, as has one at which no column has anything in common with the model.
     """
-    vector = start.astype(float)
-    matrix = model.interaction_matrix(Misregistration.from_vector(vector))
+    vector = start.vector
+    matrix = model.interaction_matrix(start)
     misfit, n = columns.misfit(matrix), 1
     converged = False
     for _ in range(MAX_FAR_STEPS):
-        derivatives = model.derivatives(Misregistration.from_vector(vector))
+        derivatives = model.derivatives(start.moved_to(vector))
         seen, n = columns.project(matrix, derivatives), n + 4
         if not seen.gains.any():
             break
@@ -197,7 +195,7 @@ def approach(
         converged, tried = bool(np.all(np.abs(step) < approached)), step
         for _ in range(_HALVINGS):
             if allowed(vector + tried):
-                found = model.interaction_matrix(Misregistration.from_vector(vector + tried))
+                found = model.interaction_matrix(start.moved_to(vector + tried))
                 left, n = columns.misfit(found), n + 1
                 if left <= misfit * (1.0 + 1e-9):
                     vector, matrix, misfit = vector + tried, found, left
@@ -207,7 +205,8 @@ def approach(
             break
         if converged:
             break
-    return Approach(vector=vector, misfit=misfit, converged=converged, n_matrices=n)
+    alpha = start.moved_to(vector)
+    return Approach(alpha=alpha, misfit=misfit, converged=converged, n_matrices=n)
 
 
 def vertex(before: float, at: float, after: float) -> float:

@@ -111,18 +111,23 @@ def parse_modes(text: str) -> NDArray[np.intp]:
 def parse_alpha(text: str) -> Misregistration:
     """Return the registration ``X,Y,ROT,MAG``: subapertures, degrees, ratio.
 
+    Two numbers more are its anamorphosis, along x and along 45 deg.
+
     Raises
     ------
     ValueError
-        If it is not four finite numbers, or the magnification is not positive.
+        If it is not four or six finite numbers, or the magnification is not positive.
     """
     values = numbers_in(text)
-    if len(values) != 4 or values[3] <= 0.0:
+    if len(values) not in {4, 6} or values[3] <= 0.0:
         expected = "expected X,Y,ROT,MAG: subapertures, degrees, ratio, like 0.3,-0.1,65,0.98"
         raise ValueError(f"found {text.strip()!r}, {expected}")
+    import numpy as np
+
     from service.model.misregistration import PARAMETERS, Misregistration
 
-    return Misregistration.from_boundary(dict(zip(PARAMETERS, values, strict=True)))
+    alpha = Misregistration.from_boundary(dict(zip(PARAMETERS, values[:4], strict=True)))
+    return alpha if len(values) == 4 else alpha.stretched(np.array(values[4:]))
 
 
 def numbers_in(text: str) -> list[float]:

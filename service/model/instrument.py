@@ -74,6 +74,9 @@ class Mount:
     stroke_known: bool = True
     """Whether a unit command has a known height; if not, only shapes can be compared."""
 
+    nominal_anamorphosis: tuple[float, float] | None = None
+    """Anamorphosis at which a fit starts, as α has it; None: not told."""
+
     @property
     def y_sign(self) -> float:
         """Sign of the mirror's y axis: 1 unless its owner says otherwise."""
@@ -229,6 +232,13 @@ class Instrument(Telescope):
         """Start of a fit: the mirror's nominal rotation, nothing else."""
         return Misregistration(rotation_rad=self.mirror.nominal_rotation_rad or 0.0)
 
+    def with_anamorphosis(self, alpha: Misregistration) -> Misregistration:
+        """Return α with the mirror's nominal anamorphosis, where it has none of its own."""
+        nominal = self.mirror.nominal_anamorphosis
+        if nominal is None or alpha.anamorphosis is not None:
+            return alpha
+        return replace(alpha, anamorphosis=nominal)
+
     @property
     def analytic_mirror(self) -> Mirror:
         """The mirror, where actuators are needed and a table of shapes will not do.
@@ -264,7 +274,17 @@ def sensor_of_kind(instrument: Instrument, kind: type[_Sensor]) -> _Sensor:
     return instrument.wfs
 
 
-_LATER = frozenset({"unknown", "sensor_modes", "law", "pupil", "spiders_m", "spiders_deg"})
+_LATER = frozenset(
+    {
+        "unknown",
+        "sensor_modes",
+        "law",
+        "pupil",
+        "spiders_m",
+        "spiders_deg",
+        "nominal_anamorphosis",
+    }
+)
 """Fields without which an instrument has the digest that it has always had."""
 
 

@@ -19,7 +19,7 @@ from typing_extensions import override
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.local import LocalShapes, Patch, Shapes, beside, tiles_of
-from service.model.misregistration import Misregistration, rotation
+from service.model.misregistration import Misregistration, rotation, stretching
 from service.model.modes import Basis, ModalBasis
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.kind import WorkingPoint
@@ -131,16 +131,18 @@ class InteractionModel:
         """Return how D changes with an anamorphosis of the mirror's image, ``(2, ...)``.
 
         Per unit of stretch along x, and as much shrinking along y; the second along 45 deg and
-        135 deg. The size stays, so that neither is a magnification.
+        135 deg.
         """
         turn = rotation(alpha.rotation_rad)
-
-        stretch, askew = turn.T * [-1.0, 1.0] @ turn, -turn.T[:, ::-1] @ turn
+        stretches = self.instrument.with_anamorphosis(alpha).stretches
+        back = np.linalg.inv(stretching(stretches)) @ turn
+        along, askew = -turn.T * [1.0, -1.0] @ back, -turn.T[:, ::-1] @ back
         moved = [
-            self._moved(alpha, lambda at: at @ stretch),
+            self._moved(alpha, lambda at: at @ along),
             self._moved(alpha, lambda at: at @ askew),
         ]
-        return np.stack(self._seen_together(alpha, moved))
+        rates = self._seen_together(alpha, moved)
+        return np.stack([self._as_listed(rate) for rate in rates])
 
     def width_derivative(self, alpha: Misregistration) -> Array:
         """Return how D changes with the logarithm of the influence functions' width.
@@ -203,12 +205,13 @@ class InteractionModel:
         """Return where points of the pupil lie on the mirror, ``(n_points, 2)``."""
         if self.instrument.stop is Stop.TELESCOPE:
             points = points - alpha.vector[:2]
-        return points @ rotation(alpha.rotation_rad) / alpha.magnification
+        return self.instrument.with_anamorphosis(alpha).on_mirror(points)
 
     def _rendered(self, alpha: Misregistration) -> Shapes:
         shift = self._image_shift(alpha)
         moved = alpha.vector - np.array([*shift, 0.0, 0.0])
-        return self._modes.get(tuple(moved), lambda: self._moved(alpha, None))
+        stretches = self.instrument.with_anamorphosis(alpha).stretches
+        return self._modes.get((*moved, *stretches), lambda: self._moved(alpha, None))
 
     def _as_listed(self, rows: Array) -> Array:
         """Return rows ``(n_slopes, ...)`` as whoever asked this model knows them."""
@@ -226,7 +229,7 @@ class InteractionModel:
             matrix, *turned = self._seen_together(alpha, shapes)
             shifted = self._at(self._image_shift(alpha)).shift_rates(rendered)
             return [matrix, *shifted, *turned]
-        step_x, step_y = -rotation(alpha.rotation_rad) / alpha.magnification
+        step_x, step_y = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
         shapes[1:1] = [
             self._moved(alpha, lambda at: np.broadcast_to(step_x, at.shape)),
             self._moved(alpha, lambda at: np.broadcast_to(step_y, at.shape)),

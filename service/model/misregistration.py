@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -40,8 +40,9 @@ def wrapped(angle_rad: float) -> float:
 class Misregistration:
     """Registration of the mirror's actuators on the sensor's subapertures.
 
-    A mirror point ``p`` lands on the sensor at ``magnification * R(rotation) p + shift``
-    (Heritier et al. 2018, section 4.1). The default is perfect registration.
+    A mirror point ``p`` lands on the sensor at ``S(anamorphosis) magnification R(rotation) p +
+    shift`` (Heritier et al. 2018, section 4.1; S is ours, 1 where the image is not stretched). The
+    default is perfect registration.
     """
 
     shift_x_subap: float = 0.0
@@ -56,16 +57,23 @@ class Misregistration:
     magnification: float = 1.0
     """Size of the mirror's image over its nominal size."""
 
+    anamorphosis: tuple[float, float] | None = None
+    """Stretch of the turned image along the sensor's x over the mean of both axes, ratio less 1,
+    and along 45 deg; the axis across shrinks by as much. None: the instrument's nominal one."""
+
     def __post_init__(self) -> None:
         """Refuse numbers no registration can have.
 
         Raises
         ------
         ModelError
-            If a parameter is not finite or the magnification is not positive.
+            If a parameter is not finite, the magnification is not positive, or a stretch leaves
+            nothing of the image.
         """
         if not np.all(np.isfinite(self.vector)) or self.magnification <= 0.0:
             raise ModelError(f"a registration needs finite numbers and a magnification > 0: {self}")
+        if not np.hypot(*self.stretches) < 1.0:
+            raise ModelError(f"found anamorphosis = {self.anamorphosis}, expected less than 1")
 
     @override
     def __str__(self) -> str:
@@ -80,15 +88,40 @@ class Misregistration:
             [self.shift_x_subap, self.shift_y_subap, self.rotation_rad, self.magnification]
         )
 
+    @property
+    def stretches(self) -> NDArray[np.float64]:
+        """``(2,)`` the anamorphosis; 0 where none is told."""
+        return np.array(self.anamorphosis or (0.0, 0.0))
+
     @classmethod
     def from_vector(cls, vector: NDArray[np.float64]) -> Self:
         """Build from a numeric 4-vector (shape ``(4,)``, rotation in radians)."""
-        names = (field.name for field in fields(cls))
-        return cls(**{name: float(v) for name, v in zip(names, vector, strict=True)})
+        x, y, turned, size = map(float, vector)
+        return cls(shift_x_subap=x, shift_y_subap=y, rotation_rad=turned, magnification=size)
+
+    def moved_to(self, vector: NDArray[np.float64]) -> Self:
+        """Return the registration with another 4-vector; the anamorphosis stays."""
+        return replace(self.from_vector(vector), anamorphosis=self.anamorphosis)
 
     def stepped(self, step: NDArray[np.float64]) -> Self:
         """Return the registration a step ``(4,)`` further, numeric units."""
-        return self.from_vector(self.vector + step)
+        return self.moved_to(self.vector + step)
+
+    def stretched(self, stretches: NDArray[np.float64]) -> Self:
+        """Return the registration with another anamorphosis ``(2,)``."""
+        return replace(self, anamorphosis=(float(stretches[0]), float(stretches[1])))
+
+    @property
+    def image(self) -> NDArray[np.float64]:
+        """``(2, 2)`` from a point of the mirror to the sensor, before the shift."""
+        turned = self.magnification * rotation(self.rotation_rad)
+        return turned if self.anamorphosis is None else stretching(self.stretches) @ turned
+
+    def on_mirror(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where points of the sensor ``(n_points, 2)`` lie on the mirror; no shift."""
+        if self.anamorphosis is not None:
+            points = points @ np.linalg.inv(stretching(self.stretches))
+        return points @ rotation(self.rotation_rad) / self.magnification
 
     @classmethod
     def from_boundary(cls, values: dict[str, float]) -> Self:
@@ -126,6 +159,12 @@ def step_text(step: NDArray[np.float64]) -> str:
 def at_boundary(four: NDArray[np.float64]) -> dict[str, float]:
     """Return α or its σ, ``(4,)`` in numeric units, as four named numbers in boundary units."""
     return dict(zip(PARAMETERS, (four * BOUNDARY_SCALE).tolist(), strict=True))
+
+
+def stretching(stretches: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return S of an anamorphosis ``(2,)``: symmetric, so that rows are stretched by it, too."""
+    along, askew = stretches
+    return np.array([[1.0 + along, askew], [askew, 1.0 - along]])
 
 
 def rotation(angle_rad: float) -> NDArray[np.float64]:

@@ -195,8 +195,8 @@ class FitParameters(Parameters):
     gain_map: bool = False
     """Whether a gain over the pupil, common to all modes, is unknown too."""
 
-    anamorphosis: bool = False
-    """Whether the mirror's image may be stretched."""
+    anamorphosis: bool = True
+    """Whether the stretch of the mirror's image is unknown, too."""
 
     instrument: (
         Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$"), _understood(_packaged)] | None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from service.model.instrument import Instrument, Mirror
 from service.model.kinds import Stop
-from service.model.misregistration import Misregistration, rotation
+from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.registry import kind_of
@@ -141,7 +141,7 @@ class Plant(ABC):
         points = self._points
         if self._instrument.stop is Stop.TELESCOPE:
             points = points - alpha.vector[:2]
-        on_mirror = points @ rotation(alpha.rotation_rad) / alpha.magnification
+        on_mirror = self._instrument.with_anamorphosis(alpha).on_mirror(points)
         blocks = [
             self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._weights
             for start in range(0, len(on_mirror), _RENDER_ROWS)

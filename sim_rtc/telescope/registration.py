@@ -163,7 +163,7 @@ class Schedule:
         for jump in self.jumps:
             if jump.time_s <= time_s:
                 vector = vector + jump.vector
-        return Misregistration.from_vector(vector)
+        return self.start.moved_to(vector)
 
     def alpha_before(self, time_s: float) -> Misregistration:
         """Return the registration as this time is reached, a jump at that very time left out."""
@@ -267,7 +267,7 @@ class MovingOptics:
         self._seen_s = time_s
         if not self._demands.empty():
             there_s, vector = self._demands.get()
-            start = Misregistration.from_vector(self._schedule.start.vector + vector)
+            start = self._schedule.start.stepped(vector)
             self._schedule = replace(self._schedule, start=start)
             self._next = self._executor.submit(self._compute, there_s, None)
         if self._next is not None and self._next.done() and time_s >= self._next.result().start_s:

@@ -80,7 +80,7 @@ async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(
         "modes": "0:4",
         "start": "0.1,0,65,0.98",
         "gain_map": "true",
-        "anamorphosis": "true",
+        "anamorphosis": "false",
         "instrument": "flao-lbt",
         "reference": "im.h5",
         "name": "last night",
@@ -100,7 +100,7 @@ async def test_the_body_is_the_file_and_the_parameters_are_those_of_the_command(
         "modes": "0:4",
         "start": "0.1,0,65,0.98",
         "gain_map": True,
-        "anamorphosis": True,
+        "anamorphosis": False,
         "instrument": "flao-lbt",
         "reference": "im.h5",
     }
@@ -112,7 +112,7 @@ async def test_without_parameters_the_defaults_of_the_command_hold(client, desk)
         **dict.fromkeys(("dataset", "modes", "start", "instrument", "reference")),
         "method": "joint",
         "gain_map": False,
-        "anamorphosis": False,
+        "anamorphosis": True,
     }
 
 

@@ -134,6 +134,11 @@ def test_more_unknowns_are_told_in_the_table(run):
     assert "gain over the pupil" in out
 
 
+def test_without_an_anamorphosis_the_file_is_believed(run):
+    _, out, _ = run(MATRIX, "--json", "--no-anamorphosis")
+    assert json.loads(out)["anamorphosis_sigma"] is None
+
+
 def test_what_was_found_is_kept_and_drawn_on_request(run):
     pytest.importorskip("matplotlib")
     status, _, _ = run(MATRIX, "--output", "fit.h5", "--plot", "fit.png")

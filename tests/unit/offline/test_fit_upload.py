@@ -160,7 +160,7 @@ ASKED = {
     "method": "joint",
     "modes": "0:15",
     "gain_map": False,
-    "anamorphosis": False,
+    "anamorphosis": True,
 }
 OWN = HERE / "tiny.toml"
 REQUEST = FitRequest(

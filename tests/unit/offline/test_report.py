@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from pyrcal.offline.report import document, table
+from pyrcal.offline.report import document, read_fit, table
 from service.model.misregistration import PARAMETERS
 from service.model.slopes import Orientation
-from tests.unit.offline.made import GAINS, SCAN, a_fit, a_report
+from tests.unit.offline.made import ALPHA, GAINS, SCAN, a_fit, a_report
 
 KEYS = {
     *PARAMETERS,
@@ -22,6 +22,7 @@ KEYS = {
     "verdict",
     "notes",
     "anamorphosis",
+    "anamorphosis_sigma",
     "instrument_found",
     "seconds",
 }
@@ -140,11 +141,29 @@ def test_the_papers_table_has_a_line_for_every_step():
 
 
 def test_what_was_asked_beside_the_four_is_told():
-    fit = a_fit(anamorphosis=np.array([0.001, -0.002]), gain_map=np.full((3, 3), 0.9))
+    fit = a_fit(**stretched(0.0003), gain_map=np.full((3, 3), 0.9))
     text = table(a_report(fit, notes=("double pass: no, as the measured file says",)))
-    assert "+0.100 %" in line(text, "anamorphosis")
+    assert "+0.100 +- 0.030 % along x, -0.200" in line(text, "anamorphosis")
     assert "0.90 to 0.90" in line(text, "gain over the pupil")
     assert "double pass: no" in line(text, "note")
+
+
+def stretched(sigma):
+    alpha = ALPHA.stretched(np.array([0.001, -0.002]))
+    return {"alpha": alpha, "anamorphosis_sigma": np.full(2, sigma)}
+
+
+def test_an_anamorphosis_that_the_modes_do_not_tell_is_said_to_be_none():
+    unsure = a_report(a_fit(**stretched(0.015)))
+    assert document(unsure)["anamorphosis"] is None
+    assert document(unsure)["anamorphosis_sigma"] == [0.015, 0.015]
+    assert "not observable with these modes" in line(table(unsure), "anamorphosis")
+
+
+def test_a_fit_that_is_read_back_has_its_anamorphosis(tmp_path):
+    path = tmp_path / "fit.json"
+    path.write_text(json.dumps(document(a_report(a_fit(**stretched(0.0003))))))
+    assert read_fit(path).alpha.anamorphosis == (0.001, -0.002)
 
 
 def test_a_refused_fit_without_a_size_is_still_told():

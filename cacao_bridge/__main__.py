@@ -22,6 +22,7 @@ from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
 from pyrcal.terminal import print_lines
 from service.cli.program import leave, log_to_terminal, status_of, stop_signal
+from service.config.link_tables import Router, client_security
 from service.wire import FrameHeader, Keys, encode, encode_frames
 from sim_rtc.computer.feed import Background
 from sim_rtc.link.matrices import Matrices
@@ -111,6 +112,9 @@ class Bridge:
     def __init__(self, settings: Settings) -> None:
         """Raise ``ConfigurationError`` if a file of the settings is not what it should be."""
         self._settings = settings
+        self._router = Router(
+            endpoint=settings.wire.connect, security=client_security(settings.zenoh)
+        )
         self._cacao = Cacao(settings)
         self._n_sent = 0
 
@@ -122,7 +126,7 @@ class Bridge:
                 self._cacao.poll()  # which matrix cacao has, before anybody may ask
                 stopped.wait(_UNLINKED_PAUSE_S)
             replies = Replies(keys, self._cacao)
-            while (session := open_session(self._settings.wire.connect, stopped)) is not None:
+            while (session := open_session(self._router, stopped)) is not None:
                 with session:
                     replies.declare(session)
                     with (

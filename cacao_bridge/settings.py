@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from service.config.link_tables import CredentialsTable
 from service.config.sources import Id, Table, in_file, read_toml, refuse, validated
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -120,6 +121,7 @@ class Settings(Table):
     streams: StreamsTable = StreamsTable()
     loop: LoopTable
     calibration: CalibrationTable
+    zenoh: CredentialsTable = CredentialsTable()
 
 
 def load(path: Path) -> Settings:

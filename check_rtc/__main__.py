@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import signal
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from pyrcal.offline.arguments import seconds
 from pyrcal.options import add, words
@@ -43,8 +44,10 @@ def check_parser() -> argparse.ArgumentParser:
         words("--listen ENDPOINT", "default tcp/127.0.0.1:7447"),
         words("--connect ENDPOINT", "a router that is there already"),
     )
+    secured = "settings, TOML: [zenoh] says how to connect to a secured link, as the service's do"
     add(
         check,
+        words("--config FILE", secured, type=Path),
         words("--seconds S", "to listen, default %(default)g", type=seconds, default=8.0),
         words("--wait S", "for the RTC, default %(default)g", type=seconds, default=30.0),
         words("--only CHECK,...", "these checks and no others", type=_names, default=()),

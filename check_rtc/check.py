@@ -22,6 +22,7 @@ from check_rtc.offload import Registered
 from check_rtc.requirements import REQUIREMENTS, Checked, Outcome
 from check_rtc.watch import TelemetryObserver
 from service.config import load_instrument, packaged_instrument
+from service.config.link_tables import ZenohTable, link_security, read_link_tables
 from service.errors import ConfigurationError, LinkError, ModelError, say, shown
 from service.estimation.lockin import LockInEstimate, Spectra
 from service.estimation.slope_convention import SlopeConvention, of_reconstructor
@@ -99,22 +100,25 @@ def _whom(options: argparse.Namespace) -> tuple[Endpoint, Instrument | None]:
     PyrcalError
         If there is no RTC at a router, or there are several and none was named.
     """
-    endpoint = Endpoint(
-        system=options.system or "any",
-        listen=(options.listen,) if options.listen else Endpoint(system="any").listen,
-        connect=(options.connect,) if options.connect else (),
-    )
-    if options.instrument is not None or (options.system is None and not options.connect):
+    zenoh = read_link_tables(options.config, listen=options.listen, connect=options.connect)
+    if options.instrument is not None or (options.system is None and not zenoh.connect):
         instrument = load_instrument(options.instrument or DEFAULT)
-        return replace(endpoint, system=options.system or instrument.name), instrument
-    if options.system is None:
-        endpoint = replace(endpoint, system=_only_system(endpoint, options.wait))
-        say(f"the RTC there is that of system {endpoint.system}")
+        return _endpoint(zenoh, options.system or instrument.name), instrument
+    system = options.system
+    if system is None:
+        system = _only_system(_endpoint(zenoh, "any"), options.wait)
+        say(f"the RTC there is that of system {system}")
+    endpoint = _endpoint(zenoh, system)
     try:
         return endpoint, packaged_instrument(endpoint.system)
     except ConfigurationError:
         say(f"no instrument of that name is packaged: {NO_FILE}")
         return endpoint, None
+
+
+def _endpoint(zenoh: ZenohTable, system: str) -> Endpoint:
+    security = link_security(zenoh, system)
+    return Endpoint(system=system, listen=zenoh.listen, connect=zenoh.connect, security=security)
 
 
 def _only_system(endpoint: Endpoint, wait_s: float) -> str:

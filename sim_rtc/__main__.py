@@ -102,7 +102,7 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
 
 def _replay(path: Path, options: Options, stopped: threading.Event) -> int:
     with Recording(path) as recording:
-        Replay(recording, endpoint=options.connect, speed=options.speed).run(stopped)
+        Replay(recording, router=options.router, speed=options.speed).run(stopped)
     return 0
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from service.config.link_tables import DEFAULT_ENDPOINT, Router, router_of
 from service.errors import ConfigurationError
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from sim_rtc import arguments as read
@@ -310,12 +311,17 @@ class Options:
         "--rate and --n-controlled; binning needs the diffractive plant",
         choices=["flao"],
     )
-    connect: str = option(
+    given_connect: str | None = option(
         "--connect ENDPOINT",
-        "zenoh endpoint of the service (default: %(default)s); may come up later",
+        f"zenoh endpoint of the service (default: {DEFAULT_ENDPOINT}); may come up later",
         read.endpoint,
-        default="tcp/127.0.0.1:7447",
         chapter="run",
+    )
+    config: Path | None = option(
+        "--config FILE",
+        "settings, TOML: [zenoh] says how to connect to a secured link, as rtc.toml of pyrcal "
+        "certificates does",
+        Path,
     )
     seconds: float | None = option(
         "--seconds S", "stop after this much loop time", within(0.01, 1e7)
@@ -381,6 +387,11 @@ class Options:
                 f"{n_modes} modes"
             )
         return self.given_n_controlled
+
+    @property
+    def router(self) -> Router:
+        """The service's router, and what it is shown."""
+        return router_of(self.config, self.given_connect)
 
     @property
     def speed(self) -> float:

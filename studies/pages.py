@@ -124,6 +124,7 @@ PAGES = {
     "rtc.md": rtc,
     "openapi.json": openapi,
     "reference/settings.md": reference.settings,
+    "reference/access.md": reference.access,
     "reference/instrument.md": reference.instrument,
     "reference/cli.md": reference.commands,
     "understand/tracker.md": dispatch.page,

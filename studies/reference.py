@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from itertools import chain
 from typing import Any, get_args, get_type_hints
 
@@ -17,6 +17,8 @@ from service.config.sources import Table
 from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.tracking.alarms import ALARMS
+from service.wire import Keys
+from service.wire.access import Rights, rights_of
 from studies.contract_tables import described
 
 Schema = Mapping[str, Any]
@@ -94,6 +96,11 @@ def _tables(whole: type[Table]) -> Iterator[str]:
                 yield f"## [[{section}.{key}]]"
                 (each, _) = get_args(get_type_hints(record)[key])
                 yield from _keys(kinds[inner.rpartition("/")[2]], each, kinds)
+            for of_key in (field, *field.get("anyOf", ())):
+                table = kinds.get(of_key.get("$ref", "").rpartition("/")[2], {})
+                if _text(table).startswith(f"`[{section}.{key}]"):
+                    yield f"## [{section}.{key}]"
+                    yield from _keys(table, None, kinds)
 
 
 def _keys(kind: Schema, record: object, kinds: Mapping[str, Schema]) -> Iterator[str]:
@@ -109,6 +116,33 @@ def _keys(kind: Schema, record: object, kinds: Mapping[str, Schema]) -> Iterator
         )
         for key, field in kind["properties"].items()
     )
+
+
+def access() -> str:
+    """Return docs/reference/access.md: who may do what on the link."""
+    keys = Keys("SYSTEM")
+    words = {right.name: right.name for right in fields(Rights)}
+    words |= {"holds": "holds tokens", "watches": "watches tokens"}
+    rows = [
+        "| role | may | keys below `ao/v1/{system}/` |",
+        "| --- | --- | --- |",
+        *(
+            f"| {role} | {words[right]} | {_below(keys, getattr(rights, right))} |"
+            for role, rights in rights_of(keys).items()
+            for right in words
+            if getattr(rights, right)
+        ),
+    ]
+    intro = (
+        "What each role of [a secured link](../operate/link.md) may do; all else is refused. "
+        "`@adv` is what zenoh's advanced publishers and subscribers say to each other: losses "
+        "asked for again, the last message for those who come late."
+    )
+    return page("Access to the link", intro, "\n".join(rows))
+
+
+def _below(keys: Keys, expressions: Iterable[str]) -> str:
+    return ", ".join(f"`{each.removeprefix(keys.root + '/')}`" for each in expressions)
 
 
 def _field_texts(record: type) -> dict[str, str]:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from service.config.link_tables import router_of
+
 from .bench import GAIN, Bench
 from .bridge import Bridge
 
@@ -29,7 +31,8 @@ def main():
     parser.add_argument(
         "folder", type=Path, help="where oopao.toml is written; start the service on it"
     )
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="its endpoint")
+    parser.add_argument("--connect", help="its endpoint, default tcp/127.0.0.1:7447")
+    parser.add_argument("--config", type=Path, help="settings of a secured link: rtc.toml")
     parser.add_argument("--shift", type=float, nargs=2, default=(0.3, 0.0), metavar="SUBAP")
     parser.add_argument("--rotation", type=float, default=1.0, metavar="DEG")
     parser.add_argument("--modes", type=int, default=80, help="that the loop controls")
@@ -53,7 +56,7 @@ def main():
         )
         bench.begin(asked.seed)
         bridge = Bridge(bench, "oopao", nominal)
-        bridge.run(asked.connect, asked.frames)
+        bridge.run(router_of(asked.config, asked.connect), asked.frames)
         used = bridge.reconstructor
         found = {"id": used.manifest.id, "alpha": used.manifest.alpha, "sigma": used.manifest.sigma}
         if asked.compare:

@@ -188,10 +188,10 @@ class Bridge:
             self.seq += BATCH
         return header, np.array(rows, dtype=np.float32)
 
-    def run(self, endpoint, n_frames):
-        """Be an RTC of the service at ``endpoint``, which may be late, for so many frames."""
+    def run(self, router, n_frames):
+        """Be an RTC of the service at ``router``, which may be late, for so many frames."""
         keys = Keys(self.identity.system)
-        with open_session(endpoint, threading.Event()) as session:
+        with open_session(router, threading.Event()) as session:
             Replies(keys, self).declare(session)
             frames = frames_publisher(session, keys, RATE_HZ / BATCH)
             status, told_s, said = status_publisher(session, keys), 0.0, None

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pyrcal.options import add, words
-from service.cli.program import check_settings, such, whole
+from service.cli.program import check_settings, port, such, whole
 from service.errors import ConfigurationError
 from service.files import kind_of, numbers_in, parse_alpha, parse_modes
 
@@ -28,6 +28,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     """Add these commands to a command line."""
     _describe_archive(
         commands.add_parser("archive", help="list, verify, prune or export what is archived")
+    )
+    _describe_certificates(
+        commands.add_parser("certificates", help="make certificates for the link to the RTC")
     )
     _describe_fit(commands.add_parser("fit", help="fit the registration to a measured matrix"))
     _describe_reconstruct(
@@ -67,6 +70,33 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
     ):
         parser = actions.add_parser(action, help=purpose)
         add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+
+
+def _describe_certificates(certificates: argparse.ArgumentParser) -> None:
+    certificates.set_defaults(module="pyrcal.offline.certificates")
+    certificates.description = (
+        "Make an authority, a certificate for each role on the link (service, rtc, viewer), and "
+        "the settings that use them. Again in the same folder: the authority that is there signs "
+        "new ones. docs/operate/link.md says where each file belongs."
+    )
+    certificates.epilog = "Exit status: 0 done, 2 it cannot be done."
+    actions = certificates.add_subparsers(dest="action", required=True)
+    hosts = (
+        "names or addresses under which the service is reached, with commas; default %(default)s"
+    )
+    for action, purpose, more in (
+        (
+            "new",
+            "make them",
+            (
+                words("--host NAME,...", hosts, default="127.0.0.1"),
+                words("--zenoh-port PORT", "default %(default)s", type=port, default=7447),
+                words("--days N", "that they hold, default %(default)s", type=_count, default=365),
+            ),
+        ),
+        ("show", "show whose they are and until when they hold", ()),
+    ):
+        add(actions.add_parser(action, help=purpose), words("folder FOLDER", type=Path), *more)
 
 
 _FIT = """

@@ -22,6 +22,7 @@ from typing_extensions import override
 from service.archive import Archive
 from service.cli.program import announced, leave
 from service.config import Settings
+from service.config.link_tables import link_security
 from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
@@ -78,7 +79,12 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
     """Open everything, run until asked to stop or the service fails, close everything."""
     system = settings.service.system or instrument.name
     archive = Archive(settings.service.data_dir, settings.archive.noon_utc_h)
-    endpoint = Endpoint(system=system, listen=settings.zenoh.listen, connect=settings.zenoh.connect)
+    endpoint = Endpoint(
+        system=system,
+        listen=settings.zenoh.listen,
+        connect=settings.zenoh.connect,
+        security=link_security(settings.zenoh, system),
+    )
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
         where = "http://{}:{}".format(*listener.getsockname()[:2])

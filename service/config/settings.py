@@ -10,6 +10,7 @@ from typing import Annotated, Literal, get_args, get_origin
 
 from pydantic import Field, model_validator
 
+from service.config.link_tables import ZenohTable
 from service.config.sources import Id, Table, in_file, nearest, read_toml, validated
 from service.errors import ConfigurationError
 
@@ -43,19 +44,6 @@ class ServiceTable(Table):
 
     log_format: Literal["auto", "text", "json"] = "auto"
     """Format of the log; "auto": text on a terminal, else JSON."""
-
-
-class ZenohTable(Table):
-    """``[zenoh]``: the way to the RTC."""
-
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
-    """Endpoints the embedded router listens on."""
-
-    connect: tuple[str, ...] = ()
-    """Endpoints of an observatory's own routers; not empty: no router is embedded."""
-
-    chunk_bytes: int = Field(default=4_000_000, ge=1024, le=4_000_000)
-    """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
 
 
 class ApiTable(Table):

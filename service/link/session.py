@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -58,6 +58,9 @@ class Endpoint:
     connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers, of which the service becomes a client."""
 
+    security: Mapping[str, object] = field(default_factory=dict)
+    """What zenoh is told about certificates, users and access; empty: nothing is asked."""
+
     lease_s: float = 2.0
     """Silence after which the other side counts as gone."""
 
@@ -104,6 +107,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
         "transport/shared_memory/enabled": False,
+        **endpoint.security,
     }
     try:
         for key, value in settings.items():

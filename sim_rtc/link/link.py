@@ -106,7 +106,7 @@ class Link(Background):
     @override
     def _work(self) -> None:
         replies = Replies(self._keys, self._computer)
-        while (session := open_session(self._options.connect, self._stopped)) is not None:
+        while (session := open_session(self._options.router, self._stopped)) is not None:
             self._speak(session, replies)
 
     def _speak(self, session: zenoh.Session, replies: Replies) -> None:
@@ -126,7 +126,9 @@ class Link(Background):
                 ) as matrices,
                 Token(session, self._keys, self._recorder) as token,
             ):
-                _log.info("link.open", endpoint=self._options.connect, system=self._keys.system)
+                _log.info(
+                    "link.open", endpoint=self._options.router.endpoint, system=self._keys.system
+                )
                 self._publish(session, token, matrices)
 
     def _publish(self, session: zenoh.Session, token: Token, matrices: Matrices) -> None:

@@ -17,6 +17,7 @@ import structlog
 import zenoh
 import zenoh.ext
 
+from service.config.link_tables import Router
 from service.errors import WireError
 from service.files.recording import Message, RecordedKind, Recording
 from service.wire import (
@@ -32,7 +33,12 @@ from service.wire import (
     encode,
 )
 from sim_rtc.link.replies import acknowledge, answer_applied, answer_commands
-from sim_rtc.link.session import Token, frames_publisher, open_session, status_publisher
+from sim_rtc.link.session import (
+    Token,
+    frames_publisher,
+    open_session,
+    status_publisher,
+)
 
 _log = structlog.get_logger("sim_rtc")
 
@@ -49,10 +55,10 @@ _LINGER_S = 0.5
 class Replay:
     """Plays a recording once."""
 
-    def __init__(self, recording: Recording, *, endpoint: str, speed: float) -> None:
+    def __init__(self, recording: Recording, *, router: Router, speed: float) -> None:
         """Take the recording; ``speed`` is recorded time over wall-clock time, 0: no waiting."""
         self._recording = recording
-        self._endpoint = endpoint
+        self._router = router
         self._speed = speed
         self._keys = Keys(recording.system)
         self._matrix: Message | None = None
@@ -62,7 +68,7 @@ class Replay:
 
     def run(self, stopped: threading.Event) -> None:
         """Play until the end or until ``stopped``."""
-        session = open_session(self._endpoint, stopped)
+        session = open_session(self._router, stopped)
         if session is None:
             return
         with session:

@@ -10,6 +10,7 @@ import structlog
 import zenoh
 import zenoh.ext
 
+from service.config.link_tables import Router
 from service.files.recording import RecordedKind, RecordingWriter
 from service.wire import Encodings, Keys, Role
 
@@ -34,25 +35,25 @@ _CACHE_S = 5.0
 _HEARTBEAT_S = 0.2
 
 
-def open_session(endpoint: str, stopped: threading.Event) -> zenoh.Session | None:
+def open_session(router: Router, stopped: threading.Event) -> zenoh.Session | None:
     """Open a session, waiting for the service's router until ``stopped``: then None."""
     waiting = False
     while not stopped.is_set():
         try:
-            return zenoh.open(client_config(endpoint))
+            return zenoh.open(client_config(router))
         except zenoh.ZError:
             if not waiting:
-                _log.warning("link.waiting", endpoint=endpoint)
+                _log.warning("link.waiting", endpoint=router.endpoint)
             waiting = True
             stopped.wait(_RETRY_S)
     return None
 
 
-def client_config(endpoint: str) -> zenoh.Config:
+def client_config(router: Router) -> zenoh.Config:
     """Return the settings of a zenoh client of the service's router, as the wire page asks."""
     settings: dict[str, object] = {
         "mode": "client",
-        "connect/endpoints": [endpoint],
+        "connect/endpoints": [router.endpoint],
         "connect/timeout_ms": _OPEN_TIMEOUT_MS,
         "connect/retry": _RETRY,
         "scouting/multicast/enabled": False,
@@ -62,6 +63,7 @@ def client_config(endpoint: str) -> zenoh.Config:
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _WAIT_BEFORE_DROP_US,
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": True,
+        **router.security,
     }
     config = zenoh.Config()
     for key, value in settings.items():

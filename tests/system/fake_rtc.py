@@ -41,7 +41,7 @@ T0_NS = 1_800_000_000_000_000_000
 DT_NS = 1_000_000
 
 
-def client_session(endpoint, stamped=True):
+def client_session(endpoint, stamped=True, **more):
     """Open a zenoh client as wire.md asks an RTC to."""
     config = zenoh.Config()
     settings = {
@@ -59,7 +59,7 @@ def client_session(endpoint, stamped=True):
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,
         "transport/shared_memory/enabled": False,
     }
-    for key, value in settings.items():
+    for key, value in (settings | more).items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
 
@@ -67,7 +67,7 @@ def client_session(endpoint, stamped=True):
 class FakeRtc:
     """Sends what a test tells it to, stages and applies what it is sent."""
 
-    def __init__(self, endpoint, system="bench", session="s1", n_slopes=6, n_modes=4):
+    def __init__(self, endpoint, system="bench", session="s1", n_slopes=6, n_modes=4, **more):
         self.keys = Keys(system)
         self.session = session
         self.n_slopes, self.n_modes = n_slopes, n_modes
@@ -80,7 +80,7 @@ class FakeRtc:
         self.answers = []
         self.waiting = {}
         self.lock = threading.Lock()
-        self.zenoh = client_session(endpoint)
+        self.zenoh = client_session(endpoint, **more)
         self.frames = zenoh.ext.declare_advanced_publisher(
             self.zenoh,
             self.keys.frames,

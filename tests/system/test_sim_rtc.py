@@ -16,6 +16,7 @@ import pytest
 import zenoh
 
 from benchmarks.plant import measure_linear
+from service.config.link_tables import Router
 from service.wire import (
     Acknowledgement,
     CommandKind,
@@ -234,7 +235,7 @@ def test_a_connection_left_over_under_its_name_does_not_silence_it_for_ever(tmp_
         (zid,) = [transport.zid for transport in listener.session.info.transports()]
         cable.cut()
         wait_for(lambda: listener.tokens.qsize() > 1, what="it is gone")
-        config = client_config(f"tcp/127.0.0.1:{port}")
+        config = client_config(Router(endpoint=f"tcp/127.0.0.1:{port}", security={}))
         config.insert_json5("id", json.dumps(str(zid)))
         with zenoh.open(config):
             cable.plugged.set()

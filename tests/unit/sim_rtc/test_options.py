@@ -23,7 +23,7 @@ def test_who_begins_far_away_begins_with_what_the_matrix_holds():
 
 def test_the_other_defaults_are_a_star_and_one_layer():
     options = parse_options([])
-    assert options.connect == "tcp/127.0.0.1:7447"
+    assert options.router.endpoint == "tcp/127.0.0.1:7447"
     (layer,) = options.layers
     assert (layer.speed_m_s, layer.direction_deg) == (12.0, 35.0)
 

@@ -1,0 +1,239 @@
+"""``[zenoh]`` of the settings, and what zenoh is told of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import Field, model_validator
+
+from service.config.sources import Table, in_file, read_toml, refuse, validated
+from service.wire.access import LinkRole, access_control
+from service.wire.keys import Keys
+
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+
+_ENCRYPTED: Final = re.compile("(tls|quic)/")
+
+Names = tuple[Annotated[str, Field(min_length=1, max_length=64)], ...]
+
+
+class TlsTable(Table):
+    """``[zenoh.tls]``: certificates, without which nobody connects."""
+
+    ca: Path
+    """Certificate of the authority that has signed all others, PEM."""
+
+    certificate: Path
+    """This program's own, PEM."""
+
+    key: Path
+    """The private key of it, PEM; nobody else may read the file."""
+
+
+class UsersTable(Table):
+    """``[zenoh.users]``: names and passwords, beside certificates or, on loopback, instead."""
+
+    name: str = Field(min_length=1, pattern="^[^:]+$")
+    """This program's own name."""
+
+    password_file: Path
+    """The file whose first line is its password; nobody else may read it."""
+
+    file: Path | None = None
+    """Of the service with its own router: the lines ``NAME:PASSWORD`` of all who may connect."""
+
+
+class AccessTable(Table):
+    """``[zenoh.access]``: names of the programs that may act as RTC, service or viewer.
+
+    A name is the common name of a certificate; without ``[zenoh.tls]`` that of a user.
+    """
+
+    rtc: Names = ("rtc",)
+    """Send telemetry and acknowledgements, answer commands."""
+
+    service: Names = ("service",)
+    """Command, send matrices: other services, ``pyrcal check-rtc``."""
+
+    viewer: Names = ("viewer",)
+    """Read state, alarms, statuses and published matrices, and do nothing else."""
+
+    @model_validator(mode="after")
+    def _one_role_for_each_name(self) -> AccessTable:
+        names = [*self.rtc, *self.service, *self.viewer]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"found {', '.join(twice)} twice, expected one role for each name")
+        return self
+
+
+class CredentialsTable(Table):
+    """``[zenoh]`` of a program that only connects: who it is, and whom it trusts."""
+
+    tls: TlsTable | None = None
+    """Certificates; left out: whoever reaches the port may put a matrix on the mirror."""
+
+    users: UsersTable | None = None
+    """Names and passwords; left out: none are asked for."""
+
+
+class ZenohTable(CredentialsTable):
+    """``[zenoh]``: the way to the RTC."""
+
+    listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    """Endpoints the embedded router listens on."""
+
+    connect: tuple[str, ...] = ()
+    """Endpoints of an observatory's own routers; not empty: no router is embedded."""
+
+    chunk_bytes: int = Field(default=4_000_000, ge=1024, le=4_000_000)
+    """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
+
+    access: AccessTable = Field(default_factory=AccessTable)
+    """Who may do what, as soon as certificates or users tell who is who."""
+
+    @model_validator(mode="after")
+    def _with_certificates_no_way_around_them(self) -> ZenohTable:
+        open_ones = [each for each in self.connect or self.listen if not _ENCRYPTED.match(each)]
+        if self.tls is not None and open_ones:
+            raise ValueError(
+                f"found {', '.join(open_ones)} beside [zenoh.tls], expected tls/HOST:PORT: "
+                "nobody is let in without a certificate"
+            )
+        return self
+
+
+class _OfAnyProgram(Table):
+    """The one table of a settings file that every program on the link reads."""
+
+    zenoh: ZenohTable = Field(default_factory=ZenohTable)
+
+
+def read_link_tables(
+    path: Path | None, *, listen: str | None = None, connect: str | None = None
+) -> ZenohTable:
+    """Return ``[zenoh]`` of a settings file, whatever else is in it; what else is given replaces.
+
+    Raises
+    ------
+    ConfigurationError
+        One line: where, what was found, what was expected.
+    """
+    table = {} if path is None else read_toml(path).get("zenoh", {})
+    if isinstance(table, dict):
+        given = {"listen": listen, "connect": connect}
+        table |= {key: [value] for key, value in given.items() if value is not None}
+    place = in_file(path) if path is not None else ".".join
+    return validated(_OfAnyProgram, {"zenoh": table}, place).zenoh
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Router:
+    """The router that a program connects to, and what it shows there."""
+
+    endpoint: str
+    security: Mapping[str, object]
+    """What zenoh is told about certificates and users; empty: it shows nothing."""
+
+
+def router_of(path: Path | None, connect: str | None) -> Router:
+    """Return the router that a settings file names, or ``connect`` instead.
+
+    Raises
+    ------
+    ConfigurationError
+        One line: where, what was found, what was expected.
+    """
+    zenoh = read_link_tables(path, connect=connect)
+    endpoint = (*zenoh.connect, DEFAULT_ENDPOINT)[0]
+    return Router(endpoint=endpoint, security=client_security(zenoh))
+
+
+def link_security(zenoh: ZenohTable, system: str) -> Mapping[str, object]:
+    """Return what zenoh is told about certificates, users and access; nothing: nothing is asked.
+
+    An embedded router controls access itself; where an observatory's own routers are used, theirs
+    do, and this program only shows who it is.
+
+    Raises
+    ------
+    ConfigurationError
+        If a file is missing, or others can read what is secret.
+    """
+    security = client_security(zenoh)
+    if zenoh.connect or not security:
+        return security
+    if zenoh.users is not None:
+        known = _users_file(zenoh.users)
+        own = security["transport/auth/usrpwd"]
+        security["transport/auth/usrpwd"] = {**own, "dictionary_file": known}
+    access = zenoh.access
+    names = {
+        LinkRole.RTC: access.rtc,
+        LinkRole.SERVICE: access.service,
+        LinkRole.VIEWER: access.viewer,
+    }
+    named_by = "usernames" if zenoh.tls is None else "cert_common_names"
+    return {**security, "access_control": access_control(Keys(system), names, named_by=named_by)}
+
+
+def client_security(credentials: CredentialsTable) -> dict[str, dict[str, object]]:
+    """Return what zenoh is told of a program that connects; nothing: it shows nothing.
+
+    Raises
+    ------
+    ConfigurationError
+        If a file is missing, or others can read what is secret.
+    """
+    security: dict[str, dict[str, object]] = {}
+    if credentials.tls is not None:
+        security["transport/link/tls"] = _certificates(credentials.tls)
+    if credentials.users is not None:
+        security["transport/auth/usrpwd"] = _own_user(credentials.users)
+    return security
+
+
+def _certificates(tls: TlsTable) -> dict[str, object]:
+    ca = _there(tls.ca, "zenoh.tls.ca")
+    own, key = _there(tls.certificate, "zenoh.tls.certificate"), _secret(tls.key, "zenoh.tls.key")
+    return {
+        "root_ca_certificate": ca,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "close_link_on_expiration": True,
+        "listen_certificate": own,
+        "listen_private_key": key,
+        "connect_certificate": own,
+        "connect_private_key": key,
+    }
+
+
+def _own_user(users: UsersTable) -> dict[str, object]:
+    path, key = users.password_file, "zenoh.users.password_file"
+    password = next(iter(Path(_secret(path, key)).read_text(encoding="utf-8").splitlines()), "")
+    if not password:
+        refuse(key, f"nothing in the first line of {path}", "a password")
+    return {"user": users.name, "password": password}
+
+
+def _users_file(users: UsersTable) -> str:
+    if users.file is None:
+        refuse("zenoh.users.file", "none", "a file with NAME:PASSWORD of all who may connect")
+    return _secret(users.file, "zenoh.users.file")
+
+
+def _there(path: Path, key: str) -> str:
+    if not path.is_file():
+        refuse(key, f"no file {path}", "one; pyrcal certificates new FOLDER makes all of them")
+    return str(path.absolute())
+
+
+def _secret(path: Path, key: str) -> str:
+    found = _there(path, key)
+    if path.stat().st_mode & 0o077:
+        refuse(key, f"{path}, which others can read", f"it to be yours alone: chmod 600 {path}")
+    return found

@@ -283,6 +283,7 @@ _LATER = frozenset(
         "spiders_m",
         "spiders_deg",
         "nominal_anamorphosis",
+        "laser",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

@@ -91,8 +91,9 @@ class Detector:
             variance = camera.excess_noise * lights + n_pixels * camera.read_noise_electrons**2
             sigma = np.sqrt(variance) / own.mean()
         else:
-            noise = camera.read_noise_electrons, camera.excess_noise
-            sigma = np.array([sensor.slope_noise(instrument, light, *noise) for light in lights])
+            of_photons, of_pixels = sensor.noise_terms(instrument)
+            photons = camera.excess_noise * of_photons * lights
+            sigma = np.sqrt(photons + of_pixels * camera.read_noise_electrons**2) / lights
         self.sigma: Array32 = sigma.astype(np.float32)
         """``(n_slopes,)`` 1 σ of a slope, or of a normalised pixel, in one frame."""
         if silent is not None:

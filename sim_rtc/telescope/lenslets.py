@@ -17,6 +17,7 @@ from service.model.pupil import PupilGrid
 from service.model.sensors.shack_hartmann.description import ShackHartmann
 from service.model.sensors.shack_hartmann.table import Centroid
 from service.model.slopes import SlopeRecipe
+from sim_rtc.telescope.sodium import ANGLE_STEP, SodiumStar
 
 Array = NDArray[Any]
 
@@ -46,14 +47,14 @@ class DiffractiveLenslets:
         """(x, y) by which the pupil's image is moved."""
 
         self._pixel = wfs.pixel_lambda_over_d(subaperture_m)
-        self._n_inside = _INSIDE_PIXEL * int(np.ceil(self._pixel))
-        field = wfs.pixels_per_subaperture * self._pixel
-        self._n_nodes = max(8, int(np.ceil(field)) + 4)
+        self._star = None if wfs.laser is None else SodiumStar(wfs, wfs.laser, subaperture_m)
+        self._angles, angle = self._sampled_field()
+        self._n_nodes = max(8, int(np.ceil(len(self._angles) * angle)) + 4)
         self._on_x, self._on_y = (self._between(shift) for shift in shift_subap)
         self._amplitude: Array = self._under(pupil.amplitude)
         self._wavenumber = np.float32(2 * np.pi / wfs.wavelength_m)
         self._edge, self._inside = _continued(pupil.lit)
-        self._transform = self._to_pixels()
+        self._transform = self._to_angles(angle)
         self._flat = self.images(np.zeros(int(pupil.lit.sum()), dtype=np.float32))
 
     def at(self, shift_subap: tuple[float, float]) -> DiffractiveLenslets:
@@ -71,10 +72,12 @@ class DiffractiveLenslets:
         n, nodes, rows = self._wfs.n_subapertures, self._n_nodes, self._transform
         seen = rows @ field.reshape(n, nodes, n * nodes)
         seen = seen.reshape(-1, nodes) @ rows.T
-        m, inside = self._wfs.pixels_per_subaperture, self._n_inside
-        light = seen.real**2 + seen.imag**2
+        light = (seen.real**2 + seen.imag**2).reshape(n, len(rows), n, len(rows))
+        if self._star is not None:
+            return self._star.on_pixels(light)
+        m = self._wfs.pixels_per_subaperture
         # rows: lenslet, pixel, inside; columns: lenslet, pixel, inside
-        return np.asarray(light.reshape(n, m, inside, n, m, inside).sum(axis=(2, 5)))
+        return np.asarray(light.reshape(n, m, -1, n, m, len(rows) // m).sum(axis=(2, 5)))
 
     def signals(self, light: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> Array:
         """Return centroids ``(n_slopes,)`` of valid lenslets, waves across one."""
@@ -102,13 +105,19 @@ class DiffractiveLenslets:
         """Return a map of the pupil's grid at the nodes of all lenslets."""
         return np.asarray(self._on_y @ on_grid.astype(np.float32, copy=False) @ self._on_x.T)
 
-    def _to_pixels(self) -> Array:
-        """Return the transform of a lenslet's line of nodes to samples of its pixels."""
-        m, inside = self._wfs.pixels_per_subaperture, self._n_inside
-        angles = self._pixel * ((np.arange(m * inside) + 0.5) / inside - m / 2)
+    def _sampled_field(self) -> tuple[Array, float]:
+        """Return where light is sampled along an axis, λ/d, and the distance between samples."""
+        if self._star is not None:
+            return self._star.angles, ANGLE_STEP
+        inside = _INSIDE_PIXEL * int(np.ceil(self._pixel))
+        n = self._wfs.pixels_per_subaperture * inside
+        return self._pixel * ((np.arange(n) + 0.5) / inside - n / inside / 2), self._pixel / inside
+
+    def _to_angles(self, angle: float) -> Array:
+        """Return the transform of a lenslet's line of nodes to samples of its light."""
         nodes = (np.arange(self._n_nodes) + 0.5) / self._n_nodes - 0.5
-        step = np.sqrt(self._pixel / inside) / self._n_nodes
-        transform = step * np.exp(-2j * np.pi * angles[:, None] * nodes)
+        step = np.sqrt(angle) / self._n_nodes
+        transform = step * np.exp(-2j * np.pi * self._angles[:, None] * nodes)
         return np.asarray(transform.astype(np.complex64))
 
 

@@ -6,6 +6,7 @@ What a kind does not have, it need not mention. Quick to import: mathematics com
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from service.model.pupil import PupilGrid
     from service.model.sensors.sensor import CannotTell, Fineness, Light, Sensor
     from service.model.slopes import SlopeRecipe
+
+    Term = float | NDArray[np.float64]
+    """Of the variance of slopes: one for all, or ``(n_signals,)``."""
 
 
 class SensorTable(Protocol):
@@ -171,13 +175,33 @@ class SensorKind(ABC):
         raise ModelError(f"a {self.name}: found binning {binning}, expected none")
 
     @abstractmethod
+    def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
+        """Return the variance of a slope by each photon, and by noise 1 of its pixels.
+
+        Both over the square of the photons yet; numbers, or ``(n_signals,)`` where the spots of
+        subapertures are not alike.
+        """
+
     def slope_noise(
         self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
     ) -> float:
         """Return 1 σ of a slope of a subaperture with so many electrons, read with this noise.
 
-        ``excess`` is the variance of the photon noise over Poisson's.
+        ``excess`` is the variance of the photon noise over Poisson's. RMS of all slopes.
         """
+        of_photons, of_pixels = (_mean(term) for term in self.noise_terms(instrument))
+        return math.sqrt(excess * of_photons * electrons + of_pixels * read_noise**2) / electrons
+
+    def noise_shape(self, instrument: Instrument) -> NDArray[np.float64] | None:
+        """Return 1 σ of each signal ``(n_signals,)`` over their RMS, by photons of the same light.
+
+        None: all alike.
+        """
+        of_photons, _ = self.noise_terms(instrument)
+        if isinstance(of_photons, float):
+            return None
+        shape: NDArray[np.float64] = (of_photons / of_photons.mean()) ** 0.5
+        return shape
 
     @abstractmethod
     def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -246,3 +270,7 @@ class SensorKind(ABC):
         from service.model.sensors.sensor import CannotTell
 
         return CannotTell(reason=f"the light of a {self.name} does not tell where the pupil lies")
+
+
+def _mean(term: Term) -> float:
+    return term if isinstance(term, float) else float(term.mean())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 
     from service.model.instrument import Instrument, SensorMode
     from service.model.pupil import PupilGrid
+    from service.model.sensors.kind import Term
     from service.model.sensors.pyramid.description import FrameWindows, Pyramid
     from service.model.sensors.pyramid.light import PyramidLight
     from service.model.sensors.pyramid.signals import PyramidSensor
@@ -115,11 +115,9 @@ class PyramidKind(SensorKind):
         return binned(sensor, binning)
 
     @override
-    def slope_noise(
-        self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
-    ) -> float:
+    def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
         # a difference of four pixels over the mean flux: their variances add up, in x and y alike
-        return math.sqrt(excess * electrons + 4 * read_noise**2) / electrons
+        return 1.0, 4.0
 
     @override
     def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:

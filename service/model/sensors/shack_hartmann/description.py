@@ -113,11 +113,12 @@ def pixel_places(sensor: ShackHartmann, valid: NDArray[np.bool_]) -> NDArray[np.
     return np.ascontiguousarray(places.transpose(1, 3, 0, 2)[..., valid].reshape(m * m, -1))
 
 
-def centroid_variances(sensor: ShackHartmann, subaperture_m: float) -> tuple[float, float]:
+def point_variances(sensor: ShackHartmann, subaperture_m: float) -> tuple[float, float]:
     """Return the variance of a centroid by one photon's place, and by noise 1 of all its pixels.
 
-    In (λ/d)², over the square of the photons yet: of a spot sinc² u its variance within a field
-    from -w to w is w / π². A threshold, or weights, let the core count alone: w = 1.
+    Of a star that is a point, in (λ/d)², over the square of the photons yet: of a spot sinc² u its
+    variance within a field from -w to w is w / π². A threshold, or weights, let the core count
+    alone: w = 1.
     """
     pixel = sensor.pixel_lambda_over_d(subaperture_m)
     half = sensor.pixels_per_subaperture * pixel / 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
     from service.model.instrument import Instrument
     from service.model.pupil import PupilGrid
+    from service.model.sensors.kind import Term
     from service.model.sensors.sensor import Fineness
     from service.model.sensors.shack_hartmann.description import ShackHartmann
     from service.model.sensors.shack_hartmann.optics import ShackHartmannSensor
@@ -38,9 +38,11 @@ class ShackHartmannKind(SensorKind):
         height = written.get("guide_star_height_m", "infinity")
         if height != "infinity":
             raise ModelError(
-                f'guide_star_height_m: found {height!r}, expected "infinity": the cone of a laser '
-                "star is not modelled"
+                f'guide_star_height_m: found {height!r}, expected "infinity", or a table '
+                "[wfs.laser] with height_m, thickness_m, spot_arcsec and launcher_m"
             )
+        if "guide_star_height_m" in written and "laser" in written:
+            raise ModelError("guide_star_height_m: has no meaning beside the table [wfs.laser]")
         return written
 
     @override
@@ -52,8 +54,10 @@ class ShackHartmannKind(SensorKind):
     @override
     def check(self, sensor: ShackHartmann, subaperture_m: float) -> None:
         from service.model.sensors.shack_hartmann.description import check_field
+        from service.model.sensors.shack_hartmann.stars import check_star
 
         check_field(sensor, subaperture_m)
+        check_star(sensor, subaperture_m)
 
     @override
     def left_out(self, instrument: Instrument) -> LeftOut | None:
@@ -79,18 +83,10 @@ class ShackHartmannKind(SensorKind):
             )
 
     @override
-    def slope_noise(
-        self, instrument: Instrument, electrons: float, read_noise: float, excess: float = 1.0
-    ) -> float:
-        from service.model.sensors.shack_hartmann.description import (
-            centroid_variances,
-            shack_hartmann_in,
-        )
+    def noise_terms(self, instrument: Instrument) -> tuple[Term, Term]:
+        from service.model.sensors.shack_hartmann.stars import centroid_variances
 
-        wfs = shack_hartmann_in(instrument)
-        of_photon, of_pixels = centroid_variances(wfs, instrument.subaperture_m)
-        variance = excess * of_photon * electrons + of_pixels * read_noise**2
-        return math.sqrt(variance) / electrons
+        return centroid_variances(instrument)
 
     @override
     def pixels(self, instrument: Instrument, valid: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -22,6 +22,7 @@ from service.model.pupil import Illumination, PupilGrid, instrument_pupil, valid
 from service.model.sensors.sensor import Work
 from service.model.sensors.shack_hartmann.description import shack_hartmann_in
 from service.model.sensors.shack_hartmann.spots import Spots
+from service.model.sensors.shack_hartmann.stars import spots_of
 
 Array = NDArray[Any]
 
@@ -69,13 +70,9 @@ class ShackHartmannSensor:
 
     @cached_property
     def spots(self) -> Spots:
-        """Pixels and centroid."""
-        wfs = shack_hartmann_in(self.instrument)
-        return Spots(
-            n_pixels=wfs.pixels_per_subaperture,
-            pixel=wfs.pixel_lambda_over_d(self.instrument.subaperture_m),
-            centroid=wfs.centroid,
-            threshold=wfs.threshold,
+        """Pixels and centroids of valid subapertures."""
+        return spots_of(
+            shack_hartmann_in(self.instrument), self.instrument.subaperture_m, self.valid
         )
 
     @cached_property
@@ -127,7 +124,7 @@ class ShackHartmannSensor:
         n_nodes = len(self.spots.nodes[0])
         spots = 16.0 * self.n_signals * n_nodes**2
         return Work(
-            memory_bytes=24.0 * entries + 8.0 * spots,
+            memory_bytes=24.0 * entries + 8.0 * spots + self.spots.memory_bytes,
             flop=2.0 * entries * n_shapes + 4.0 * n_nodes * spots,
         )
 
@@ -212,7 +209,9 @@ class ShackHartmannResponse:
 
         Of a full lenslet, wings beyond its field counted, it is 1.
         """
-        n, spots = len(self.sensor.valid), self.sensor.spots
+        instrument, n = self.sensor.instrument, len(self.sensor.valid)
+        every = np.ones((n, n), np.bool_)
+        spots = spots_of(shack_hartmann_in(instrument), instrument.subaperture_m, every)
         light = spots.images(self._amplitudes[0].reshape(n * n, *self._amplitudes[0].shape[2:]))
         return light.reshape(n, n, *light.shape[1:]).swapaxes(1, 2)
 

@@ -24,7 +24,12 @@ Array = NDArray[Any]
 _NODES_PER_PIXEL = 3
 """Along a side, and one for each λ/d that the pixel is wide: spots are that smooth."""
 
-_SPARE_NODES = 6
+SPARE_NODES = 6
+"""More than fringes of light at the border of what is seen need."""
+
+
+_MOVED = 9
+"""Places of a spot that is moved about."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,7 +51,7 @@ class Spots:
 
         As many as the finest fringe needs that the border of the field makes.
         """
-        places, weights = gauss_legendre(int(np.ceil(self.n_pixels * self.pixel)) + _SPARE_NODES)
+        places, weights = gauss_legendre(int(np.ceil(self.n_pixels * self.pixel)) + SPARE_NODES)
         return places / 2, weights / 2
 
     @cached_property
@@ -67,30 +72,51 @@ class Spots:
         return np.exp(-2j * np.pi * self._angles[0].reshape(-1, 1) * places) * weights
 
     @cached_property
-    def _counts(self) -> Array:
-        """``(n_angles, n_angles)`` how much the light at an angle counts, of its quadrature too."""
-        _, weights = self._angles
-        of_angle = np.tile(weights, self.n_pixels)
-        area = np.outer(of_angle, of_angle)
-        n_inside = weights.size
-        light = self.images(np.ones((1, *[len(self.nodes[0])] * 2)))[0]
-        light /= light.max()
-        if self.centroid is Centroid.CENTRE_OF_GRAVITY:
-            light = np.ones_like(light)
-        elif self.centroid is Centroid.THRESHOLD:
-            light = (light >= self.threshold).astype(np.float64)
-        return area * np.kron(light, np.ones((n_inside, n_inside)))
+    def _area(self) -> Array:
+        """``(n_angles, n_angles)`` the quadrature's own weights."""
+        of_angle = np.tile(self._angles[1], self.n_pixels)
+        return np.outer(of_angle, of_angle)
+
+    @cached_property
+    def _counts(self) -> tuple[Array, Array, Array]:
+        """How much the light at an angle counts, and that times its pixel's x, and y.
+
+        ``(..., n_angles, n_angles)`` each, of its quadrature too.
+        """
+        full = self.images(np.ones((1, *[len(self.nodes[0])] * 2)))
+        counts = self._spread(self.weights_of(full))
+        x = self.pixel * np.repeat(self._places, self._angles[0].shape[1])
+        return counts, counts * x, counts * x[:, None]
+
+    def weights_of(self, full: Array) -> Array:
+        """Return how much each pixel counts, of spots ``(n, n_pixels, n_pixels)`` in full light."""
+        light = full / full.max(axis=(1, 2), keepdims=True)
+        match self.centroid:
+            case Centroid.CENTRE_OF_GRAVITY:
+                return np.ones_like(light)
+            case Centroid.THRESHOLD:
+                return np.asarray(light >= self.threshold, np.float64)
+            case Centroid.WEIGHTED:
+                return np.asarray(light)
+
+    def _spread(self, on_pixels: Array) -> Array:
+        """Return what stands on pixels ``(n, n_pixels, n_pixels)`` at the angles within them."""
+        n_inside = self._angles[0].shape[1]
+        return np.asarray(np.kron(on_pixels, np.ones((n_inside, n_inside))) * self._area)
 
     def _seen(self, amplitude: Array) -> Array:
         return np.asarray(self._transform @ amplitude @ self._transform.T)
 
     def images(self, amplitude: Array) -> Array:
         """Return the light on the pixels ``(n_lenslets, n_pixels, n_pixels)`` [y, x]."""
-        _, weights = self._angles
-        of_angle = np.tile(weights, self.n_pixels)
-        light = np.abs(self._seen(amplitude)) ** 2 * np.outer(of_angle, of_angle)
-        n, inside = self.n_pixels, weights.size
+        light = np.abs(self._seen(amplitude)) ** 2 * self._area
+        n, inside = self.n_pixels, self._angles[0].shape[1]
         return np.asarray(light.reshape(-1, n, inside, n, inside).sum(axis=(2, 4)))
+
+    @property
+    def memory_bytes(self) -> float:
+        """What spots that are not alike take."""
+        return 0.0
 
     def light(self, first: Array, second: Array) -> Array:
         """Return the light that counts ``(n_lenslets,)``, bilinear in two amplitudes.
@@ -98,7 +124,7 @@ class Spots:
         Amplitudes are ``(n_lenslets, n_nodes, n_nodes)`` [y, x] at the nodes.
         """
         product = self._seen(first).conj() * self._seen(second)
-        return np.asarray(np.einsum("nij,ij->n", product.real, self._counts))
+        return np.asarray(np.sum(product.real * self._counts[0], axis=(1, 2)))
 
     def pull(self, outer: Array, inner: Array) -> tuple[Array, Array]:
         """Return how far phase pulls a spot along x, and along y; not over its light yet.
@@ -107,11 +133,36 @@ class Spots:
         phase is, and with which light it interferes. Quadrature weights are in it.
         """
         _, weights = self.nodes
-        seen = self._seen(inner).conj() * self._counts
-        place = self.pixel * np.repeat(self._places, self._angles[0].shape[1])
+        seen = self._seen(inner).conj()
         back = self._transform / weights
         lit = -2.0 * outer * np.outer(weights, weights)
         along_x, along_y = (
-            lit * np.imag(back.T @ (seen * moment) @ back) for moment in (place, place[:, None])
+            lit * np.imag(back.T @ (seen * moment) @ back) for moment in self._counts[1:]
         )
         return along_x, along_y
+
+    def straightness(self, moves: float) -> Array:
+        """Return how far centroids go, ``(2 * n_lenslets,)`` along x, then y, over what is linear.
+
+        Of full lenslets, as spots move to ``moves`` λ/d on either side and pixels pass the
+        threshold; linear: what pixels that count at rest make of small moves.
+        """
+        nodes = self.nodes[0]
+        full = np.ones((1, len(nodes), len(nodes)))
+        aside = np.linspace(-moves, moves, _MOVED)
+        found = []
+        for axis, pull in enumerate(self.pull(full, full)):
+            along = nodes[:, None] if axis else nodes
+            linear = 2 * np.pi * (pull * along).sum(axis=(1, 2)) / self.light(full, full)
+            seen = [self._centroids(full * np.exp(2j * np.pi * far * along), axis) for far in aside]
+            fitted = aside @ np.array(seen) / (aside @ aside)
+            found.append(fitted / np.maximum(linear, 1e-3))
+        return np.concatenate(found)
+
+    def _centroids(self, amplitude: Array, axis: int) -> Array:
+        """Return centroids ``(n_lenslets,)`` along x (0) or y (1), each by its own threshold."""
+        spots = self.images(amplitude)
+        brightest = spots.max(axis=(1, 2), keepdims=True)
+        spots = np.where(spots >= (self.threshold or 0.0) * brightest, spots, 0.0)
+        line = spots.sum(axis=1 + axis)
+        return np.asarray(line @ self._places * self.pixel / line.sum(axis=1))

@@ -31,6 +31,23 @@ class PartlyLit(StrEnum):
     LEAVE_OUT = "leave out"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaserStar(Read):
+    """Star of a laser: light of a layer of sodium, seen aslant, an elongated spot."""
+
+    height_m: Annotated[float, Ge(1e3), Le(1e6)]
+    """Distance of the middle of the layer along the line of sight."""
+
+    thickness_m: Annotated[float, Ge(0.0), Le(1e5)]
+    """Full width at half maximum of the layer along the line of sight."""
+
+    spot_arcsec: Annotated[float, Gt(0.0), Le(60.0)]
+    """Full width at half maximum of the star across its beam."""
+
+    launcher_m: tuple[float, float]
+    """Where the laser is launched, x and y from the middle of the pupil, in the sensor's axes."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShackHartmannNumbers(Read):
     """The lenslets, their pixels and their centroids."""
@@ -66,6 +83,9 @@ class ShackHartmannNumbers(Read):
     """What fits of matrices do with subapertures that the pupil's edge cuts: `use` or `leave out`;
     None: used, but not beside a threshold, which makes their centroids lie."""
 
+    laser: LaserStar | None = None
+    """A laser star, a table `[wfs.laser]`; None: a star at infinity, a point."""
+
     @property
     def pupil_diameter(self) -> float:
         """Diameter of the pupil image, in subapertures."""
@@ -82,4 +102,4 @@ class ShackHartmannTable(ShackHartmannNumbers):
     """"auto": by ``flux_threshold``; else a mask ``path:/dataset``."""
 
     guide_star_height_m: Literal["infinity"] = "infinity"
-    """Metres; a laser star, whose light is a cone, is not modelled yet."""
+    """A laser star has a table `[wfs.laser]` instead."""

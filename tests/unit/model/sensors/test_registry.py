@@ -59,7 +59,7 @@ class CurvatureKind(SensorKind):
     table = CurvatureTable
     unknown: ClassVar[dict[str, float]] = {"extra_m": 2.0}
     signals = (SignalKind.XY,)
-    sensor = pixels = slope_noise = aot = None
+    sensor = pixels = noise_terms = aot = None
 
     def described(self, table, given):
         return Curvature(**{one.name: getattr(table, one.name) for one in fields(Numbers)})

@@ -11,6 +11,7 @@ from pyrcal.offline.matrix import fit_matrix
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.estimation.reference import Reference, target_of
+from service.model.instrument import instrument_sha256
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
@@ -23,10 +24,15 @@ from service.model.pupil import (
 )
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import CannotTell, Fineness
+from service.model.sensors.shack_hartmann.table import LaserStar
 from tests.numerics import SOMEWHERE
 
 FILE = Path(__file__).parents[3] / "data" / "lenslets.toml"
 DOUBLE = Fineness(dtype=np.float64)
+LASER = LaserStar(height_m=9e4, thickness_m=1.5e4, spot_arcsec=0.8, launcher_m=(2.5, 0.5))
+DIGEST = "8b7f65efd1a2ec806dd4989fbe3521d37e4d59b531372dc9fab59a4a29479506"
+STAR = "height_m = 9e4\nthickness_m = 1e4\nspot_arcsec = 1.5\nlauncher_m = [2.0, 0.0]\n"
+""""[wfs.laser]" of a file."""
 
 
 @pytest.fixture(scope="module")
@@ -79,17 +85,18 @@ def test_the_slope_of_a_parabola_is_that_in_the_middle_of_a_lit_subaperture(lens
     np.testing.assert_allclose(found, full_gain() * middle[full].T, rtol=1e-3)
 
 
+@pytest.mark.parametrize("laser", [None, LASER])
 @pytest.mark.parametrize("stop", Stop)
-def test_derivatives_are_those_of_the_matrix(lenslets, stop):
+def test_derivatives_are_those_of_the_matrix(lenslets, stop, laser):
     """Nodes that pass a point of the pupil within the step are what is left."""
-    about = replace(lenslets, stop=stop)
+    about = replace(lenslets, stop=stop, wfs=replace(lenslets.wfs, laser=laser))
     model = InteractionModel(about, modal_basis(about).subset(np.arange(12)), dtype=np.float64)
-    for derivative, step in zip(model.derivatives(SOMEWHERE), 1e-4 * np.eye(4), strict=True):
+    for derivative, step in zip(model.derivatives(SOMEWHERE), 1e-5 * np.eye(4), strict=True):
         less, more = (
             model.interaction_matrix(Misregistration.from_vector(SOMEWHERE.vector + side * step))
             for side in (-1.0, 1.0)
         )
-        difference = (more - less) / 2e-4
+        difference = (more - less) / 2e-5
         assert np.linalg.norm(derivative - difference) < 1e-5 * np.linalg.norm(difference)
 
 
@@ -148,7 +155,30 @@ def test_its_light_tells_nothing_of_the_pupil(lenslets):
             'partly_lit: found "use" beside a threshold of 0.1, expected "leave out"',
         ),
         ("wavelength_m", "pixel_scale_arcsec = 0.001\nwavelength_m", "expected 1.5 to 60"),
-        ("wavelength_m", "guide_star_height_m = 9e4\nwavelength_m", 'expected "infinity"'),
+        ("wavelength_m", "guide_star_height_m = 9e4\nwavelength_m", "a table [wfs.laser]"),
+        (
+            "[mirror]",
+            f'guide_star_height_m = "infinity"\n[wfs.laser]\n{STAR}[mirror]',
+            "has no meaning beside the table [wfs.laser]",
+        ),
+        ("[mirror]", f"[wfs.laser]\n{STAR}[mirror]".replace("launcher_m", "#"), "laser.launcher_m"),
+        ("[mirror]", f"[wfs.laser]\n{STAR}[mirror]".replace("9e4", "90"), "laser.height_m"),
+        ("[mirror]", f"[wfs.laser]\n{STAR}[mirror]".replace("1.5", "0.1"), "expected 0.5 λ/d"),
+        (
+            "[mirror]",
+            f"[wfs.laser]\n{STAR}[mirror]".replace("[2.0, 0.0]", "[200.0, 0.0]"),
+            "laser.thickness_m: found spots of up to 51.3 arcseconds in a field of 3.71",
+        ),
+        (
+            "wavelength_m",
+            'centroid = "threshold"\nthreshold = 0.5\nwavelength_m',
+            "threshold: found 0.5: a spot that moves by 0.2 λ/d moves its centroid by 1.7 times",
+        ),
+        (
+            "wavelength_m",
+            'pixels_per_subaperture = 7\ncentroid = "threshold"\nthreshold = 0.3\nwavelength_m',
+            "threshold: found 0.3",
+        ),
         ("wavelength_m", 'centroid = "matched"\nwavelength_m', "wfs.centroid"),
         ("wavelength_m", "pixels_per_subaperture = 1\nwavelength_m", "pixels_per_subaperture"),
         ("shack-hartmann", "curvature", "'curvature', expected 'pyramid' or 'shack-hartmann'"),
@@ -164,6 +194,17 @@ def test_what_is_no_lenslets_is_refused_in_one_line(tmp_path, old, new, said):
         load_instrument(path)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_file_may_have_a_laser_star_and_one_without_has_the_digest_it_had(tmp_path, lenslets):
+    path = tmp_path / "laser.toml"
+    path.write_text(
+        FILE.read_text("utf-8").replace("[mirror]", f"[wfs.laser]\n{STAR}[mirror]"), "utf-8"
+    )
+    laser = load_instrument(path).wfs.laser
+    assert laser == LaserStar(height_m=9e4, thickness_m=1e4, spot_arcsec=1.5, launcher_m=(2.0, 0.0))
+    assert instrument_sha256(lenslets) == DIGEST
+    assert instrument_sha256(replace(lenslets, wfs=replace(lenslets.wfs, laser=laser))) != DIGEST
 
 
 def test_beside_a_threshold_fits_leave_out_what_the_edge_cuts_and_say_so(tmp_path):

@@ -1,0 +1,116 @@
+"""Spots of an instrument's star: a point at infinity, or a laser's elongated ones."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.pupil import valid_subapertures
+from service.model.sensors.shack_hartmann.description import (
+    ShackHartmann,
+    point_variances,
+    shack_hartmann_in,
+)
+from service.model.sensors.shack_hartmann.elongated import ElongatedSpots, blur_of, elongation_rad
+from service.model.sensors.shack_hartmann.spots import Spots
+from service.model.sensors.shack_hartmann.table import LaserStar
+
+if TYPE_CHECKING:
+    from service.model.sensors.kind import Term
+
+
+STRAIGHT = (0.8, 1.25)
+"""Of the way that a spot's centroid goes over the way that its pixels at rest say: further from 1
+pixels pass the threshold as the spot moves."""
+
+_MOVES = 0.2
+"""By which spots move in a closed loop, λ/d."""
+
+_SPOTS_LOOKED_AT = 8
+"""Across a sensor whose spots are not alike."""
+
+_FINEST = 0.5
+"""Of λ/d: a laser's beam is wider than that."""
+
+_LONGEST = 2.0
+"""Of a field's width: of a longer spot the field has but a piece."""
+
+
+def spots_of(wfs: ShackHartmann, width_m: float, lenslets: NDArray[np.bool_]) -> Spots:
+    """Return the spots of these lenslets ``(n, n)`` [y, x], row by row, each so wide."""
+    pixels: dict[str, Any] = {
+        "n_pixels": wfs.pixels_per_subaperture,
+        "pixel": wfs.pixel_lambda_over_d(width_m),
+        "centroid": wfs.centroid,
+        "threshold": wfs.threshold,
+    }
+    if wfs.laser is None:
+        return Spots(**pixels)
+    line_m = width_m * (np.arange(len(lenslets)) - (len(lenslets) - 1) / 2)
+    places_m = np.stack(np.meshgrid(line_m, line_m), axis=-1)
+    blur = blur_of(wfs.laser, places_m, wfs.wavelength_m / width_m)
+    widest = float(np.sqrt(np.linalg.eigvalsh(blur).max()))
+    return ElongatedSpots(**pixels, blur=blur[lenslets], widest=widest)
+
+
+def centroid_variances(instrument: Instrument) -> tuple[Term, Term]:
+    """Return the variance of centroids by a photon's place, and by noise 1 of all their pixels.
+
+    In (λ/d)², over the square of the photons yet; of a laser star's spots ``(n_slopes,)``.
+    """
+    wfs, width_m = shack_hartmann_in(instrument), instrument.subaperture_m
+    spots = spots_of(wfs, width_m, valid_subapertures(instrument))
+    if isinstance(spots, ElongatedSpots):
+        of_photon, of_pixels = spots.variances
+        return of_photon.reshape(-1), of_pixels.reshape(-1)
+    return point_variances(wfs, width_m)
+
+
+def check_star(wfs: ShackHartmann, width_m: float) -> None:
+    """Refuse a laser star that no field of this sensor can hold, and centroids that lie.
+
+    Raises
+    ------
+    ModelError
+        One line that begins with the key.
+    """
+    n = wfs.n_subapertures
+    if wfs.laser is not None:
+        _check_laser(wfs.laser, wfs, width_m)
+    if wfs.threshold is None:
+        return
+    some = np.zeros((n, n), np.bool_)
+    each = 1 if wfs.laser is None else max(1, n // _SPOTS_LOOKED_AT)
+    some[::each, ::each] = True
+    moved = spots_of(wfs, width_m, some).straightness(_MOVES)
+    worst = float(moved[np.argmax(np.abs(np.log(np.maximum(moved, 1e-3))))])
+    low, high = STRAIGHT
+    if not low < worst < high:
+        raise ModelError(
+            f"threshold: found {wfs.threshold:g}: a spot that moves by {_MOVES:g} λ/d moves its "
+            f"centroid by {worst:.2g} times what its pixels at rest say, expected {low:g} to "
+            f"{high:g}: a lower one, or another centroid"
+        )
+
+
+def _check_laser(laser: LaserStar, wfs: ShackHartmann, width_m: float) -> None:
+    lambda_over_d = math.degrees(wfs.wavelength_m / width_m) * 3600.0
+    if laser.spot_arcsec < _FINEST * lambda_over_d:
+        raise ModelError(
+            f"laser.spot_arcsec: found {laser.spot_arcsec:g}, expected {_FINEST:g} λ/d or more: "
+            f"{_FINEST * lambda_over_d:.2g} of a subaperture of {width_m:.3g} m"
+        )
+    corner = width_m * wfs.n_subapertures / 2 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+    long = math.degrees(np.linalg.norm(elongation_rad(laser, corner), axis=1).max()) * 3600.0
+    field = wfs.pixels_per_subaperture * wfs.pixel_lambda_over_d(width_m) * lambda_over_d
+    if long > _LONGEST * field:
+        raise ModelError(
+            f"laser.thickness_m: found spots of up to {long:.3g} arcseconds in a field of "
+            f"{field:.3g}, expected {_LONGEST:g} times that at most: thickness_m, height_m and "
+            "launcher_m are metres"
+        )

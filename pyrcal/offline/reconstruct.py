@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -190,9 +189,7 @@ def _recipe(options: argparse.Namespace, model: RtcInteractionModel) -> Recipe:
     if options.method == InversionMethod.MAP:
         prior = Prior(
             variance_m2=model.basis.variance_m2,
-            slope_noise=np.full(
-                model.n_slopes, options.slope_noise * model.instrument.slopes.kind.noise
-            ),
+            slope_noise=model.slope_noise(options.slope_noise),
         )
     return Recipe(
         n_modes=options.modes,

@@ -240,7 +240,8 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
 
     Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per
     line; C the command at the line, Z the instrument, ``F(v) = [γ S_j v, D v, i D v]``,
-    ``r = S - γ D(α) C``. When ``step`` is not small the caller linearises anew at the estimate.
+    ``r = S - γ D(α) C``. Where slopes are not equally noisy, Z is weighted by their variance. When
+    ``step`` is not small the caller linearises anew at the estimate.
     """
     matrix = linearisation.matrix
     coupling = loop.reconstructor @ matrix
@@ -250,6 +251,8 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     # the first guess: <D Z, S> / <D Z, D C>
     gains = np.sum(known.conj() * slopes, axis=1) / np.sum(known.conj() * seen[:, 0], axis=1)
     known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
+    if linearisation.noise_shape is not None:  # an instrument may be weighted by anything
+        known /= linearisation.noise_shape**2
     step = np.zeros(4)
     for _ in range(N_STEPS):
         normal, score = _normal_equations(slopes, seen, known, gains, step)

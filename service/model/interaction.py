@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -49,6 +50,9 @@ class Linearisation:
 
     derivatives: NDArray[np.float32]
     """``(4, n_slopes, n_modes)`` per subaperture, subaperture, radian, unit of magnification."""
+
+    noise_shape: NDArray[np.float64] | None = None
+    """``(n_slopes,)`` σ of each slope over their RMS; None: all alike."""
 
     def matrix_at(self, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D at a registration close by, to first order, ``(n_slopes, n_modes)``."""
@@ -161,7 +165,18 @@ class InteractionModel:
             derivatives=np.stack([self._as_listed(rate) for rate in rates]).astype(
                 np.float32, copy=False
             ),
+            noise_shape=self.noise_shape,
         )
+
+    @cached_property
+    def noise_shape(self) -> NDArray[np.float64] | None:
+        """``(n_slopes,)`` σ of each slope over their RMS, of the same light; None: all alike."""
+        return kind_of(self.instrument).noise_shape(self.instrument)
+
+    def slope_noise(self, noise: float) -> NDArray[np.float64]:
+        """Return σ of every signal ``(n_slopes,)`` where that of a slope is ``noise``, RMS."""
+        shape = np.ones(self.n_slopes) if self.noise_shape is None else self.noise_shape
+        return noise * self.instrument.slopes.kind.noise * shape
 
     def seen(self, alpha: Misregistration, shapes: Shapes) -> Array:
         """Return the signals ``(n_slopes, n_shapes)`` of shapes ``(n_points, n_shapes)``, metres.
@@ -321,6 +336,12 @@ class RtcInteractionModel(InteractionModel):
         """Return which of the RTC's slopes lie near unknown surface, ``(n_slopes,)``."""
         marks = self._listed(super().unknown_rows(alpha).astype(np.float32))
         return np.asarray(marks != 0.0)
+
+    @override
+    @cached_property
+    def noise_shape(self) -> NDArray[np.float64] | None:
+        shape = kind_of(self.instrument).noise_shape(self.instrument)
+        return None if shape is None else np.abs(self._listed(shape))
 
     def _listed(self, rows: Array) -> Array:
         recipe = self.instrument.slopes

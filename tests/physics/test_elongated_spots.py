@@ -8,11 +8,13 @@ import pytest
 import scipy
 
 from service.config import load_instrument
-from service.model.interaction import InteractionModel
+from service.model.interaction import InteractionModel, RtcInteractionModel
+from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.sensors.registry import kind_of
 from service.model.sensors.shack_hartmann.table import Centroid, LaserStar
+from service.model.slopes import Orientation, SlopeRecipe
 from tests.physics.fft_spots import FINE, PADDED, PUSH_M, SAMPLES, centroids, fine_points
 
 FILE = Path(__file__).parents[1] / "data" / "lenslets.toml"
@@ -121,3 +123,23 @@ def test_more_is_uncertain_along_the_axis_of_a_spot_than_across(lenslets):
     along, across = shape.reshape(2, -1)[:, at]
     assert along > 1.3 * across
     assert np.sqrt(np.mean(shape**2)) == pytest.approx(1.0)
+
+
+def test_noise_stands_as_the_rtc_lists_its_slopes(lenslets):
+    """Interleaved, mirrored along x and with signs of its own: σ has none."""
+    plain = kind_of(lenslets).noise_shape(lenslets).reshape(2, -1)
+    recipe = SlopeRecipe(
+        order=SlopeOrder.INTERLEAVED, orientation=Orientation(flip_x=True, sign_x=-1)
+    )
+    about = replace(lenslets, slopes=recipe)
+    model = RtcInteractionModel(about, modal_basis(about).subset(np.arange(3)))
+    mask = model.valid
+    maps = np.full((2, *mask.shape), np.nan)
+    maps[:, mask] = plain
+    turned = maps[:, :, ::-1]
+    np.testing.assert_allclose(
+        model.noise_shape.reshape(-1, 2).T, turned[:, mask[:, ::-1]], rtol=1e-6
+    )
+    at = Misregistration(shift_x_subap=0.1)
+    np.testing.assert_array_equal(model.linearise(at).noise_shape, model.noise_shape)
+    np.testing.assert_allclose(model.slope_noise(0.3), 0.3 * model.noise_shape)

@@ -168,7 +168,7 @@ class OpticsWorker:
 
         what = ("linearisation", *sampling, start.vector.tolist())
         kept = self._disk_cache.arrays(self._model.instrument, what, computed)
-        return Linearisation(alpha=start, **kept)
+        return Linearisation(alpha=start, **kept, noise_shape=self._model.noise_shape)
 
     def fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration | None
@@ -440,10 +440,9 @@ class OpticsWorker:
     def _recipe(self, n_modes: int) -> Recipe:
         prior = None
         if self._compute.method is InversionMethod.MAP:
-            noise = self._compute.slope_noise * self._model.instrument.slopes.kind.noise
             prior = Prior(
                 variance_m2=self._model.basis.variance_m2,
-                slope_noise=np.full(self._model.n_slopes, noise),
+                slope_noise=self._model.slope_noise(self._compute.slope_noise),
             )
         return Recipe(
             n_modes=n_modes,

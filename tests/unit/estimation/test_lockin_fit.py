@@ -279,6 +279,26 @@ def test_a_noise_free_linear_sensor_is_read_exactly(gain):
     np.testing.assert_allclose(estimate.optical_gain, gain, atol=1e-4)
 
 
+def test_slopes_that_are_known_to_be_noisy_count_less():
+    """Half of them four times as noisy as the others: counted alike they cost twice the σ."""
+    even = small_linearisation()
+    rng, spectra = np.random.default_rng(3), quiet(even, SOMEWHERE, 1.0)
+    shape = np.where(rng.random(even.matrix.shape[0]) < 0.5, 4.0, 1.0)
+    noise = rng.normal(size=(2, *spectra.slopes.shape)) * shape
+    size = 0.01 * np.abs(spectra.slopes[:, 0]).mean()
+    noisy = replace(
+        spectra, slopes=(spectra.slopes + size * (noise[0] + 1j * noise[1])).astype(np.complex64)
+    )
+    known = replace(even, noise_shape=shape / np.sqrt(np.mean(shape**2)))
+    alike, weighted = (fit_window(noisy, about, small_loop()) for about in (even, known))
+    sigma = np.sqrt([np.diag(alike.covariance), np.diag(weighted.covariance)])
+    expected = np.sqrt(np.mean(shape**2) * np.mean(shape**-2.0))
+    assert expected > 2.0
+    np.testing.assert_allclose(sigma[0] / sigma[1], expected, rtol=0.25)
+    error = np.abs(weighted.alpha.vector - SOMEWHERE.vector)
+    assert np.all(error < 3 * sigma[1])
+
+
 # --- the closed loop's answer to the dither
 
 

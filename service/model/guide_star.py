@@ -1,0 +1,49 @@
+"""A guide star, and where along its light a mirror at an altitude is seen on the pupil.
+
+The one rule of parallax and cone. The light that a star at height H sends through the point p of
+the pupil crosses the altitude h at ``q = (1 - h / H) p + h θ``, θ the star's direction. So a point
+q of a mirror there is seen at ``p = (q - h θ) / (1 - h / H)``: shifted by the parallax, and
+magnified because a cone narrows towards its tip. Heights and altitudes are distances from the
+pupil along the line of sight, and may be negative.
+
+References
+----------
+Agapito, Plantet & Heritier 2024, Proc. SPIE 13097, 130975P, section 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+from service.errors import ModelError
+from service.model.similarity import Similarity
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuideStar:
+    """Direction and height of a guide star."""
+
+    direction_rad: complex = 0j
+    """x + iy on the sky, in the pupil's axes: towards +x, light at an altitude lies at +x."""
+
+    height_m: float = inf
+    """Of a laser star, metres along the line of sight; infinite: a natural one."""
+
+    def seen(self, altitude_m: float) -> Similarity:
+        """Return where points of a plane at this altitude are seen on the pupil, metres.
+
+        Raises
+        ------
+        ModelError
+            If the plane is not below the star: none of its light comes through it.
+        """
+        if not altitude_m < self.height_m:
+            raise ModelError(
+                f"found a mirror at an altitude of {altitude_m:g} m and a star at "
+                f"{self.height_m:g} m, expected the mirror below the star"
+            )
+        magnification = 1.0 / (1.0 - altitude_m / self.height_m)
+        return Similarity(
+            turn=complex(magnification), shift=-magnification * altitude_m * self.direction_rad
+        )

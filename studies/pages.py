@@ -126,6 +126,7 @@ PAGES = {
     "reference/settings.md": reference.settings,
     "reference/access.md": reference.access,
     "reference/instrument.md": reference.instrument,
+    "reference/system.md": reference.system,
     "reference/cli.md": reference.commands,
     "understand/tracker.md": dispatch.page,
     "integrate/rest.md": rest,

@@ -11,6 +11,7 @@ from typing import Any, get_args, get_type_hints
 
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import OTHER_PROGRAMS, command_line
+from pyrcal.offline.system_file import SystemFile
 from service.config.instrument_schema import whole_of
 from service.config.settings import Settings
 from service.config.sources import Table
@@ -71,6 +72,15 @@ def instrument() -> str:
     first, *others = KINDS.values()
     own = [part for kind in others for part in _sensor_table(kind)]
     return page("The instrument file", intro, *_tables(whole_of(first)), *own)
+
+
+def system() -> str:
+    """Return docs/reference/system.md: every key of a system's file."""
+    intro = (
+        "A TOML file of several sensors and mirrors, for `pyrcal fit-system`: "
+        "[how it is used](../integrate/systems.md). In brackets: type and default."
+    )
+    return page("The file of a system", intro, *_tables(SystemFile))
 
 
 def _sensor_table(kind: SensorKind) -> list[str]:

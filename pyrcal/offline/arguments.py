@@ -33,6 +33,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
         commands.add_parser("certificates", help="make certificates for the link to the RTC")
     )
     _describe_fit(commands.add_parser("fit", help="fit the registration to a measured matrix"))
+    _describe_fit_system(
+        commands.add_parser("fit-system", help="fit several sensors and mirrors together")
+    )
     _describe_reconstruct(
         commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
     )
@@ -120,6 +123,14 @@ measured.
 
 _INSTRUMENT = words("instrument INSTRUMENT", "TOML file, or a packaged name")
 
+_OF_AN_ANSWER = (
+    words("--json", "print one JSON object, not a table"),
+    words("--plot FILE.png", "write the figures", type=Path),
+    words("--output FILE.h5", "write everything found", type=Path),
+    words("--threads N", "default: one for every core", type=_count, default=os.cpu_count() or 1),
+)
+"""What commands that fit have in common."""
+
 
 def _describe_fit(fit: argparse.ArgumentParser) -> None:
     fit.set_defaults(module="pyrcal.offline.fit")
@@ -148,16 +159,41 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
         words("--flux-reference FILE", reference, type=Path),
         words("--arms WIDTH:DEG,DEG...", arms, type=_read_by(parse_arms)),
     )
-    cores = os.cpu_count() or 1
     add(
         fit,
         words("--gain-map", "also fit a smooth gain over the pupil"),
         words("--no-anamorphosis", "take the image for as stretched as the instrument file says"),
         words("--anamorphosis", "as without it: the stretch is always fitted"),
-        words("--json", "print one JSON object, not a table"),
-        words("--plot FILE.png", "write the paper's figures", type=Path),
-        words("--output FILE.h5", "write everything found", type=Path),
-        words("--threads N", "default: one for every core", type=_count, default=cores),
+        *_OF_AN_ANSWER,
+    )
+
+
+_FIT_SYSTEM = """
+Find where each sensor, mirror and star of a system lies, from the measured interaction matrix of
+every sensor with every mirror: each pair is fitted as pyrcal fit does, and what is common to them
+follows by weighted least squares. Directions that no pair can see are named.
+"""
+
+_FIT_SYSTEM_EPILOG = """
+Exit status: 0 accepted, 1 fitted but refused (the verdict says why), 2 input that cannot be used.
+docs/integrate/systems.md explains the file, the gauge and verdicts.
+"""
+
+
+def _describe_fit_system(fit: argparse.ArgumentParser) -> None:
+    fit.set_defaults(module="pyrcal.offline.fit_system")
+    fit.description, fit.epilog = _FIT_SYSTEM, _FIT_SYSTEM_EPILOG
+    reference = (
+        "the matrices: a file for each pair, {sensor} and {mirror} in its name standing for "
+        "theirs, or one HDF5 file of all"
+    )
+    dataset = "of each matrix; default {sensor}/{mirror}/interaction_matrix in one file of all"
+    add(
+        fit,
+        words("system SYSTEM", "TOML file of sensors and mirrors", type=Path),
+        words("reference REFERENCE", reference, type=Path),
+        words("--dataset NAME", dataset),
+        *_OF_AN_ANSWER,
     )
 
 

@@ -17,6 +17,7 @@ from pyrcal.offline.report import FitReport
 from service.errors import MatrixError
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument, instrument_sha256
+from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
 
 Progress = Callable[[str], None]
@@ -29,9 +30,10 @@ def fit_file(
     *,
     dataset: str | None = None,
     threads: int = 2,
+    basis: Basis | None = None,
     progress: Progress | None = None,
 ) -> FitReport:
-    """Return the fit of the measured matrix in a file.
+    """Return the fit of the measured matrix in a file; ``basis`` as in ``fit_matrix``.
 
     Raises
     ------
@@ -46,7 +48,9 @@ def fit_file(
     # BLAS keeps to one thread: nested threading made a fit seven times slower
     with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
         try:
-            fit = fit_matrix(instrument, reference, options, mapper=pool.map, progress=progress)
+            fit = fit_matrix(
+                instrument, reference, options, basis=basis, mapper=pool.map, progress=progress
+            )
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")
             raise MatrixError(f"{recorded.where}: {text}") from error

@@ -18,6 +18,7 @@ from cacao_bridge.__main__ import arguments_parser
 from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import command_line, with_negative_numbers
+from pyrcal.offline.system_file import load_system
 from service.api import create_app
 from service.config import load_instrument, load_settings
 from service.tracking.alarms import ALARMS
@@ -160,11 +161,16 @@ def test_a_block_of_the_manual_is_one_that_the_shell_reads(text):
 
 @pytest.mark.parametrize("text", list(blocks("toml")))
 def test_a_file_of_the_manual_is_read(text, tmp_path):
-    """By whoever reads it for a user: an instrument, the bridge to cacao, the service."""
+    """By whoever reads it for a user: an instrument, a system, the bridge to cacao, the service."""
     path = tmp_path / "it.toml"
     path.write_text(text, encoding="utf-8")
     if text.startswith("[instrument]"):
         assert load_instrument(path).modes.n_modes > 100
+    elif text.startswith("[system]"):
+        for name in re.findall(r'"(\w+\.toml)"', text):
+            other = DOCS / "integrate" / "systems.md"
+            (tmp_path / name).write_text(next(blocks_of(other, "toml"))[0], encoding="utf-8")
+        assert len(load_system(path).pairs) > 1
     elif text.startswith("[wire]"):
         assert load_bridge(path)
     else:

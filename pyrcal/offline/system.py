@@ -1,0 +1,337 @@
+"""Several sensors and mirrors: what each pair sees when each of them lies where it does.
+
+A sensor, a star and a mirror make a pair. A point of the mirror's drawing goes to its place at the
+mirror's altitude, along the star's light to the pupil, and from there to the sensor's grid: three
+similarities one after the other. What a pair's own matrix tells is α, the registration beside the
+nominal one; what is wanted is where each sensor, mirror and star is.
+
+References
+----------
+Agapito, Plantet & Heritier 2024, Proc. SPIE 13097, 130975P (arXiv 2406.15336), section 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.model.guide_star import GuideStar
+from service.model.instrument import Instrument, Mirror, TabulatedModes
+from service.model.kinds import BasisKind, Stop
+from service.model.modes import Basis, ModalBasis, modal_basis
+from service.model.similarity import Similarity
+from service.model.surface import mirror_surface
+
+Array = NDArray[np.float64]
+
+ARCSEC_RAD = np.pi / 180.0 / 3600.0
+
+SHIFTS, ROTATION, MAGNIFICATION, STAR, HEIGHT = slice(0, 2), 2, 3, slice(4, 6), 6
+"""Places among the numbers of a sensor, and of a mirror, which has no star."""
+
+N_OF_SENSOR, N_OF_MIRROR = 7, 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlacedSensor:
+    """A sensor, where it lies nominally, and the star that it looks at."""
+
+    name: str
+    instrument: Instrument
+    """Its telescope and sensor."""
+
+    star: GuideStar
+    place: Similarity
+    """From the pupil to the sensor's grid, lengths in its subapertures."""
+
+    fixed: bool = False
+    """Whether it lies just there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlacedMirror:
+    """A mirror, and where it lies nominally."""
+
+    name: str
+    instrument: Instrument
+    """Its actuators and modes."""
+
+    altitude_m: float
+    """That it is conjugate to, along the line of sight from the pupil."""
+
+    place: Similarity
+    """From its drawing to the plane at its altitude, lengths in metres."""
+
+    fixed: bool = False
+    """Whether it lies just there."""
+
+
+class Pair(NamedTuple):
+    """A sensor with a mirror, by their numbers."""
+
+    sensor: int
+    mirror: int
+
+
+class Parameter(NamedTuple):
+    """One number that says where something is."""
+
+    owner: str
+    """Name of the sensor or mirror."""
+
+    name: str
+    """With its unit at the boundary."""
+
+    boundary: float
+    """Multiply the numeric value by this to have that unit."""
+
+    subap: float
+    """How much of it moves what a sensor sees by about one subaperture, at the edge of the pupil or
+    on the highest mirror."""
+
+    free: bool
+    """Whether it is to be found; else it is as the file says."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class System:
+    """Sensors and mirrors of one telescope, and what is not known of them."""
+
+    name: str
+    sensors: tuple[PlacedSensor, ...]
+    mirrors: tuple[PlacedMirror, ...]
+    stars_move: bool = False
+    """Whether directions of stars are to be found, too."""
+
+    heights_move: bool = False
+    """Whether heights of laser stars are."""
+
+    @cached_property
+    def pairs(self) -> tuple[Pair, ...]:
+        """Every sensor with every mirror."""
+        return tuple(Pair(i, j) for i in range(len(self.sensors)) for j in range(len(self.mirrors)))
+
+    def names(self, pair: Pair) -> tuple[str, str]:
+        """Return the names of a pair's sensor and mirror."""
+        return self.sensors[pair.sensor].name, self.mirrors[pair.mirror].name
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What says where everything is, in the order of ``nominal``."""
+        return tuple(self._parameters())
+
+    def _parameters(self) -> Iterator[Parameter]:
+        degrees = 180.0 / np.pi
+        highest_m = max(abs(mirror.altitude_m) for mirror in self.mirrors) or 1.0
+        for sensor in self.sensors:
+            free, star, laser = not sensor.fixed, sensor.star, sensor.star.height_m < inf
+            edge = 2.0 / sensor.instrument.wfs.pupil_diameter
+            parallax = sensor.instrument.subaperture_m / highest_m
+            higher = star.height_m**2 / highest_m * edge if laser else 1.0
+            yield Parameter(sensor.name, "shift_x_subap", 1.0, 1.0, free)
+            yield Parameter(sensor.name, "shift_y_subap", 1.0, 1.0, free)
+            yield Parameter(sensor.name, "rotation_deg", degrees, edge, free)
+            yield Parameter(sensor.name, "magnification", 1.0, edge, free)
+            yield Parameter(sensor.name, "star_x_arcsec", 1 / ARCSEC_RAD, parallax, self.stars_move)
+            yield Parameter(sensor.name, "star_y_arcsec", 1 / ARCSEC_RAD, parallax, self.stars_move)
+            found = self.heights_move and laser
+            yield Parameter(sensor.name, "star_height_m", 1.0, higher, found)
+        for mirror in self.mirrors:
+            edge = 2.0 / mirror.instrument.wfs.pupil_diameter
+            width_m, free = mirror.instrument.subaperture_m, not mirror.fixed
+            yield Parameter(mirror.name, "shift_x_m", 1.0, width_m, free)
+            yield Parameter(mirror.name, "shift_y_m", 1.0, width_m, free)
+            yield Parameter(mirror.name, "rotation_deg", degrees, edge, free)
+            yield Parameter(mirror.name, "magnification", 1.0, edge, free)
+
+    def of_sensor(self, number: int) -> slice:
+        """Return where a sensor's numbers stand."""
+        return slice(number * N_OF_SENSOR, (number + 1) * N_OF_SENSOR)
+
+    def of_mirror(self, number: int) -> slice:
+        """Return where a mirror's numbers stand."""
+        first = len(self.sensors) * N_OF_SENSOR
+        return slice(first + number * N_OF_MIRROR, first + (number + 1) * N_OF_MIRROR)
+
+    @cached_property
+    def nominal(self) -> Array:
+        """``(n_parameters,)`` as the file says, numeric units."""
+        of_sensors = [
+            [
+                *_numbers(s.place),
+                s.star.direction_rad.real,
+                s.star.direction_rad.imag,
+                s.star.height_m,
+            ]
+            for s in self.sensors
+        ]
+        return np.concatenate([*of_sensors, *(_numbers(m.place) for m in self.mirrors)])
+
+    def at(self, values: Array) -> System:
+        """Return the system that is nominally where these numbers say."""
+        sensors = tuple(
+            replace(
+                one, star=_star(values[self.of_sensor(k)]), place=_place(values[self.of_sensor(k)])
+            )
+            for k, one in enumerate(self.sensors)
+        )
+        mirrors = tuple(
+            replace(one, place=_place(values[self.of_mirror(k)]))
+            for k, one in enumerate(self.mirrors)
+        )
+        return replace(self, sensors=sensors, mirrors=mirrors)
+
+    def seen(self, pair: Pair, values: Array) -> Similarity:
+        """Return where a mirror's drawing lands on a sensor's grid, lengths in its subapertures."""
+        to_grid, along_light, to_altitude = self._steps(pair, values)
+        return to_grid.after(along_light).after(to_altitude)
+
+    def _steps(self, pair: Pair, values: Array) -> tuple[Similarity, Similarity, Similarity]:
+        of_sensor, of_mirror = (
+            values[self.of_sensor(pair.sensor)],
+            values[self.of_mirror(pair.mirror)],
+        )
+        width_m = self.sensors[pair.sensor].instrument.subaperture_m
+        along_light = _star(of_sensor).seen(self.mirrors[pair.mirror].altitude_m)
+        return _place(of_sensor), along_light.scaled(width_m), _place(of_mirror).scaled(width_m)
+
+    def drawn(self, pair: Pair) -> Similarity:
+        """Return the part of the nominal map that is in the drawing of the pair's instrument.
+
+        α is counted from there. All of it where actuators are known and the pupil stays where it
+        is; else nothing.
+        """
+        mirror = self.mirrors[pair.mirror].instrument.mirror
+        stop = self.sensors[pair.sensor].instrument.stop
+        if isinstance(mirror, Mirror) and stop is Stop.TELESCOPE:
+            return self.seen(pair, self.nominal)
+        return Similarity()
+
+    def instrument(self, pair: Pair) -> Instrument:
+        """Return the instrument that a pair is: its mirror drawn as this sensor sees it.
+
+        At ``Misregistration()`` D of it is that of the nominal system, or at ``alphas`` of the
+        nominal numbers where nothing is in the drawing.
+        """
+        sensor, mirror = self.sensors[pair.sensor], self.mirrors[pair.mirror]
+        about, own = sensor.instrument, mirror.instrument
+        unknown = (
+            *(key for key in about.unknown if key.startswith("wfs.")),
+            *(key for key in own.unknown if key.startswith("mirror.")),
+        )
+        return replace(
+            about,
+            name=f"{sensor.name}-{mirror.name}",
+            mirror=self._drawing(pair),
+            modes=own.modes,
+            unknown=unknown,
+            law=None,
+            remarks=(),
+        )
+
+    def basis(self, pair: Pair) -> Basis:
+        """Return the mirror's modes as this sensor sees them; strokes are the same for all."""
+        about = self.instrument(pair)
+        own = self._bases[pair.mirror]
+        if not isinstance(own, ModalBasis):
+            return modal_basis(about)
+        seen = mirror_surface(about.analytic_mirror, about.subaperture_m)
+        return replace(own.of_surface(seen), y_sign=about.mirror.y_sign)
+
+    @cached_property
+    def _bases(self) -> tuple[Basis, ...]:
+        return tuple(modal_basis(mirror.instrument) for mirror in self.mirrors)
+
+    def lit(self, pair: Pair) -> NDArray[np.intp] | None:
+        """Return the actuators of a mirror at an altitude that lie in the star's light.
+
+        None: its modes are not single actuators, or it lies at the pupil.
+        """
+        mirror, about = self.mirrors[pair.mirror], self.instrument(pair)
+        own = about.mirror
+        if mirror.altitude_m == 0.0 or not isinstance(own, Mirror):
+            return None
+        if own.mode_to_actuator is not None or own.basis is not BasisKind.ZONAL:
+            return None
+        radius_m = np.linalg.norm(own.positions_m, axis=1)
+        inside = radius_m <= about.diameter_m / 2
+        return np.flatnonzero(inside & (radius_m >= about.obscuration_ratio * about.diameter_m / 2))
+
+    def _drawing(self, pair: Pair) -> Mirror | TabulatedModes:
+        mirror, drawn = self.mirrors[pair.mirror].instrument.mirror, self.drawn(pair)
+        if drawn == Similarity() or not isinstance(mirror, Mirror):
+            return mirror
+        width_m = self.sensors[pair.sensor].instrument.subaperture_m
+        sided = mirror.positions_m * [1.0, mirror.y_sign]
+        return replace(
+            mirror,
+            positions_m=drawn.scaled(1.0 / width_m).points(sided),
+            pitch_m=mirror.pitch_m * abs(drawn.turn),
+            nominal_rotation_rad=0.0,
+            parity=1,
+        )
+
+    def alphas(self, values: Array) -> Array:
+        """Return α of every pair ``(n_pairs, 4)``, numeric units, when everything is so."""
+        found = [self.seen(p, values).after(self.drawn(p).inverse).alpha.vector for p in self.pairs]
+        return np.array(found)
+
+    def rates(self, values: Array) -> Array:
+        """Return how α of every pair changes with each number, ``(n_pairs, 4, n_parameters)``."""
+        found = np.zeros((len(self.pairs), 4, len(values)))
+        for rates, pair in zip(found, self.pairs, strict=True):
+            turned, shifted = self._pair_rates(pair, values)
+            drawn = self.drawn(pair)
+            turn = self.seen(pair, values).turn / drawn.turn
+            shifted = shifted - turn * turned * drawn.shift
+            rates[:] = [shifted.real, shifted.imag, turned.imag, abs(turn) * turned.real]
+        return found
+
+    def _pair_rates(self, pair: Pair, values: Array) -> tuple[NDArray[np.complex128], ...]:
+        """Return the change of the map's turn over itself, and of its shift, per parameter."""
+        turned, shifted = np.zeros((2, len(values)), dtype=np.complex128)
+        of_sensor, of_mirror = self.of_sensor(pair.sensor), self.of_mirror(pair.mirror)
+        to_grid, along_light, to_altitude = self._steps(pair, values)
+        width_m = self.sensors[pair.sensor].instrument.subaperture_m
+        altitude_m = self.mirrors[pair.mirror].altitude_m
+        height_m = values[of_sensor][HEIGHT]
+        # from metres at the altitude to the grid, and what a point of the pupil adds there
+        scale = to_grid.turn * along_light.turn / width_m
+        centre = to_grid.after(along_light).after(to_altitude).shift - to_grid.shift
+        narrower = -abs(along_light.turn) * altitude_m / height_m**2
+        size, own_size = values[of_sensor][MAGNIFICATION], values[of_mirror][MAGNIFICATION]
+        turned[of_sensor] = [0, 0, 1j, 1 / size, 0, 0, narrower]
+        shifted[of_sensor] = [
+            1,
+            1j,
+            1j * centre,
+            centre / size,
+            -scale * altitude_m,
+            -1j * scale * altitude_m,
+            centre * narrower,
+        ]
+        turned[of_mirror] = [0, 0, 1j, 1 / own_size]
+        shifted[of_mirror] = [scale, 1j * scale, 0, 0]
+        return turned, shifted
+
+
+def _numbers(place: Similarity) -> list[float]:
+    """Return shift, rotation and magnification of a place."""
+    return [place.shift.real, place.shift.imag, float(np.angle(place.turn)), abs(place.turn)]
+
+
+def _star(numbers: Array) -> GuideStar:
+    return GuideStar(direction_rad=complex(*numbers[STAR]), height_m=float(numbers[HEIGHT]))
+
+
+def _place(numbers: Array) -> Similarity:
+    return Similarity(
+        turn=numbers[MAGNIFICATION] * complex(np.exp(1j * numbers[ROTATION])),
+        shift=complex(*numbers[SHIFTS]),
+    )

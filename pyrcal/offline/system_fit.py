@@ -1,0 +1,303 @@
+"""Where each sensor, mirror and star is, from α of every pair.
+
+Weighted least squares: every pair counts by its own covariance. Some directions change nothing that
+any pair sees, or so little that it is less than a subaperture for all that was measured: along
+those, everything stays nearest to what the file says, and they are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from pyrcal.offline.system import HEIGHT, MAGNIFICATION, ROTATION, SHIFTS, STAR, System
+from service.model.misregistration import wrapped
+
+Array = NDArray[np.float64]
+
+UNSEEN_SUBAP = 1.0
+"""1 σ along a direction, where it moves the edge of the pupil most, beyond which it is not seen."""
+
+MAX_STEPS = 20
+SETTLED_SUBAP = 1e-7
+
+_ALONG = 0.9
+"""Share of a direction that lies among those not seen, from which it is one of them."""
+
+_NEW = 0.1
+"""Share of it beyond those named before, from which it is named, too."""
+
+_NAMED, _NOTABLE = 4, 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SystemFit:
+    """Where everything is."""
+
+    values: Array
+    """``(n_parameters,)`` numeric units."""
+
+    covariance: Array
+    """``(n_parameters, n_parameters)`` of what is seen; nothing along what is not."""
+
+    unseen_share: Array
+    """``(n_parameters,)`` share of each in directions that are not seen, 0..1: it is known only
+    beside the others there."""
+
+    unseen: tuple[str, ...]
+    """Those directions, in words."""
+
+    misfit: Array
+    """``(n_pairs, 4)`` α of each pair less what these values make of it; NaN: not used."""
+
+    pulls: Array
+    """``(n_pairs, 4)`` the same over 1 σ of α."""
+
+    chi2: float
+    n_free: int
+    """Numbers measured beyond those found: what χ² should be about."""
+
+    @property
+    def sigma(self) -> Array:
+        """``(n_parameters,)`` 1 σ."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def probability(self) -> float:
+        """Of a larger χ² if all is as the covariances say; 1 where nothing is measured twice."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.n_free)) if self.n_free else 1.0
+
+
+def fit_system(system: System, alphas: Array, covariances: Array) -> SystemFit:
+    """Return where everything is, from α of every pair.
+
+    Parameters
+    ----------
+    system
+        As the file says.
+    alphas
+        ``(n_pairs, 4)`` in the order of ``system.pairs``, numeric units; NaN: not measured.
+    covariances
+        ``(n_pairs, 4, 4)`` of them.
+    """
+    used = np.isfinite(alphas).all(axis=1)
+    roots = np.array([np.linalg.inv(np.linalg.cholesky(one)) for one in covariances[used]])
+    free = np.array([parameter.free for parameter in system.parameters])
+    unit = np.array([parameter.subap for parameter in system.parameters])
+    values = system.nominal.copy()
+    for _ in range(MAX_STEPS):
+        left = _left(system, alphas, values)
+        rates = np.einsum("pij,pjk->pik", roots, system.rates(values)[used])
+        seen = _Directions.of(rates.reshape(-1, len(values))[:, free] * unit[free])
+        moved = (values[free] - system.nominal[free]) / unit[free]
+        whitened = np.einsum("pij,pj->pi", roots, left[used]).ravel()
+        step = seen.best(whitened + seen.rates @ moved) - moved
+        values[free] += step * unit[free]
+        if np.max(np.abs(step), initial=0.0) < SETTLED_SUBAP:
+            break
+    left = _left(system, alphas, values)
+    whitened = np.einsum("pij,pj->pi", roots, left[used])
+    covariance = np.zeros((len(values), len(values)))
+    covariance[np.ix_(free, free)] = seen.covariance * np.outer(unit[free], unit[free])
+    share = np.zeros(len(values))
+    share[free] = np.linalg.norm(seen.unseen, axis=0)
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return SystemFit(
+        values=values,
+        covariance=covariance,
+        unseen_share=share,
+        unseen=tuple(_named(system, values, seen.unseen, free, unit)),
+        misfit=left,
+        pulls=left / sigma,
+        chi2=float(np.sum(whitened**2)),
+        n_free=whitened.size - seen.n_seen,
+    )
+
+
+def _left(system: System, alphas: Array, values: Array) -> Array:
+    """Return α measured less expected, rotations the short way round."""
+    left = alphas - system.alphas(values)
+    left[:, 2] = [wrapped(angle) for angle in left[:, 2]]
+    return left
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Directions:
+    """Singular directions of what is to be found, in subapertures at the edge."""
+
+    rates: Array
+    """``(n_measured, n_found)`` in σ per subaperture."""
+
+    left: Array
+    size: Array
+    seen: Array
+    """``(n_seen, n_found)``."""
+
+    unseen: Array
+    """``(n_unseen, n_found)`` orthonormal."""
+
+    @classmethod
+    def of(cls, rates: Array) -> _Directions:
+        left, size, along = np.linalg.svd(rates, full_matrices=True)
+        n_seen = int(np.sum(size > 1.0 / UNSEEN_SUBAP))
+        return cls(
+            rates=rates,
+            left=left[:, :n_seen],
+            size=size[:n_seen],
+            seen=along[:n_seen],
+            unseen=along[n_seen:],
+        )
+
+    @property
+    def n_seen(self) -> int:
+        return len(self.size)
+
+    def best(self, measured: Array) -> Array:
+        """Return the shortest vector that explains most."""
+        return np.asarray((measured @ self.left / self.size) @ self.seen)
+
+    @property
+    def covariance(self) -> Array:
+        scaled = self.seen / self.size[:, None]
+        return np.asarray(scaled.T @ scaled)
+
+
+def _named(
+    system: System, values: Array, unseen: Array, free: NDArray[np.bool_], unit: Array
+) -> Iterator[str]:
+    """Yield in words the directions that ``unseen`` spans."""
+    left = unseen
+    for words, directions in _known_directions(system, values):
+        found = False
+        for direction in directions:
+            moved = (direction / unit)[free]
+            size = float(np.linalg.norm(moved))
+            if size == 0.0 or np.linalg.norm(unseen @ moved) < _ALONG * size:
+                continue
+            moved = moved @ left.T @ left / size
+            if np.linalg.norm(moved) < _NEW:
+                continue
+            found = True
+            moved /= np.linalg.norm(moved)
+            # what is left is turned so that this direction is its first, which then goes
+            turned, _ = np.linalg.qr(np.column_stack([left @ moved, np.eye(len(left))]))
+            left = turned[:, 1:].T @ left
+        if found:
+            yield words
+    parameters = [parameter for parameter in system.parameters if parameter.free]
+    for direction in left:
+        largest = np.argsort(-np.abs(direction))[:_NAMED]
+        parts = [
+            f"{parameters[k].owner} {parameters[k].name} ({direction[k]:+.2f})"
+            for k in largest
+            if abs(direction[k]) > _NOTABLE
+        ]
+        yield f"together, in subapertures: {', '.join(parts)}"
+
+
+def _known_directions(system: System, values: Array) -> Iterator[tuple[str, list[Array]]]:
+    """Yield directions that some systems do not see, in words, and as changes of all numbers."""
+    yield from _of_each_star(system, values)
+    both = (1.0 + 0j, 1j)
+    everything = "sensors, mirrors and stars" if system.stars_move else "sensors and mirrors"
+    yield (
+        "the common shift of all sensors and mirrors: only where one lies on the other is seen",
+        [_common_shift(system, values, along) for along in both],
+    )
+    yield (
+        "the common direction of all stars: mirrors that are shifted in proportion to their "
+        "altitudes look alike",
+        [_common_direction(system, along) for along in both],
+    )
+    yield (
+        f"the common rotation of all {everything}",
+        [_common_turn(system, values, 1j)],
+    )
+    yield (
+        f"the common magnification of all {everything}",
+        [_common_turn(system, values, 1.0 + 0j)],
+    )
+
+
+def _of_each_star(system: System, values: Array) -> Iterator[tuple[str, list[Array]]]:
+    """Yield what one star's place shares with its own sensor, where mirrors lie at one altitude."""
+    altitude_m = float(np.mean([mirror.altitude_m for mirror in system.mirrors]))
+    for number, sensor in enumerate(system.sensors):
+        of_sensor = system.of_sensor(number)
+        own = values[of_sensor]
+        width_m = sensor.instrument.subaperture_m
+        turn = own[MAGNIFICATION] * np.exp(1j * own[ROTATION])
+        narrowed = 1.0 / (1.0 - altitude_m / own[HEIGHT])
+        aside = []
+        for along in (1.0 + 0j, 1j):
+            direction = np.zeros(len(values))
+            direction[of_sensor][STAR] = _xy(along)
+            direction[of_sensor][SHIFTS] = _xy(turn * narrowed * altitude_m / width_m * along)
+            aside.append(direction)
+        nothing = "no mirror lies above or below the pupil"
+        one = "they separate only with mirrors at several altitudes"
+        yield (
+            f"the star of {sensor.name}: {nothing}"
+            if altitude_m == 0.0
+            else f"the star's direction and the shift of {sensor.name}: {one}",
+            aside,
+        )
+        if own[HEIGHT] < inf:
+            higher = np.zeros(len(values))
+            higher[of_sensor][HEIGHT] = 1.0
+            higher[of_sensor][MAGNIFICATION] = (
+                own[MAGNIFICATION] * narrowed * altitude_m / own[HEIGHT] ** 2
+            )
+            yield (
+                f"the height of the star of {sensor.name}: {nothing}"
+                if altitude_m == 0.0
+                else f"the star's height and the magnification of {sensor.name}: {one}",
+                [higher],
+            )
+
+
+def _common_shift(system: System, values: Array, along: complex) -> Array:
+    """Return everything shifted over the pupil; a cone narrows what lies high."""
+    direction = np.zeros(len(values))
+    heights = values[: len(system.sensors) * 7].reshape(-1, 7)[:, HEIGHT]
+    for number, sensor in enumerate(system.sensors):
+        own = values[system.of_sensor(number)]
+        turn = own[MAGNIFICATION] * np.exp(1j * own[ROTATION])
+        shift = _xy(-turn * along / sensor.instrument.subaperture_m)
+        direction[system.of_sensor(number)][SHIFTS] = shift
+    for number, mirror in enumerate(system.mirrors):
+        narrowed = 1.0 - mirror.altitude_m * float(np.mean(1.0 / heights))
+        direction[system.of_mirror(number)][SHIFTS] = _xy(narrowed * along)
+    return direction
+
+
+def _common_direction(system: System, along: complex) -> Array:
+    direction = np.zeros(len(system.parameters))
+    for number in range(len(system.sensors)):
+        direction[system.of_sensor(number)][STAR] = _xy(along)
+    for number, mirror in enumerate(system.mirrors):
+        direction[system.of_mirror(number)][SHIFTS] = _xy(mirror.altitude_m * along)
+    return direction
+
+
+def _common_turn(system: System, values: Array, turn: complex) -> Array:
+    """Return everything turned (imaginary) or magnified (real) about the pupil's centre."""
+    direction = np.zeros(len(values))
+    for number in range(len(system.sensors)):
+        own, change = values[system.of_sensor(number)], direction[system.of_sensor(number)]
+        change[ROTATION], change[MAGNIFICATION] = -turn.imag, -turn.real * own[MAGNIFICATION]
+        change[STAR] = _xy(turn * complex(*own[STAR]))
+    for number in range(len(system.mirrors)):
+        own, change = values[system.of_mirror(number)], direction[system.of_mirror(number)]
+        change[ROTATION], change[MAGNIFICATION] = turn.imag, turn.real * own[MAGNIFICATION]
+        change[SHIFTS] = _xy(turn * complex(*own[SHIFTS]))
+    return direction
+
+
+def _xy(point: complex) -> tuple[float, float]:
+    return point.real, point.imag

@@ -1,0 +1,206 @@
+"""Where each sensor, mirror and star is, as JSON, as a table, as HDF5."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+
+from pyrcal.offline import report as fit_report
+from pyrcal.offline.report import FitReport
+from pyrcal.offline.system import System
+from pyrcal.offline.system_fit import SystemFit
+from service.errors import shown
+from service.files.container import put_array
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+
+UNLIKELY = 1e-4
+"""Probability of so large a χ², below which the pairs do not belong to one system."""
+
+PARTLY = 0.05
+"""Share in directions that are not seen, from which a number is marked."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SystemReport:
+    """A system, the fits of its pairs, and what follows of them."""
+
+    system: System
+    fits: tuple[FitReport, ...]
+    """In the order of ``system.pairs``."""
+
+    found: SystemFit | None
+    """Where everything is; None: no pair was accepted."""
+
+    @property
+    def refused(self) -> tuple[str, ...]:
+        """Pairs whose own fit was refused, with its verdict."""
+        return tuple(
+            f"{' x '.join(self.system.names(pair))}: {one.fit.verdict.removeprefix('refused: ')}"
+            for pair, one in zip(self.system.pairs, self.fits, strict=True)
+            if not one.fit.accepted
+        )
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every pair was, and all agree."""
+        return not self.refused and self.found is not None and self.found.probability >= UNLIKELY
+
+    @property
+    def verdict(self) -> str:
+        """One line."""
+        if self.refused or self.found is None:
+            more = f" (and {len(self.refused) - 1} more)" if len(self.refused) > 1 else ""
+            n_pairs = len(self.fits)
+            return f"refused: {len(self.refused)} of {n_pairs} pairs{more}: {self.refused[0]}"
+        agree = f"chi2 {self.found.chi2:.1f} where {self.found.n_free} is expected"
+        if not self.accepted:
+            return (
+                f"refused: the pairs disagree ({agree}), most {self._worst(self.found)}: an "
+                "altitude, a star or a nominal place is not as the file says, or a matrix is "
+                'another pair\'s; stars = "direction" finds directions of stars, too'
+            )
+        if not self.found.n_free:
+            return "accepted: no number is measured twice, so that nothing checks another"
+        return f"accepted: {len(self.fits)} pairs agree ({agree})"
+
+    def _worst(self, found: SystemFit) -> str:
+        number, column = np.unravel_index(np.nanargmax(np.abs(found.pulls)), found.pulls.shape)
+        names = " x ".join(self.system.names(self.system.pairs[number]))
+        off = found.misfit[number, column] * BOUNDARY_SCALE[column]
+        pull = found.pulls[number, column]
+        return f"{names}: {PARAMETERS[column]} by {off:+.3g}, {abs(pull):.1f} sigma"
+
+
+def document(report: SystemReport) -> dict[str, Any]:
+    """Return it as one JSON object, in boundary units.
+
+    ``sensors`` and ``mirrors`` have an object for each name, with ``value``, ``sigma``, ``nominal``
+    and ``unseen_share`` of each number that says where it is; ``sigma`` is None of what is as the
+    file says. ``pairs`` has what ``pyrcal fit --json`` prints.
+    """
+    system, found = report.system, report.found
+    pairs: dict[str, dict[str, Any]] = {sensor.name: {} for sensor in system.sensors}
+    for pair, one in zip(system.pairs, report.fits, strict=True):
+        sensor, mirror = system.names(pair)
+        pairs[sensor][mirror] = fit_report.document(one)
+    places: dict[str, dict[str, Any]] = {}
+    for row in _rows(report):
+        places.setdefault(row.owner, {})[row.name] = {
+            "value": row.value,
+            "sigma": row.sigma,
+            "nominal": row.nominal,
+            "unseen_share": row.unseen_share,
+        }
+    return {
+        "system": system.name,
+        "verdict": report.verdict,
+        "chi2": None if found is None else found.chi2,
+        "n_free": None if found is None else found.n_free,
+        "not_seen": [] if found is None else list(found.unseen),
+        "sensors": {one.name: places.get(one.name, {}) for one in system.sensors},
+        "mirrors": {one.name: places.get(one.name, {}) for one in system.mirrors},
+        "pairs": pairs,
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Row:
+    """One number, boundary units; None: infinite, or not to be found."""
+
+    owner: str
+    name: str
+    value: float | None
+    sigma: float | None
+    nominal: float | None
+    unseen_share: float
+
+
+def _rows(report: SystemReport) -> Iterator[_Row]:
+    found, system = report.found, report.system
+    if found is None:
+        return
+    for parameter, value, sigma, nominal, share in zip(
+        system.parameters,
+        found.values,
+        found.sigma,
+        system.nominal,
+        found.unseen_share,
+        strict=True,
+    ):
+        finite = bool(np.isfinite(nominal))
+        yield _Row(
+            owner=parameter.owner,
+            name=parameter.name,
+            value=float(value * parameter.boundary) if finite else None,
+            sigma=float(sigma * parameter.boundary) if parameter.free else None,
+            nominal=float(nominal * parameter.boundary) if finite else None,
+            unseen_share=round(float(share), 4),
+        )
+
+
+def table(report: SystemReport) -> str:
+    """Return the verdict, where everything is, and α of each pair, as text."""
+    lines = [report.verdict, "", *_place_lines(report)]
+    if report.found is not None:
+        lines += [f"not seen: {words}" for words in report.found.unseen]
+    lines += ["", *_pair_lines(report)]
+    for pair, one in zip(report.system.pairs, report.fits, strict=True):
+        names = " x ".join(report.system.names(pair))
+        lines += [f"note: {names}: {note}" for note in one.notes]
+    return "\n".join(shown(line) for line in lines)
+
+
+def _place_lines(report: SystemReport) -> Iterator[str]:
+    rows = list(_rows(report))
+    if not rows:
+        return
+    yield f"{'':28s}{'value':>12s}{'1 sigma':>12s}{'nominal':>12s}"
+    for row in rows:
+        if row.sigma is None:
+            continue
+        mark = "  only beside others: see not seen" if row.unseen_share > PARTLY else ""
+        numbers = "".join(
+            f"{number:12.6g}" if number is not None else f"{'':>12s}"
+            for number in (row.value, row.sigma, row.nominal)
+        )
+        yield f"{row.owner + ' ' + row.name:28s}{numbers}{mark}"
+
+
+def _pair_lines(report: SystemReport) -> Iterator[str]:
+    yield f"{'pair':28s}" + "".join(
+        f"{name:>12s}" for name in ("shift x", "shift y", "rotation", "magnif.", "residual %")
+    )
+    for pair, one in zip(report.system.pairs, report.fits, strict=True):
+        values = one.fit.alpha.vector * BOUNDARY_SCALE
+        numbers = "".join(f"{value:12.5f}" for value in values)
+        names = " x ".join(report.system.names(pair))
+        said = "" if one.fit.accepted else "  refused"
+        yield f"{names:28s}{numbers}{100.0 * one.fit.residual_fraction:12.2f}{said}"
+
+
+def fill_system(file: h5py.File, report: SystemReport) -> None:
+    """Write everything into an open, empty HDF5 file; pairs as ``pyrcal fit`` writes them.
+
+    Each pair is the group ``pairs/SENSOR/MIRROR``; the JSON document is the attribute ``document``.
+    """
+    for pair, one in zip(report.system.pairs, report.fits, strict=True):
+        sensor, mirror = report.system.names(pair)
+        fit_report.fill_fit(file.create_group(f"pairs/{sensor}/{mirror}"), one)
+    found, parameters = report.found, report.system.parameters
+    if found is not None:
+        boundary = np.array([parameter.boundary for parameter in parameters])
+        described = "of the numbers that `parameters` names, in the units of their names"
+        scale = np.outer(boundary, boundary)
+        put_array(file, "values", found.values * boundary, f"(n,) {described}")
+        put_array(file, "covariance", found.covariance * scale, f"(n, n) {described}; 0: not found")
+        put_array(file, "unseen_share", found.unseen_share, f"(n,) {described}, not seen, 0 to 1")
+        put_array(file, "pulls", found.pulls, "(n_pairs, 4) what is left of each pair over 1 sigma")
+        file["values"].attrs["parameters"] = [f"{one.owner}.{one.name}" for one in parameters]
+    file.attrs["system"], file.attrs["verdict"] = report.system.name, report.verdict
+    file.attrs["accepted"] = report.accepted
+    file.attrs["document"] = json.dumps(document(report), allow_nan=False)

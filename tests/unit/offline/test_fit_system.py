@@ -1,0 +1,144 @@
+"""``pyrcal fit-system``: files in, where everything is out."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from pyrcal.__main__ import main
+from tests.unit.offline import systems
+
+NOISE = 0.005
+"""Of the largest slope."""
+
+PYRAMID = """
+[wfs]
+kind = "pyramid"
+n_subapertures = 12
+pupil_separation_subap = 16
+wavelength_m = 750e-9
+modulation_lambda_over_d = 3.0
+"""
+
+SYSTEM = systems.SYSTEM.replace(
+    """
+[[sensors]]
+name = "lgs2"
+star_arcsec = [-12.0, 18.0]
+star_height_m = 90e3
+""",
+    "",
+).replace('name = "ngs"', 'name = "ngs"\ninstrument = "pyramid.toml"')
+SYSTEM = SYSTEM.replace('name = "dm1"', 'name = "dm1"\nfixed = true')
+"""A Shack-Hartmann on a laser star, a pyramid on a natural one."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two sensors of different kinds with two mirrors, and noisy matrices of all four pairs."""
+    folder = tmp_path_factory.mktemp("system")
+    systems.written(folder)
+    before, _wfs, after = (folder / "ground.toml").read_text().partition("[wfs]")
+    mirror = after.partition("[mirror]")[2]
+    (folder / "pyramid.toml").write_text(f"{before}{PYRAMID}[mirror]{mirror}")
+    system = systems.written(folder, SYSTEM)
+    rng = np.random.default_rng(1)
+    values = systems.moved(system, rng, 0.05)
+    matrices = [systems.matrix(system, pair, values) for pair in system.pairs]
+    noisy = [one + NOISE * one.max() * rng.normal(size=one.shape) for one in matrices]
+    systems.recorded(folder / "im.h5", noisy, system)
+    for pair, one in zip(system.pairs, noisy, strict=True):
+        np.save(folder / "im_{}_{}.npy".format(*system.names(pair)), one)
+    np.save(folder / "values.npy", values)
+    return folder
+
+
+def asked(folder, reference, *options):
+    return main(["fit-system", str(folder / "system.toml"), str(folder / reference), *options])
+
+
+@pytest.fixture(scope="module")
+def answered(folder):
+    written = ["--output", str(folder / "fit.h5"), "--plot", str(folder / "fit.png")]
+    return asked(folder, "im.h5", *written)
+
+
+def test_a_system_of_two_kinds_of_sensor_is_found(folder, answered):
+    """Every number within 4 σ of the truth, and σ of some use."""
+    assert answered == 0
+    values = np.load(folder / "values.npy")
+    with h5py.File(folder / "fit.h5") as file:
+        found = json.loads(file.attrs["document"])
+        names = list(file["values"].attrs["parameters"])
+        sigma = np.sqrt(np.diag(file["covariance"][()]))
+        assert file.attrs["accepted"]
+        assert "residual_map" in file["pairs/ngs/dm2"]
+    assert found["verdict"].startswith("accepted: 4 pairs agree")
+    assert found["not_seen"] == []
+    shift = found["mirrors"]["dm2"]["shift_x_m"]
+    true = values[-4]
+    assert abs(shift["value"] - true) < 4 * shift["sigma"]
+    turned = found["sensors"]["lgs1"]["rotation_deg"]
+    assert turned["nominal"] == pytest.approx(6.0)
+    assert abs(turned["value"] - np.rad2deg(values[2])) < 4 * turned["sigma"]
+    assert turned["sigma"] == pytest.approx(sigma[names.index("lgs1.rotation_deg")])
+    assert 0 < turned["sigma"] < 0.5
+    assert found["sensors"]["ngs"]["star_height_m"]["value"] is None
+
+
+def test_figures_are_drawn(folder, answered):
+    assert (folder / "fit.png").stat().st_size > 20_000
+
+
+def test_each_pair_may_have_a_file_of_its_own(folder, answered, capsys):
+    assert asked(folder, "im_{sensor}_{mirror}.npy", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    with h5py.File(folder / "fit.h5") as file:
+        one = json.loads(file.attrs["document"])
+    assert found["sensors"] == one["sensors"]
+
+
+def test_matrices_of_another_pair_are_refused(folder, capsys):
+    """The two mirrors exchanged: another number of actuators is seen."""
+    with h5py.File(folder / "im.h5") as file, h5py.File(folder / "mixed.h5", "w") as mixed:
+        for sensor in file:
+            for mirror, other in (("dm1", "dm2"), ("dm2", "dm1")):
+                name = f"{sensor}/{{}}/interaction_matrix"
+                mixed[name.format(mirror)] = file[name.format(other)][:, :60]
+    assert asked(folder, "mixed.h5") in {1, 2}
+    said = capsys.readouterr()
+    assert "refused: " in said.out or "lgs1 x dm" in said.err
+
+
+def refusal(folder, capsys, *arguments):
+    assert asked(folder, *arguments) == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line
+    return line
+
+
+def test_a_pair_that_is_missing_is_named(folder, capsys):
+    with h5py.File(folder / "im.h5") as file, h5py.File(folder / "few.h5", "w") as few:
+        file.copy("lgs1", few)
+    line = refusal(folder, capsys, "few.h5")
+    assert "ngs x dm1: found no dataset ngs/dm1/interaction_matrix in " in line
+    line = refusal(folder, capsys, "{sensor}_to_{mirror}.npy")
+    assert "lgs1 x dm1: found no file " in line
+    assert "expected the matrix of this pair" in line
+
+
+def test_one_matrix_for_all_pairs_is_refused(folder, capsys):
+    line = refusal(folder, capsys, "im.h5", "--dataset", "lgs1/{mirror}/interaction_matrix")
+    assert "found one matrix for several pairs, expected {sensor} and {mirror}" in line
+
+
+def test_a_matrix_of_another_shape_names_its_pair(folder, capsys):
+    with h5py.File(folder / "im.h5") as file, h5py.File(folder / "short.h5", "w") as short:
+        for sensor in file:
+            file.copy(sensor, short)
+        del short["lgs1/dm1/interaction_matrix"]
+        short["lgs1/dm1/interaction_matrix"] = file["lgs1/dm1/interaction_matrix"][:-2]
+    line = refusal(folder, capsys, "short.h5")
+    assert "lgs1 x dm1: " in line
+    assert "found shape (" in line

@@ -11,6 +11,7 @@ from service.errors import PyrcalError
 
 if TYPE_CHECKING:
     from pyrcal.offline.fit_file import fit_file
+    from pyrcal.offline.importers.oopao import from_oopao, to_oopao
     from pyrcal.offline.matrix import FitOptions
     from pyrcal.offline.report import read_fit
     from service.config.instrument import load_instrument
@@ -27,10 +28,12 @@ __all__ = [
     "RtcInteractionModel",
     "__version__",
     "fit_file",
+    "from_oopao",
     "load_instrument",
     "modal_basis",
     "read_fit",
     "reconstruct",
+    "to_oopao",
 ]
 
 _HOMES = {
@@ -39,10 +42,12 @@ _HOMES = {
     "Recipe": "service.control.reconstructor",
     "RtcInteractionModel": "service.model.interaction",
     "fit_file": "pyrcal.offline.fit_file",
+    "from_oopao": "pyrcal.offline.importers.oopao",
     "load_instrument": "service.config.instrument",
     "modal_basis": "service.model.modes",
     "read_fit": "pyrcal.offline.report",
     "reconstruct": "service.control.reconstructor",
+    "to_oopao": "pyrcal.offline.importers.oopao",
 }
 
 

@@ -39,6 +39,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     _describe_reconstruct(
         commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
     )
+    _describe_import(
+        commands.add_parser("import", help="make an instrument file and a matrix of another code's")
+    )
 
 
 _OF_A_FOLDER = (
@@ -227,6 +230,20 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),
     )
+
+
+def _describe_import(bring: argparse.ArgumentParser) -> None:
+    bring.set_defaults(module="pyrcal.offline.importers.program")
+    bring.description = (
+        "Write an instrument file and a measured matrix, as pyrcal fit takes them, from what other "
+        "codes have saved. What is not known is said as unknown; docs/integrate explains each."
+    )
+    bring.epilog = "Exit status: 0 written, 2 input that cannot be used."
+    folder = words("--output DIR", "folder of both files, made", type=Path, required=True)
+    saved = words("file FILE.npz", "np.savez of what docs/integrate/oopao.md lists", type=Path)
+    sources = bring.add_subparsers(dest="source", required=True)
+    for source, purpose, more in (("oopao", "from objects that were saved", (saved,)),):
+        add(sources.add_parser(source, help=purpose), *more, folder)
 
 
 def parse_arms(text: str) -> Arms:

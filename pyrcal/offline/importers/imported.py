@@ -1,0 +1,143 @@
+"""What an importer found, and the two files it becomes: an instrument file and its arrays."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.archive.store import write_whole
+from service.config.instrument import load_instrument
+from service.errors import MatrixError, StorageError
+from service.files.container import DATASET
+
+Array = NDArray[Any]
+Tables = Mapping[str, Mapping[str, Any]]
+
+INSTRUMENT_FILE, ARRAYS_FILE = "instrument.toml", "matrix.h5"
+
+UNKNOWN = "unknown"
+"""What an instrument file says of a number that nobody told."""
+
+
+class Dataset(str):
+    """The name of an array that a key of the instrument file refers to."""
+
+    __slots__ = ()
+
+
+class Saved(NamedTuple):
+    """Where an import lies."""
+
+    instrument: Path
+    matrix: Path
+    """Holds the interaction matrix and whatever the instrument file refers to."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Imported:
+    """An instrument and its measured matrix, as pyrcal's own files say it."""
+
+    source: str
+    """What it was made of, in words."""
+
+    tables: Tables
+    """Of the instrument file."""
+
+    arrays: Mapping[str, Array]
+    """By name; ``interaction_matrix`` is ``(n_slopes, n_modes)``, where there is one."""
+
+    notes: tuple[str, ...] = ()
+    """What was converted, assumed or is unknown, one sentence each."""
+
+    def save(self, folder: str | Path) -> Saved:
+        """Write both files into a folder, and read the instrument file once as a check.
+
+        Raises
+        ------
+        ConfigurationError
+            If the instrument file does not describe an instrument.
+        StorageError
+            If the disk refuses.
+        """
+        place = Path(folder)
+        saved = Saved(place / INSTRUMENT_FILE, place / ARRAYS_FILE)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            write_whole(saved.matrix, self._fill)
+            saved.instrument.write_text(self.instrument_text(), encoding="utf-8")
+        except OSError as error:
+            raise StorageError(f"{place}: cannot be written: {error}") from error
+        load_instrument(saved.instrument)
+        return saved
+
+    def instrument_text(self) -> str:
+        """Return the instrument file, its notes first."""
+        lines = [f"# Imported from {self.source}.", *(f"# {note}" for note in self.notes)]
+        for name, table in self.tables.items():
+            lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
+        return "\n".join(lines) + "\n"
+
+    def _fill(self, file: h5py.File) -> None:
+        file.attrs["source"] = self.source
+        for name, values in self.arrays.items():
+            file[name] = values
+
+
+def _toml(value: object) -> str:
+    """Return a value as TOML has it."""
+    if isinstance(value, Dataset):
+        return json.dumps(f"{ARRAYS_FILE}:/{value}")
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
+    if isinstance(value, bool | str):
+        return json.dumps(value, ensure_ascii=False)
+    return repr(float(value)) if isinstance(value, float | np.floating) else str(value)
+
+
+def oriented(
+    values: Array, rows: int, columns: int | None, what: str, of: str
+) -> tuple[Array, tuple[str, ...]]:
+    """Return a matrix as ``(rows, columns)``, and a note where it was listed the other way.
+
+    Parameters
+    ----------
+    values
+        As it was found.
+    rows, columns
+        What it must have; ``columns`` None: any number.
+    what
+        Its name, for messages.
+    of
+        Its shape in words, like ``(n_slopes, n_modes)``.
+
+    Raises
+    ------
+    MatrixError
+        If it has neither shape, or holds a number that is not finite.
+    """
+    found = np.asarray(values)
+    if found.ndim != 2 or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+        raise MatrixError(
+            f"{what}: found shape {found.shape} of {found.dtype}, expected finite numbers {of}"
+        )
+    n_rows, n_columns = found.shape
+    if n_rows == rows and columns in {None, n_columns}:
+        square = n_rows == n_columns
+        unsure = f"{what} is square, {n_rows} by {n_rows}: taken as {of}"
+        return found, (unsure,) if square else ()
+    if n_columns == rows and columns in {None, n_rows}:
+        return found.T, (f"{what} was listed the other way round: turned to {of}",)
+    wanted = f"({rows}, {'any' if columns is None else columns})"
+    raise MatrixError(f"{what}: found shape {found.shape}, expected {of} = {wanted}")
+
+
+matrix_of = partial(oriented, what=DATASET, of="(n_slopes, n_modes)")
+"""Returns the interaction matrix of so many slopes and modes."""

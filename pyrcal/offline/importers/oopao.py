@@ -1,0 +1,398 @@
+"""From OOPAO's objects: telescope, deformable mirror, wavefront sensor, M2C, calibration.
+
+Nothing of OOPAO is imported: its objects are known by their attributes, so what was saved of them
+in an ``.npz`` under the same names will do. How OOPAO draws things was read from version 1.0.0 and
+is tested with it:
+
+- Its mirror and its modulation lie on a pupil of n points whose first and last are one diameter
+  apart, while a pupil of n samples is n steps wide: lengths times (n - 1) / n, modulation times
+  n / (n - 1).
+- Its ``MisRegistration`` scales, then turns, then moves the mirror by minus the shift.
+- Its mirrors transmit: strokes are OPD, and there is no double pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.importers.imported import Array, Dataset, Imported, matrix_of, oriented
+from service.errors import ConfigurationError
+from service.model.misregistration import Misregistration, rotation
+
+PYRAMID, LENSLETS = "pyramid", "shackHartmann"
+
+SAVED = {
+    "tel": ("D", "resolution", "pupil", "pupilReflectivity"),
+    "ngs": ("wavelength",),
+    "dm": (
+        *("modes", "altitude", "initial_coordinates", "nActAlongDiameter", "mechCoupling"),
+        *("sign", "flip_", "flip_lr"),
+    ),
+    "dm.misReg": (
+        *("rotationAngle", "shiftX", "shiftY", "anamorphosisAngle"),
+        *("radialScaling", "tangentialScaling"),
+    ),
+    "wfs": (
+        *("tag", "nSubap", "modulation", "n_pix_separation", "binning", "postProcessing"),
+        *("validI4Q", "valid_subapertures", "pixel_scale", "n_pix_subap", "threshold_cog"),
+    ),
+}
+"""Attributes that are looked at, of each object; what an object lacks does not concern it."""
+
+_OPTIONAL = {"pupilReflectivity", "altitude", "sign", "flip_", "flip_lr"}
+
+_OF_SENSOR = {
+    **dict.fromkeys(
+        ("modulation", "n_pix_separation", "binning", "postProcessing", "validI4Q"), (PYRAMID,)
+    ),
+    **dict.fromkeys(
+        ("valid_subapertures", "pixel_scale", "n_pix_subap", "threshold_cog"), (LENSLETS,)
+    ),
+}
+"""Attributes of ``wfs`` that only one kind of sensor has."""
+
+_SAME_SHAPE = 1e-3
+"""Largest deviation of an influence function from the Gaussian that is told, of its height."""
+
+_SAMPLED_ACTUATORS = 24
+"""Influence functions that are held against it."""
+
+
+def from_oopao(
+    tel: Any,  # noqa: ANN401 - OOPAO's own classes, known by their attributes
+    dm: Any,  # noqa: ANN401
+    wfs: Any,  # noqa: ANN401
+    calib: Any = None,  # noqa: ANN401
+    M2C: Array | None = None,  # noqa: N803 - OOPAO's own name
+    ngs: Any = None,  # noqa: ANN401
+) -> Imported:
+    """Return OOPAO's telescope, mirror, sensor and calibration as pyrcal's instrument and matrix.
+
+    Parameters
+    ----------
+    tel, dm, wfs
+        ``Telescope``, ``DeformableMirror``, and ``Pyramid`` or ``ShackHartmann``.
+    calib
+        ``CalibrationVault`` of ``InteractionMatrix``, or its ``D``; None: instrument alone.
+    M2C
+        Modes to commands, ``(n_actuators, n_modes)``; None: ``calib`` is zonal.
+    ngs
+        ``Source`` that the sensor looks at; None: the telescope's.
+
+    Raises
+    ------
+    ConfigurationError
+        If the objects are not those, or do what pyrcal has no model of.
+    MatrixError
+        If ``calib`` or ``M2C`` does not belong to them.
+    """
+    notes: list[str] = []
+    if getattr(dm, "altitude", None) is not None:
+        raise ConfigurationError(
+            f"dm.altitude: found {dm.altitude} m, expected None: a mirror in the pupil"
+        )
+    wavelength_m = _wavelength_m(tel, wfs, ngs)
+    sensor, valid, slopes = _sensor(tel, wfs, notes)
+    mirror, arrays = _mirror(tel, dm, notes)
+    if "positions" in arrays:
+        notes += _where_it_lies(dm.misReg, tel, len(valid))
+    n_actuators = np.shape(dm.modes)[1]
+    if M2C is None:
+        mirror["basis"] = "zonal"
+        n_modes = n_actuators
+    else:
+        strokes, turned = oriented(_numpy(M2C), n_actuators, None, "M2C", "(n_actuators, n_modes)")
+        notes += turned
+        n_modes = strokes.shape[1]
+        mirror["mode_to_actuator"] = Dataset("mode_to_actuator")
+        arrays["mode_to_actuator"] = strokes
+    if calib is not None:
+        matrix, turned = matrix_of(_numpy(getattr(calib, "D", calib)), 2 * valid.sum(), n_modes)
+        notes += turned
+        arrays["interaction_matrix"] = matrix
+    arrays |= {"valid_subapertures": valid.astype(np.uint8), "pupil": _pupil(tel)}
+    return Imported(
+        source="OOPAO",
+        tables={
+            "instrument": {
+                "name": "oopao",
+                "diameter_m": float(tel.D),
+                "pupil": Dataset("pupil"),
+                "stop": "telescope",
+                "double_pass": False,
+            },
+            "wfs": {
+                **sensor,
+                "wavelength_m": wavelength_m,
+                "valid_subapertures": Dataset("valid_subapertures"),
+            },
+            "mirror": mirror,
+            "slopes": slopes,
+        },
+        arrays=arrays,
+        notes=tuple(notes),
+    )
+
+
+def _numpy(values: Any) -> Array:  # noqa: ANN401 - of NumPy or CuPy
+    """Return an array of this machine's memory."""
+    return np.asarray(values.get() if hasattr(values, "get") else values)
+
+
+def _wavelength_m(tel: Any, wfs: Any, ngs: Any) -> float:  # noqa: ANN401
+    source = ngs or getattr(wfs, "src", None) or getattr(tel, "src", None)
+    if source is None or not hasattr(source, "wavelength"):
+        raise ConfigurationError(
+            "ngs: found no source with a wavelength, expected the one that the sensor looks at"
+        )
+    return float(source.wavelength)
+
+
+def _pupil(tel: Any) -> NDArray[np.float32]:  # noqa: ANN401
+    """Return the share of light of every point: OOPAO's reflectivity is of the intensity."""
+    reflectivity = _numpy(getattr(tel, "pupilReflectivity", 1.0))
+    return np.asarray(_numpy(tel.pupil) * np.sqrt(reflectivity), dtype=np.float32)
+
+
+def _steps(tel: Any) -> float:  # noqa: ANN401
+    """Return a length of a pupil that is n samples wide over one of OOPAO's."""
+    return (int(tel.resolution) - 1) / int(tel.resolution)
+
+
+# --- the sensor
+
+
+def _sensor(
+    tel: Any,  # noqa: ANN401
+    wfs: Any,  # noqa: ANN401
+    notes: list[str],
+) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
+    """Return ``[wfs]``, its valid subapertures, and ``[slopes]``."""
+    kind = getattr(wfs, "tag", type(wfs).__name__)
+    if kind == PYRAMID:
+        return _pyramid(tel, wfs, notes)
+    if kind == LENSLETS:
+        return _lenslets(wfs, notes)
+    raise ConfigurationError(f"wfs.tag: found {kind!r}, expected {PYRAMID!r} or {LENSLETS!r}")
+
+
+def _pyramid(
+    tel: Any,  # noqa: ANN401
+    wfs: Any,  # noqa: ANN401
+    notes: list[str],
+) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
+    if not wfs.postProcessing.startswith("slopesMaps"):
+        raise ConfigurationError(
+            f"wfs.postProcessing: found {wfs.postProcessing!r}, expected 'slopesMaps' or another "
+            "one that makes slopes; or give its frames: docs/integrate/fitting.md"
+        )
+    if wfs.postProcessing != "slopesMaps":
+        notes.append(
+            f"wfs.postProcessing = {wfs.postProcessing!r} normalises by a constant: gains of all "
+            "modes differ from 1 alike"
+        )
+    if getattr(wfs, "user_modulation_path", None) is not None:
+        notes.append("wfs.user_modulation_path is taken as a circle of the radius wfs.modulation")
+    if getattr(wfs, "rooftop", None) or getattr(wfs, "theta_rotation", 0):
+        notes.append("a rooftop, and faces that are turned, are not in pyrcal's model")
+    valid, binning = _numpy(wfs.validI4Q).astype(bool), int(wfs.binning)
+    sensor = {
+        "kind": "pyramid",
+        "n_subapertures": len(valid),
+        "pupil_separation_subap": (int(wfs.nSubap) + float(wfs.n_pix_separation)) / binning,
+        "modulation_lambda_over_d": float(wfs.modulation) / _steps(tel),
+    }
+    return sensor, valid, {"order": "xy", "orientation": "auto", "normalisation": "global"}
+
+
+def _lenslets(
+    wfs: Any,  # noqa: ANN401
+    notes: list[str],
+) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
+    if getattr(wfs, "is_geometric", False):
+        notes.append("wfs.is_geometric: mean gradients are fitted with a model of spots")
+    threshold = float(wfs.threshold_cog)
+    centroid: dict[str, Any] = {"centroid": "cog"}
+    if threshold > 0.0:
+        centroid = {"centroid": "threshold", "threshold": threshold, "partly_lit": "leave out"}
+    notes.append("slopes of OOPAO's lenslets are in a unit of their own: one gain of all modes")
+    sensor = {
+        "kind": "shack-hartmann",
+        "n_subapertures": int(wfs.nSubap),
+        "pixels_per_subaperture": int(wfs.n_pix_subap),
+        "pixel_scale_arcsec": float(wfs.pixel_scale),
+        **centroid,
+    }
+    valid = _numpy(wfs.valid_subapertures).astype(bool)
+    return sensor, valid, {"order": "xy", "orientation": "auto"}
+
+
+# --- the mirror
+
+
+def _mirror(
+    tel: Any,  # noqa: ANN401
+    dm: Any,  # noqa: ANN401
+    notes: list[str],
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return ``[mirror]`` and its arrays: drawn where it is OOPAO's Gaussian one, else a cube."""
+    side = int(tel.resolution)
+    functions = _numpy(dm.modes)
+    if functions.ndim != 2 or len(functions) != side**2:
+        raise ConfigurationError(
+            f"dm.modes: found shape {functions.shape}, expected (tel.resolution ** 2, n_actuators) "
+            f"= ({side**2}, n)"
+        )
+    if _is_gaussian(dm, functions, float(tel.D)):
+        return _gaussian(tel, dm)
+    notes.append(
+        "dm.modes are not the Gaussian functions of dm.coordinates: taken as a cube, so α counts "
+        "from where this mirror lies, and beyond the pupil its surface is unknown"
+    )
+    cube = np.ascontiguousarray(functions.T.reshape(-1, side, side), dtype=np.float32)
+    table = {
+        "influence_functions": Dataset("influence_functions"),
+        "modes_pitch_m": float(tel.D) / side,
+    }
+    return table, {"influence_functions": cube}
+
+
+def _gaussian(tel: Any, dm: Any) -> tuple[dict[str, Any], dict[str, Array]]:  # noqa: ANN401
+    """Return ``[mirror]`` of OOPAO's own Gaussian mirror where it lies without its misReg."""
+    places = _numpy(dm.initial_coordinates).astype(float) * _steps(tel) * _mirrored(dm)
+    table = {
+        "layout": "positions",
+        "positions": Dataset("positions"),
+        "pitch_m": float(tel.D) / float(dm.nActAlongDiameter) * _steps(tel),
+        "influence": "gaussian",
+        "coupling": float(dm.mechCoupling),
+    }
+    return table, {"positions": places}
+
+
+def _mirrored(dm: Any) -> NDArray[np.float64]:  # noqa: ANN401
+    """Return the sign of x and y that OOPAO's flips of the drawn functions give."""
+    x, y = (-1.0, -1.0) if getattr(dm, "flip_", False) else (1.0, 1.0)
+    return np.array([-x if getattr(dm, "flip_lr", False) else x, y])
+
+
+def _is_gaussian(dm: Any, functions: Array, diameter_m: float) -> bool:  # noqa: ANN401
+    """Return whether the influence functions are the Gaussians that its attributes tell."""
+    places = getattr(dm, "initial_coordinates", None)
+    if places is None or len(places) != functions.shape[1] or getattr(dm, "sign", 1) != 1:
+        return False
+    some = np.unique(np.linspace(0, len(places) - 1, _SAMPLED_ACTUATORS).astype(int))
+    drawn = _drawn(dm, _numpy(places)[some].astype(float), len(functions), diameter_m)
+    return bool(np.abs(drawn - functions[:, some].T).max() <= _SAME_SHAPE)
+
+
+def _drawn(dm: Any, places_m: Array, n_points: int, diameter_m: float) -> Array:  # noqa: ANN401
+    """Return OOPAO's Gaussians ``(n, n_points)`` of actuators that its misReg moves."""
+    moved = dm.misReg
+    linear = _linear(moved)
+    along = np.linspace(-0.5, 0.5, math.isqrt(n_points)) * diameter_m
+    points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2) * _mirrored(dm)
+    centres = places_m @ linear.T - [float(moved.shiftX), float(moved.shiftY)]
+    # its Gaussian is as wide as the scaled pitch along the axes of the anamorphosis, unturned
+    angle = np.deg2rad(float(moved.anamorphosisAngle))
+    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    scales = 1.0 + np.array([float(moved.radialScaling), float(moved.tangentialScaling)])
+    pitch = diameter_m / float(dm.nActAlongDiameter) * scales
+    apart = (points - centres[:, None]) @ axes / pitch
+    return np.asarray(float(dm.mechCoupling) ** np.square(apart).sum(axis=-1))
+
+
+# --- its misregistration
+
+
+def _linear(moved: Any) -> NDArray[np.float64]:  # noqa: ANN401
+    """Return what a ``MisRegistration`` does to coordinates, ``(2, 2)``, before its shift."""
+    axes = rotation(np.deg2rad(float(moved.anamorphosisAngle)))
+    radial, tangential = 1.0 + float(moved.radialScaling), 1.0 + float(moved.tangentialScaling)
+    # its angle is counted the other way than its rotation
+    stretch = axes.T @ np.diag([radial, tangential]) @ axes
+    return np.asarray(rotation(np.deg2rad(float(moved.rotationAngle))) @ stretch)
+
+
+def _where_it_lies(moved: Any, tel: Any, n_subapertures: int) -> tuple[str, ...]:  # noqa: ANN401
+    """Return the registration that a mirror has been given, as a note; nothing where none."""
+    linear = _linear(moved)
+    if np.allclose(linear, np.eye(2)) and not moved.shiftX and not moved.shiftY:
+        return ()
+    counts = "α counts from where OOPAO's mirror lies without its misReg"
+    if not np.isclose(moved.radialScaling, moved.tangentialScaling):
+        return (f"{counts}, which also stretches it",)
+    return (f"{counts}, which is α = {registration_of(moved, tel, n_subapertures)}",)
+
+
+def registration_of(moved: Any, tel: Any, n_subapertures: int) -> Misregistration:  # noqa: ANN401
+    """Return the registration that OOPAO's ``MisRegistration`` is; a stretch is left out."""
+    linear, per_subaperture = _linear(moved), _steps(tel) * n_subapertures / float(tel.D)
+    return Misregistration(
+        shift_x_subap=-float(moved.shiftX) * per_subaperture,
+        shift_y_subap=-float(moved.shiftY) * per_subaperture,
+        rotation_rad=float(np.arctan2(linear[1, 0] - linear[0, 1], np.trace(linear))),
+        magnification=float(np.sqrt(np.linalg.det(linear))),
+    )
+
+
+def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  # noqa: ANN401
+    """Return a registration as OOPAO's ``MisRegistration`` takes it: metres, degrees, fractions."""
+    n_subapertures = int(wfs.nSubap) / int(getattr(wfs, "binning", 1))
+    subaperture_m = float(tel.D) / n_subapertures / _steps(tel)
+    return {
+        "rotationAngle": float(np.rad2deg(alpha.rotation_rad)),
+        "shiftX": -alpha.shift_x_subap * subaperture_m,
+        "shiftY": -alpha.shift_y_subap * subaperture_m,
+        "anamorphosisAngle": 0.0,
+        "tangentialScaling": alpha.magnification - 1.0,
+        "radialScaling": alpha.magnification - 1.0,
+    }
+
+
+# --- what was saved of its objects
+
+
+def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
+    """Return what ``np.savez`` kept of OOPAO's objects, by names like ``tel.D``, ``dm.modes``.
+
+    ``calib.D`` and ``M2C`` are taken where they are.
+
+    Raises
+    ------
+    ConfigurationError, MatrixError
+        If something is missing, or is not what it is called.
+    """
+    objects = {name: SimpleNamespace() for name in SAVED}
+    for name, values in arrays.items():
+        owner, _, attribute = name.rpartition(".")
+        if owner in objects:
+            setattr(objects[owner], attribute, values.item() if values.ndim == 0 else values)
+    missing = [f"{owner}.{name}" for owner, name in _missing(objects)]
+    if missing:
+        raise ConfigurationError(f"{where}: found no {', '.join(missing)}; expected it beside them")
+    objects["dm"].misReg = objects["dm.misReg"]
+    return from_oopao(
+        objects["tel"],
+        objects["dm"],
+        objects["wfs"],
+        arrays.get("calib.D"),
+        arrays.get("M2C"),
+        objects["ngs"],
+    )
+
+
+def _missing(objects: Mapping[str, SimpleNamespace]) -> Iterator[tuple[str, str]]:
+    """Yield what every import needs of each object and was not saved."""
+    kind = getattr(objects["wfs"], "tag", PYRAMID)
+    for owner, names in SAVED.items():
+        for name in names:
+            needed = name not in _OPTIONAL and kind in _OF_SENSOR.get(name, (kind,))
+            if needed and not hasattr(objects[owner], name):
+                yield owner, name

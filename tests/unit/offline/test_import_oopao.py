@@ -1,0 +1,147 @@
+"""OOPAO's own objects, saved by OOPAO 1.0.0, become an instrument file, modes and a matrix.
+
+``tests/data/imported`` holds a pyramid and a Shack-Hartmann of 8 subapertures, whose mirror OOPAO
+has moved by 0.2 of its subapertures and turned by 2 degrees: saved as docs/integrate/oopao.md says.
+"""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import pyrcal
+from pyrcal.__main__ import main
+from pyrcal.offline.importers.imported import Imported, oriented
+from pyrcal.offline.importers.oopao import SAVED, from_saved, registration_of, to_oopao
+from pyrcal.offline.importers.saved import read_npz
+from service.errors import ConfigurationError, MatrixError
+from service.model.misregistration import Misregistration
+from tests.unit.test_house import ROOT
+
+DATA = ROOT / "tests" / "data" / "imported"
+TRUE = np.array([-0.2 * 31 / 32, 0.0, np.deg2rad(2.0), 1.0])
+"""OOPAO's pupil of 32 points has its mirror on 31 steps."""
+
+
+@pytest.fixture(scope="module")
+def saved():
+    return read_npz(DATA / "oopao-pyramid.npz")
+
+
+def imported_of(saved, **other):
+    return from_saved({**saved, **{name.replace("__", "."): v for name, v in other.items()}}, "it")
+
+
+@pytest.mark.parametrize(("kind", "gain"), [("pyramid", 1.0), ("lenslets", 1.24)])
+def test_what_oopao_saved_is_imported_and_fitted(kind, gain, tmp_path, capsys):
+    folder = tmp_path / "bench"
+    assert main(["import", "oopao", str(DATA / f"oopao-{kind}.npz"), "--output", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "α = (-0.19, -0.00 subap, +2.00 deg, 1.0000)" in said
+    assert f"next: pyrcal fit {folder / 'instrument.toml'} {folder / 'matrix.h5'}" in said
+    instrument = pyrcal.load_instrument(folder / "instrument.toml")
+    fit = pyrcal.fit_file(instrument, folder / "matrix.h5", pyrcal.FitOptions()).fit
+    assert fit.accepted, fit.verdict
+    assert np.median(fit.gains) == pytest.approx(gain, abs=0.01)
+    assert np.all(np.abs(fit.alpha.vector - TRUE) < 3 * fit.sigma)
+    assert np.all(fit.sigma < [0.002, 0.002, np.deg2rad(0.02), 0.001])
+
+
+def test_the_notes_stand_in_the_instrument_file(saved):
+    assert "# α counts from where OOPAO's mirror lies" in imported_of(saved).instrument_text()
+
+
+def test_a_zonal_calibration_has_the_actuators_for_modes(saved):
+    zonal = {name: values for name, values in saved.items() if name != "M2C"}
+    n_actuators = saved["dm.modes"].shape[1]
+    found = imported_of(zonal, calib__D=np.ones((len(saved["calib.D"]), n_actuators)))
+    assert found.tables["mirror"]["basis"] == "zonal"
+
+
+def test_matrices_that_are_listed_the_other_way_round_are_turned_and_it_is_said(saved):
+    found = imported_of(saved, calib__D=saved["calib.D"].T, M2C=saved["M2C"].T)
+    np.testing.assert_array_equal(found.arrays["interaction_matrix"], saved["calib.D"])
+    np.testing.assert_array_equal(found.arrays["mode_to_actuator"], saved["M2C"])
+    assert sum("the other way round" in note for note in found.notes) == 2
+
+
+def test_a_mirror_that_is_not_gaussian_becomes_a_cube(saved, tmp_path):
+    found = imported_of(saved, dm__modes=saved["dm.modes"] ** 2)
+    assert any("taken as a cube" in note for note in found.notes)
+    side = int(saved["tel.resolution"])
+    assert found.arrays["influence_functions"].shape[1:] == (side, side)
+    instrument = pyrcal.load_instrument(found.save(tmp_path / "cube").instrument)
+    assert instrument.modes.n_modes == saved["M2C"].shape[1]
+
+
+def test_a_mirror_that_oopao_drew_flipped_is_drawn_flipped(saved):
+    side = int(saved["tel.resolution"])
+    cube = saved["dm.modes"].reshape(side, side, -1)[:, ::-1].reshape(side**2, -1)
+    found = imported_of(saved, dm__modes=cube, dm__flip_lr=np.array(True))
+    np.testing.assert_allclose(
+        found.arrays["positions"], imported_of(saved).arrays["positions"] * [-1, 1]
+    )
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ({"calib__D": np.ones((7, 30))}, "found shape (7, 30), expected (n_slopes, n_modes)"),
+        ({"M2C": np.ones((7, 30))}, "M2C: found shape (7, 30), expected (n_actuators, n_modes)"),
+        ({"calib__D": np.full((104, 30), np.nan)}, "expected finite numbers"),
+        ({"wfs__postProcessing": np.array("fullFrame")}, "expected 'slopesMaps'"),
+        ({"wfs__tag": np.array("bioEdge")}, "found 'bioEdge', expected 'pyramid'"),
+        ({"dm__altitude": np.array(8e3)}, "expected None: a mirror in the pupil"),
+        ({"dm__modes": np.ones((7, 68))}, "expected (tel.resolution ** 2, n_actuators)"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused_with_its_name(saved, other, says):
+    with pytest.raises((ConfigurationError, MatrixError), match=re.escape(says)):
+        imported_of(saved, **other)
+
+
+def test_what_was_not_saved_is_named(saved):
+    left_out = {name: v for name, v in saved.items() if name not in {"tel.D", "wfs.modulation"}}
+    with pytest.raises(ConfigurationError, match=r"it: found no tel\.D, wfs\.modulation"):
+        from_saved(left_out, "it")
+
+
+def test_the_page_saves_what_is_looked_at():
+    page = (ROOT / "docs" / "integrate" / "oopao.md").read_text("utf-8")
+    (names,) = re.findall(r"^names = (\{.*?^\})", page, re.M | re.S)
+    told = {owner: set(of_it.split()) for owner, of_it in eval(names).items()}
+    assert told == {owner: set(of_it) for owner, of_it in SAVED.items()}
+
+
+@pytest.mark.parametrize("size", [0.0, 0.02])
+def test_a_registration_there_and_back(size):
+    tel, wfs = SimpleNamespace(D=8.0, resolution=80), SimpleNamespace(nSubap=20)
+    alpha = Misregistration(
+        shift_x_subap=0.3, shift_y_subap=-0.1, rotation_rad=0.02, magnification=1.0 + size
+    )
+    moved = SimpleNamespace(**to_oopao(alpha, tel, wfs))
+    assert moved.shiftX < 0.0 < moved.shiftY
+    np.testing.assert_allclose(registration_of(moved, tel, 20).vector, alpha.vector)
+
+
+def test_a_square_matrix_is_taken_as_it_is_and_it_is_said():
+    values, (note,) = oriented(np.arange(9.0).reshape(3, 3), 3, 3, "M2C", "(a, b)")
+    assert values[0, 1] == 1.0
+    assert "M2C is square" in note
+
+
+def test_python_objects_and_what_is_no_npz_are_refused(tmp_path):
+    objects, text = tmp_path / "objects.npz", tmp_path / "text.npz"
+    np.savez(objects, thing=np.array([{}], dtype=object))
+    text.write_text("no archive")
+    for path in (objects, text, tmp_path / "missing.npz"):
+        with pytest.raises(MatrixError, match=path.name):
+            read_npz(path)
+
+
+def test_a_folder_that_cannot_be_written_is_named(saved, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(pyrcal.PyrcalError, match="cannot be written"):
+        imported_of(saved).save(tmp_path / "file")
+    assert isinstance(imported_of(saved), Imported)

@@ -25,9 +25,11 @@ RUN pip install --no-cache-dir -c constraints.txt . \
     && useradd --system --create-home --home-dir /var/lib/pyrcal pyrcal
 
 # Inside a container loopback reaches nobody: listen on all its interfaces and publish what you want.
+# The link to the RTC is open to nobody without a certificate: pyrcal certificates new makes them.
 ENV PYRCAL_API__HOST=0.0.0.0 \
     PYRCAL_API__PORT=8080 \
-    PYRCAL_ZENOH__LISTEN='["tcp/0.0.0.0:7447"]' \
+    PYRCAL_ZENOH__LISTEN='["tls/0.0.0.0:7447"]' \
+    PYRCAL_ZENOH__TLS='{ ca = "/var/lib/pyrcal/tls/ca.pem", certificate = "/var/lib/pyrcal/tls/service.pem", key = "/var/lib/pyrcal/tls/service-key.pem" }' \
     PYRCAL_SERVICE__DATA_DIR=/var/lib/pyrcal \
     PYRCAL_SERVICE__CACHE_DIR=/var/lib/pyrcal/cache
 

@@ -11,6 +11,7 @@ from typing import Annotated, Final
 from pydantic import Field, model_validator
 
 from service.config.sources import Table, in_file, read_toml, refuse, validated
+from service.web.keys import is_loopback
 from service.wire.access import LinkRole, access_control
 from service.wire.keys import Keys
 
@@ -96,6 +97,10 @@ class ZenohTable(CredentialsTable):
     access: AccessTable = Field(default_factory=AccessTable)
     """Who may do what, as soon as certificates or users tell who is who."""
 
+    anyone_may_command_the_mirror: bool = False
+    """Accept that whoever reaches ``listen`` can put a matrix of their own on the mirror: without
+    ``[zenoh.tls]`` it is refused for any address but loopback."""
+
     @model_validator(mode="after")
     def _with_certificates_no_way_around_them(self) -> ZenohTable:
         open_ones = [each for each in self.connect or self.listen if not _ENCRYPTED.match(each)]
@@ -105,6 +110,29 @@ class ZenohTable(CredentialsTable):
                 "nobody is let in without a certificate"
             )
         return self
+
+    @model_validator(mode="after")
+    def _nobody_from_elsewhere_without_a_certificate(self) -> ZenohTable:
+        if self.tls is not None or self.connect or self.anyone_may_command_the_mirror:
+            return self
+        for endpoint in self.listen:
+            host = _host_of(endpoint)
+            if host is not None and not is_loopback(host):
+                raise ValueError(
+                    f"found listen {endpoint}, which other machines can reach, without "
+                    "[zenoh.tls]: whoever reaches it can put a matrix on the mirror; "
+                    "pyrcal certificates new FOLDER --host NAME makes certificates, and settings "
+                    f"that use them (docs/operate/link.md), or listen on {DEFAULT_ENDPOINT}"
+                )
+        return self
+
+
+def _host_of(endpoint: str) -> str | None:
+    """Return the host of an endpoint; None: it is a socket of this machine's files."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol.startswith("unix"):
+        return None
+    return re.split(r"[?#]", address)[0].rpartition(":")[0].strip("[]")
 
 
 class _OfAnyProgram(Table):

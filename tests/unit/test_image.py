@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from pyrcal.arguments import OTHER_PROGRAMS
+from service.config import load_settings
 
 ROOT = Path(__file__).parents[2]
 
@@ -68,6 +69,28 @@ def test_what_pip_reads_besides_is_copied():
 @pytest.mark.parametrize("module", [module for module, _ in OTHER_PROGRAMS.values()])
 def test_every_program_that_pyrcal_can_become_is_in_the_image(module):
     assert module.split(".")[0] in copied()
+
+
+def of_the_image():
+    text = (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
+    line = next(line for line in text.splitlines() if line.startswith("ENV "))
+    return dict(word.split("=", 1) for word in shlex.split(line)[1:])
+
+
+def test_the_image_lets_nobody_onto_the_link_without_a_certificate():
+    zenoh = load_settings(None, of_the_image()).zenoh
+    assert zenoh.listen == ("tls/0.0.0.0:7447",)
+    assert zenoh.tls.key == Path("/var/lib/pyrcal/tls/service-key.pem")
+    assert not zenoh.anyone_may_command_the_mirror
+
+
+def test_the_manual_publishes_the_link_on_named_addresses_alone():
+    """``-p 7447:7447`` is every address, and past many a firewall."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    found = [port for page in pages for port in re.findall(r"(\S*):7447:7447", page.read_text())]
+    assert "127.0.0.1" in found
+    assert not [port for port in found if not re.search(r"[0-9.]+$", port)]
+    assert not [page for page in pages if re.search(r"-p[ =]7447", page.read_text())]
 
 
 @pytest.mark.parametrize("path", [".git/config", "var/index.sqlite", "service/__pycache__/a.pyc"])

@@ -118,6 +118,54 @@ def test_nobody_may_delete():
     assert not [rule for rule in control["rules"] if "delete" in rule["messages"]]
 
 
+# --- who may come from other machines
+
+
+@pytest.mark.parametrize(
+    "listen",
+    ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/ao-pc:7447", "udp/10.0.0.5:7447", "tcp/:7447"]
+    + ["tcp/0.0.0.0:7447#iface=eth0", "ws/[fe80::1]:7447", "tcp/127.0.0.1.example.org:7447"],
+)
+def test_where_other_machines_can_reach_it_nothing_is_open(tmp_path, listen):
+    found = refusal(tmp_path, f'[zenoh]\nlisten = ["tcp/127.0.0.1:7447", "{listen}"]\n')
+    assert f"found listen {listen}, which other machines can reach, without [zenoh.tls]" in found
+    assert "pyrcal certificates new FOLDER --host NAME" in found
+
+
+@pytest.mark.parametrize(
+    "listen", ["tcp/127.0.0.1:7447", "tcp/localhost:0", "tcp/[::1]:7447", "unixsock-stream//run/a"]
+)
+def test_on_loopback_nothing_is_asked_for(listen):
+    assert load_settings(None, {}, {"zenoh.listen": [listen]}).zenoh.listen == (listen,)
+
+
+def test_the_command_line_and_the_environment_are_held_to_it_too():
+    with pytest.raises(ConfigurationError, match="which other machines can reach"):
+        load_settings(None, {}, {"zenoh.listen": ["tcp/0.0.0.0:7447"]})
+    with pytest.raises(ConfigurationError, match="which other machines can reach"):
+        load_settings(None, {"PYRCAL_ZENOH__LISTEN": '["tcp/0.0.0.0:7447"]'})
+    with pytest.raises(ConfigurationError, match="which other machines can reach"):
+        read_link_tables(None, listen="tcp/0.0.0.0:7447")
+
+
+def test_with_passwords_alone_other_machines_are_not_let_in(tmp_path):
+    users = '[zenoh.users]\nname = "service"\npassword_file = "own"\nfile = "users"\n'
+    found = refusal(tmp_path, f'[zenoh]\nlisten = ["tcp/0.0.0.0:7447"]\n{users}')
+    assert "without [zenoh.tls]" in found
+
+
+def test_certificates_let_other_machines_in(folder):
+    text = '[zenoh]\nlisten = ["tls/0.0.0.0:7447"]\n' + tls(folder)
+    (folder / "all.toml").write_text(text)
+    assert load_settings(folder / "all.toml", {}).zenoh.listen == ("tls/0.0.0.0:7447",)
+
+
+def test_who_accepts_the_risk_says_so_in_a_name_that_nobody_writes_by_accident():
+    env = {"PYRCAL_ZENOH__LISTEN": '["tcp/0.0.0.0:7447"]'}
+    env["PYRCAL_ZENOH__ANYONE_MAY_COMMAND_THE_MIRROR"] = "true"
+    assert load_settings(None, env).zenoh.listen == ("tcp/0.0.0.0:7447",)
+
+
 # --- what is refused
 
 

@@ -11,6 +11,7 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ from service.errors import LinkError, UnknownIdError, WireError
 from service.estimation.frames import FrameBlock
 from service.files.recording import LastTelemetry, Message, RecordedKind, RecordingWriter
 from service.link import session as link
+from service.link.guard import LinkGuard
 from service.link.intake import Intake
 from service.link.leader_election import Standby
 from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
@@ -52,6 +54,8 @@ class Bridge:
         self._intake = Intake(endpoint)
         self._measured = MeasuredIntake(self._keys)
         self._outbox = Outbox(endpoint.offer_s)
+        self.guard = LinkGuard(endpoint.security)
+        """Who comes onto a secured link, and what was refused to whom."""
         self._session: zenoh.Session | None = None
         self._closed = False
         self._recorder: RecordingWriter | None = None
@@ -159,7 +163,11 @@ class Bridge:
 
     def statistics(self) -> LinkStatistics:
         """Return all counters of the link."""
-        return self._intake.statistics()
+        return replace(
+            self._intake.statistics(),
+            refusals=self.guard.refusals(),
+            ending_certificates=self.guard.ending(),
+        )
 
     def keep(self, recorder: RecordingWriter | None, before_s: float = 0.0) -> float:
         """Have all that the RTC sends put into a recorder from now on; None: no more.
@@ -267,6 +275,8 @@ class Bridge:
         for key in (keys.state, keys.alarm):
             self._publishers[key] = link.last_value(session, key)
         self._held += self._standby.join(session, self._guarded, wait=bool(self._endpoint.connect))
+        if self._endpoint.security.zenoh:
+            self._held.append(link.watch_links(session, self.guard.on_link))
         # zenoh takes back what nobody holds: a token within microseconds
         self._held += [
             link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack)),

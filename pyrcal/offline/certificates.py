@@ -155,11 +155,13 @@ def _write_settings(folder: Path, role: LinkRole, host: str, port: int) -> None:
     """Write what a program of this role is started with, and zenoh's own for any other."""
     own, key = folder / f"{role}.pem", folder / f"{role}-key.pem"
     ca, endpoint = folder / "ca.pem", f"tls/{host}:{port}"
+    others = [str(folder / f"{other}.pem") for other in LinkRole if other is not role]
+    watched = f"watched = {json.dumps(others)}\n" if role is LinkRole.SERVICE else ""
     how = "listen" if role is LinkRole.SERVICE else "connect"
     (folder / f"{role}.toml").write_text(
         f"[zenoh]\n{how} = {json.dumps([endpoint])}\n\n[zenoh.tls]\n"
         f"ca = {json.dumps(str(ca))}\ncertificate = {json.dumps(str(own))}\n"
-        f"key = {json.dumps(str(key))}\n",
+        f"key = {json.dumps(str(key))}\n{watched}",
         encoding="utf-8",
     )
     if role is LinkRole.SERVICE:

@@ -27,6 +27,7 @@ from service.config.policy import keeping_of, policy_of
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
 from service.files.recording import LastTelemetry
+from service.link.guard import refusals_of_zenoh
 from service.model.instrument import Instrument, instrument_sha256
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
@@ -91,7 +92,10 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
         last = LastTelemetry(
             settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
         )
-        with archive, announced(archive.directory, where), Bridge(endpoint, last) as bridge:
+        bridge = Bridge(endpoint, last)
+        secured = bool(endpoint.security.zenoh)
+        watched = refusals_of_zenoh(bridge.guard.refused) if secured else contextlib.nullcontext()
+        with archive, announced(archive.directory, where), watched, bridge:
             modes = [mode.config_id for mode in instrument.sensor_modes]
             bridge.expect(instrument.basis_id, instrument.config_id, modes)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)

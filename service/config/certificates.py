@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from service.config.sources import refuse
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Certificate:
-    """What a certificate says of itself."""
-
-    path: Path
-    name: str
-    """Its common name: what access goes by."""
-
-    ends_s: float
-    """When it ends to hold, seconds since the Unix epoch, UTC."""
+from service.link.guard import Certificate
 
 
 def read_certificate(path: Path, key: str) -> Certificate:
@@ -37,7 +25,7 @@ def read_certificate(path: Path, key: str) -> Certificate:
         refuse(key, f"{path}: {error!s:.120}", "a certificate, PEM")
     names = read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return Certificate(
-        path=path,
+        path=str(path),
         name=str(names[0].value) if names else "",
         ends_s=read.not_valid_after_utc.timestamp(),
     )

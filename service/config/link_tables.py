@@ -10,12 +10,17 @@ from typing import Annotated, Final
 
 from pydantic import Field, model_validator
 
+from service.config.certificates import read_certificate
 from service.config.sources import Table, in_file, read_toml, refuse, validated
+from service.link.guard import DAY_S, Certificate, LinkSecurity
 from service.web.keys import is_loopback
 from service.wire.access import LinkRole, access_control
 from service.wire.keys import Keys
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+
+USERS: Final = "transport/auth/usrpwd"
+"""Of zenoh's configuration."""
 
 _ENCRYPTED: Final = re.compile("(tls|quic)/")
 
@@ -33,6 +38,12 @@ class TlsTable(Table):
 
     key: Path
     """The private key of it, PEM; nobody else may read the file."""
+
+    watched: tuple[Path, ...] = ()
+    """Certificates of other programs, like the RTC's, whose end is to be foreseen, too."""
+
+    warn_days: float = Field(default=30.0, ge=0.0, le=1000.0)
+    """So many days before a certificate ends there is an alarm."""
 
 
 class UsersTable(Table):
@@ -181,32 +192,44 @@ def router_of(path: Path | None, connect: str | None) -> Router:
     return Router(endpoint=endpoint, security=client_security(zenoh))
 
 
-def link_security(zenoh: ZenohTable, system: str) -> Mapping[str, object]:
-    """Return what zenoh is told about certificates, users and access; nothing: nothing is asked.
+def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
+    """Return how the service's link is secured.
 
     An embedded router controls access itself; where an observatory's own routers are used, theirs
-    do, and this program only shows who it is.
+    do, and the service only shows who it is.
 
     Raises
     ------
     ConfigurationError
         If a file is missing, or others can read what is secret.
     """
-    security = client_security(zenoh)
-    if zenoh.connect or not security:
-        return security
-    if zenoh.users is not None:
-        known = _users_file(zenoh.users)
-        own = security["transport/auth/usrpwd"]
-        security["transport/auth/usrpwd"] = {**own, "dictionary_file": known}
+    told: dict[str, object] = {**client_security(zenoh)}
+    if not told:
+        return LinkSecurity()
     access = zenoh.access
     names = {
         LinkRole.RTC: access.rtc,
         LinkRole.SERVICE: access.service,
         LinkRole.VIEWER: access.viewer,
     }
-    named_by = "usernames" if zenoh.tls is None else "cert_common_names"
-    return {**security, "access_control": access_control(Keys(system), names, named_by=named_by)}
+    if zenoh.users is not None and not zenoh.connect:
+        known = {"dictionary_file": _users_file(zenoh.users)}
+        told[USERS] = {**_own_user(zenoh.users), **known}
+    if not zenoh.connect:
+        named_by = "usernames" if zenoh.tls is None else "cert_common_names"
+        told["access_control"] = access_control(Keys(system), names, named_by=named_by)
+    return LinkSecurity(
+        zenoh=told,
+        roles={name: str(role) for role, every in names.items() for name in every},
+        certificates=() if zenoh.tls is None else _certificates_of(zenoh.tls),
+        warn_s=DAY_S * (0.0 if zenoh.tls is None else zenoh.tls.warn_days),
+    )
+
+
+def _certificates_of(tls: TlsTable) -> tuple[Certificate, ...]:
+    watched = [(path, "zenoh.tls.watched") for path in tls.watched]
+    own = [(tls.certificate, "zenoh.tls.certificate"), (tls.ca, "zenoh.tls.ca")]
+    return tuple(read_certificate(path, key) for path, key in (*own, *watched))
 
 
 def client_security(credentials: CredentialsTable) -> dict[str, dict[str, object]]:
@@ -221,7 +244,7 @@ def client_security(credentials: CredentialsTable) -> dict[str, dict[str, object
     if credentials.tls is not None:
         security["transport/link/tls"] = _certificates(credentials.tls)
     if credentials.users is not None:
-        security["transport/auth/usrpwd"] = _own_user(credentials.users)
+        security[USERS] = _own_user(credentials.users)
     return security
 
 

@@ -375,6 +375,8 @@ class Intake:
                 status_age_s=_age_s(self._last_status_s, now_s),
                 session_age_s=now_s - self._begun_s,
                 session_waiting=self._sessions.waiting(now_s),
+                refusals=(),
+                ending_certificates=(),
                 latency_p50_s=median(self._latency_s) if self._latency_s else None,
             )
 

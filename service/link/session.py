@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from service import wire
 from service.errors import LinkError, WireError
+from service.link.guard import OPEN, LinkSecurity
 
 HISTORY_S = 0.5
 """Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
@@ -58,8 +59,8 @@ class Endpoint:
     connect: tuple[str, ...] = ()
     """Endpoints of an observatory's own routers, of which the service becomes a client."""
 
-    security: Mapping[str, object] = field(default_factory=dict)
-    """What zenoh is told about certificates, users and access; empty: nothing is asked."""
+    security: LinkSecurity = OPEN
+    """Certificates, users and access."""
 
     lease_s: float = 2.0
     """Silence after which the other side counts as gone."""
@@ -107,7 +108,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
         "transport/shared_memory/enabled": False,
-        **endpoint.security,
+        **endpoint.security.zenoh,
     }
     try:
         for key, value in settings.items():
@@ -168,6 +169,11 @@ def watch(session: zenoh.Session, key: str, callback: Callable[[tuple[str, bool]
         callback((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
 
     return session.liveliness().declare_subscriber(key, changed, history=True)
+
+
+def watch_links(session: zenoh.Session, callback: Callable[[zenoh.LinkEvent], None]) -> object:
+    """Call ``callback`` for each connection that there is, that is made and that ends."""
+    return session.info.declare_link_events_listener(callback, history=True)
 
 
 def serve(session: zenoh.Session, key: str, callback: Callable[[zenoh.Query], None]) -> object:

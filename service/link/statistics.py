@@ -40,6 +40,32 @@ class Disposition:
     """Of the last one: what was found and what was expected; empty: nothing was wrong."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Refusal:
+    """Something that somebody wanted on the link and may not."""
+
+    who: str
+    """The name in a certificate, or of a user; or what was missing."""
+
+    what: str
+    where: str
+    """The key; of a connection, why it was refused."""
+
+    n: int
+    age_s: float
+    """Since the last time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndingCertificate:
+    """A certificate that ends soon, or has ended."""
+
+    name: str
+    path: str
+    remaining_s: float
+    """Below 0: it has ended."""
+
+
 class Counters:
     """Counts what has become of everything that came; not thread-safe."""
 
@@ -159,3 +185,9 @@ class LinkStatistics:
     latency_p50_s: float | None
     """Median of put-to-callback over the last batches; None unless the RTC's session stamps its
     messages. It compares two clocks when the RTC runs on another machine."""
+
+    refusals: tuple[Refusal, ...] = ()
+    """What was refused on a secured link of late, the last first."""
+
+    ending_certificates: tuple[EndingCertificate, ...] = ()
+    """Those that end soon or have ended, the first to end first."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
+from service.link.guard import ending_in_words, refused_in_words
 from service.link.intake import COALESCED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, LinkStatistics
 from service.model.misregistration import at_boundary
@@ -64,9 +65,11 @@ LOST_SHARE: Final = 0.01
 """Of the frames: more of them lost are an alarm, which half as many do not end."""
 
 COMPLAINTS: Final = (
+    alarms.CERTIFICATE_ENDING,
     alarms.CLOCK_LEAPT,
     alarms.FRAMES_LOST,
     alarms.FRAMES_UNUSED,
+    alarms.LINK_REFUSED,
     alarms.MESSAGES_REFUSED,
     alarms.STATUS_FLOOD,
 )
@@ -84,6 +87,8 @@ def complaints(link: LinkStatistics) -> dict[str, str]:
         alarms.FRAMES_UNUSED: _unused(link),
         alarms.MESSAGES_REFUSED: _refused(link),
         alarms.STATUS_FLOOD: _flood(link),
+        alarms.LINK_REFUSED: refused_in_words(link.refusals),
+        alarms.CERTIFICATE_ENDING: ending_in_words(link.ending_certificates),
     }
     return {name: text for name, text in made.items() if text}
 

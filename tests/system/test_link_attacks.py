@@ -18,6 +18,7 @@ import zenoh
 
 from service.config.link_tables import AccessTable, TlsTable, UsersTable, ZenohTable, link_security
 from service.errors import LinkError
+from service.link.guard import OPEN
 from service.rtc_bridge import Bridge, Endpoint
 from service.wire import LoopRequest
 from tests.system.cable import free_port
@@ -259,7 +260,7 @@ def generous(folder):
     """
     zenoh_table = tables(folder, free_port())
     security = link_security(zenoh_table, "bench")
-    control = security["access_control"]
+    control = security.zenoh["access_control"]
     told = ["declare_subscriber", "declare_queryable", "reply", "query", "liveliness_query"]
     rule = {"id": "told", "permission": "allow", "flows": ["egress"], "key_exprs": ["**"]}
     control["rules"].append(rule | {"messages": [*told, "declare_liveliness_subscriber"]})
@@ -275,7 +276,7 @@ def generous(folder):
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_on_an_open_link_every_attack_succeeds(attack):
     listen = (f"tcp/127.0.0.1:{free_port()}",)
-    with bench(listen, {}) as scene, attacker(listen[0]) as session:
+    with bench(listen, OPEN) as scene, attacker(listen[0]) as session:
         assert attack(session, scene)
 
 

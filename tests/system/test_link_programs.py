@@ -1,12 +1,17 @@
 """The programs of pyrcal on a secured link: service, simulator, checker, examples."""
 
+import json
+import shutil
 import subprocess
 import sys
+import time
 
+import msgpack
 import pytest
+import zenoh
 
 from tests.system.cable import free_port
-from tests.system.night import INSTRUMENT, ROOT
+from tests.system.night import INSTRUMENT, ROOT, a_night, wait_for
 from tests.system.pace import patience
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
@@ -39,3 +44,78 @@ def test_the_checker_finds_the_simulator_through_certificates(folder):
         rtc.wait(patience(10.0))
     assert checked.returncode == 0, found
     assert "0 wrong" in found
+
+
+@pytest.fixture
+def night(folder, tmp_path):
+    """A service and a simulated RTC that meet with certificates."""
+    with a_night(tmp_path) as night:
+        table = (folder / "service.toml").read_text()
+        night.zenoh = json.loads(table.splitlines()[1].partition("= ")[2])[0]
+        settings = night.settings.read_text() + table.replace(
+            "[zenoh]", "[zenoh]\nchunk_bytes = 2048"
+        )
+        night.settings.write_text(settings)
+        yield night
+
+
+def stranger(night, folder, name):
+    """Connect as anybody would who has this certificate and zenoh."""
+    config = zenoh.Config.from_file(str(folder / f"{name}.json5"))
+    config.insert_json5("connect/exit_on_failure", "true")
+    config.insert_json5("connect/timeout_ms", "1500")
+    return zenoh.open(config)
+
+
+def log_lines(process, event):
+    lines = [json.loads(line) for line in process.log.splitlines() if line.startswith("{")]
+    return [line for line in lines if line.get("event") == event]
+
+
+ROOT_KEY = "ao/v1/small"
+COMMAND = f"{ROOT_KEY}/cmd/rtc/loop"
+
+
+def test_what_strangers_tried_is_logged_with_who_and_seen_on_the_page(night, folder):
+    service = night.service("hold", wait=False)
+    night.rtc("--config", folder / "rtc.toml")
+    wait_for(lambda: night.ready(service) and night.state["link"]["frames_received"] > 100, 60.0)
+    connected = {line["who"]: line["role"] for line in log_lines(service, "link.connected")}
+    assert connected == {"rtc": "rtc"}
+
+    gain = night.rtc_says("gains")
+    with stranger(night, folder, "viewer") as session:
+        held = [session.declare_subscriber("ao/**", print)]
+        list(session.get(COMMAND, payload=msgpack.packb({"v": 1}), timeout=0.5))
+        for key in ("cm/mine/commit", "cm/ack", "tel/frames", "tel/status"):
+            session.put(f"{ROOT_KEY}/{key}", b"forged")
+        held += [session.declare_queryable(f"{ROOT_KEY}/cm/*", print)]
+        held += [session.liveliness().declare_token(f"{ROOT_KEY}/alive/service")]
+        time.sleep(1.0)
+        assert len(held) == 3
+    tried = {
+        (line["who"], line["what"].partition(" ")[0], line["where"])
+        for line in wait_for(lambda: log_lines(service, "link.refused"), 10.0)
+    }
+    assert tried == {
+        ("viewer", "Declare", "ao/**"),
+        ("viewer", "Query", COMMAND),
+        ("viewer", "Put", f"{ROOT_KEY}/cm/mine/commit"),
+        ("viewer", "Put", f"{ROOT_KEY}/cm/ack"),
+        ("viewer", "Put", f"{ROOT_KEY}/tel/frames"),
+        ("viewer", "Put", f"{ROOT_KEY}/tel/status"),
+        ("viewer", "Declare", f"{ROOT_KEY}/cm/*"),
+    }, "a token that nobody is said to watch does not even leave the stranger's own zenoh"
+    assert "viewer: " in wait_for(lambda: night.alarms.get("link-refused"), 10.0)
+    assert night.rtc_says("gains") == gain
+    night.no_frame_is_lost()
+
+    (folder / "viewer.pem").unlink()
+    shutil.copy(folder / "ca.pem", folder / "viewer.pem")
+    with pytest.raises(zenoh.ZError):
+        stranger(night, folder, "viewer").close()
+    wait_for(
+        lambda: "no certificate of ours" in {x["who"] for x in log_lines(service, "link.refused")},
+        10.0,
+    )
+    assert "RTC" not in night.state["ready_reason"]

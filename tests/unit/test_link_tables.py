@@ -12,6 +12,7 @@ from service.config import load_settings
 from service.config.certificates import read_certificate
 from service.config.link_tables import AccessTable, link_security, read_link_tables
 from service.errors import ConfigurationError
+from service.link.guard import LinkSecurity
 from service.wire import Keys
 from service.wire.access import LinkRole, Rights, access_control, rights_of
 
@@ -66,24 +67,24 @@ def test_the_files_that_are_written_are_settings_and_zenohs_own(folder):
 
 
 def test_without_tables_zenoh_is_told_nothing():
-    assert link_security(load_settings(None, {}).zenoh, "bench") == {}
+    assert link_security(load_settings(None, {}).zenoh, "bench") == LinkSecurity()
 
 
 def test_a_router_asks_for_certificates_and_controls_access_by_their_names(folder):
-    told = link_security(load_settings(folder / "service.toml", {}).zenoh, "bench")
+    told = link_security(load_settings(folder / "service.toml", {}).zenoh, "bench").zenoh
     assert told["transport/link/tls"]["enable_mtls"]
     assert told["access_control"]["default_permission"] == "deny"
     assert {"id": "rtc", "cert_common_names": ["rtc"]} in told["access_control"]["subjects"]
 
 
 def test_a_client_shows_its_certificate_and_controls_nothing(folder):
-    told = link_security(read_link_tables(folder / "rtc.toml"), "bench")
+    told = link_security(read_link_tables(folder / "rtc.toml"), "bench").zenoh
     assert list(told) == ["transport/link/tls"]
 
 
 def test_all_that_zenoh_is_told_it_takes(folder):
     config = zenoh.Config()
-    told = link_security(load_settings(folder / "service.toml", {}).zenoh, "bench")
+    told = link_security(load_settings(folder / "service.toml", {}).zenoh, "bench").zenoh
     for key, value in told.items():
         config.insert_json5(key, json.dumps(value))
     assert json.loads(config.get_json("access_control"))["enabled"]
@@ -123,8 +124,16 @@ def test_nobody_may_delete():
 
 @pytest.mark.parametrize(
     "listen",
-    ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/ao-pc:7447", "udp/10.0.0.5:7447", "tcp/:7447"]
-    + ["tcp/0.0.0.0:7447#iface=eth0", "ws/[fe80::1]:7447", "tcp/127.0.0.1.example.org:7447"],
+    [
+        "tcp/0.0.0.0:7447",
+        "tcp/[::]:7447",
+        "tcp/ao-pc:7447",
+        "udp/10.0.0.5:7447",
+        "tcp/:7447",
+        "tcp/0.0.0.0:7447#iface=eth0",
+        "ws/[fe80::1]:7447",
+        "tcp/127.0.0.1.example.org:7447",
+    ],
 )
 def test_where_other_machines_can_reach_it_nothing_is_open(tmp_path, listen):
     found = refusal(tmp_path, f'[zenoh]\nlisten = ["tcp/127.0.0.1:7447", "{listen}"]\n')
@@ -220,5 +229,5 @@ def test_a_router_with_passwords_needs_those_of_all(tmp_path):
     client = f'[zenoh]\nconnect = ["tcp/127.0.0.1:7447"]\n{users}'
     path = tmp_path / "client.toml"
     path.write_text(client)
-    told = link_security(load_settings(path, {}).zenoh, "bench")
+    told = link_security(load_settings(path, {}).zenoh, "bench").zenoh
     assert told == {"transport/auth/usrpwd": {"user": "service", "password": "sesame"}}

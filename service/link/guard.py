@@ -1,0 +1,246 @@
+"""Who comes onto a secured link, what is refused to whom, and which certificates are about to end.
+
+zenoh says who is connected, and in its log alone what it has refused: :func:`refusals_of_zenoh`
+reads that. It does not say where somebody came from who was not let in at all.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import structlog
+import zenoh
+
+from service.link.statistics import EndingCertificate, Refusal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+DAY_S: Final = 86400.0
+
+RECENT_S: Final = 60.0
+"""For so long a refusal is spoken of."""
+
+LOG_EVERY_S: Final = 60.0
+"""Least time between two lines of the log on the same."""
+
+REMEMBERED: Final = 64
+"""Most refusals that are told apart; the others are counted together."""
+
+OTHERS: Final = ("others", "several things", "")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Certificate:
+    """A certificate that the link depends on."""
+
+    path: str
+    name: str
+    """Its common name: what access goes by."""
+
+    ends_s: float
+    """When it ends to hold, seconds since the Unix epoch, UTC."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSecurity:
+    """How a link is secured; the default: not at all."""
+
+    zenoh: Mapping[str, object] = field(default_factory=dict)
+    """What zenoh is told about certificates, users and access."""
+
+    roles: Mapping[str, str] = field(default_factory=dict)
+    """The role of each name that has one; empty: no names are known."""
+
+    certificates: tuple[Certificate, ...] = ()
+    warn_s: float = 30 * DAY_S
+    """So long before its end a certificate is spoken of."""
+
+
+OPEN: Final = LinkSecurity()
+
+
+class LinkGuard:
+    """Notes who comes and what is refused; its methods may be called from any thread."""
+
+    def __init__(self, security: LinkSecurity) -> None:
+        self._security = security
+        self._lock = threading.Lock()
+        self._refused: dict[tuple[str, str, str], list[float]] = {}
+        """Number, time of the last, and of the last line of the log, by who, what and where."""
+        self._log = structlog.get_logger()
+
+    def on_link(self, event: zenoh.LinkEvent) -> None:
+        """Note a connection that was made or ended."""
+        link, roles = event.link, self._security.roles
+        name, address = link.auth_identifier or "", str(link.dst)
+        made = event.kind == zenoh.SampleKind.PUT
+        role = roles.get(name, "none" if name else "as its user")
+        self._log.info(
+            "link.connected" if made else "link.disconnected",
+            who=name or "no certificate",
+            role=role,
+            address=address,
+            zenoh_id=str(link.zid),
+        )
+        if made and role == "none":
+            self.refused(name, "anything", f"it has no role in [zenoh.access], {address}")
+
+    def refused(self, who: str, what: str, where: str) -> None:
+        """Note something that was refused, and log it unless that was done a moment ago."""
+        now_s, key = time.monotonic(), (who, what, where)
+        with self._lock:
+            if key not in self._refused and len(self._refused) >= REMEMBERED:
+                self._forget(now_s)
+            if key not in self._refused and len(self._refused) >= REMEMBERED:
+                key = OTHERS
+            entry = self._refused.setdefault(key, [0, 0.0, -LOG_EVERY_S])
+            entry[0] += 1
+            entry[1] = now_s
+            is_due = now_s - entry[2] >= LOG_EVERY_S
+            if is_due:
+                entry[2] = now_s
+        if is_due:
+            who, what, where = key
+            self._log.warning("link.refused", who=who, what=what, where=where, n=int(entry[0]))
+
+    def refusals(self) -> tuple[Refusal, ...]:
+        """Return what was refused of late, the last first."""
+        now_s = time.monotonic()
+        with self._lock:
+            self._forget(now_s)
+            found = [
+                Refusal(who=who, what=what, where=where, n=int(n), age_s=now_s - last_s)
+                for (who, what, where), (n, last_s, _) in self._refused.items()
+            ]
+        return tuple(sorted(found, key=lambda refusal: refusal.age_s))
+
+    def ending(self) -> tuple[EndingCertificate, ...]:
+        """Return the certificates that end soon or have ended, the first to end first."""
+        now_s = time.time()
+        found = [
+            EndingCertificate(name=one.name, path=one.path, remaining_s=one.ends_s - now_s)
+            for one in self._security.certificates
+            if one.ends_s - now_s < self._security.warn_s
+        ]
+        return tuple(sorted(found, key=lambda one: one.remaining_s))
+
+    def _forget(self, now_s: float) -> None:
+        self._refused = {
+            key: entry for key, entry in self._refused.items() if now_s - entry[1] < RECENT_S
+        }
+
+
+def refused_in_words(refusals: Sequence[Refusal]) -> str:
+    """Return who was refused what; empty: nobody of late."""
+    if not refusals:
+        return ""
+    details = "; ".join(
+        f"{one.who}: {one.what} ({one.where}), {one.n} times" for one in refusals[:3]
+    )
+    more = len(refusals) - 3
+    return f"refused on the link: {details}{f'; and {more} more' if more > 0 else ''}"
+
+
+def ending_in_words(certificates: Sequence[EndingCertificate]) -> str:
+    """Return which certificates end soon or have ended; empty: none."""
+    return "; ".join(
+        f"the certificate of {one.name} ({one.path}) "
+        + ("has ended" if one.remaining_s <= 0.0 else f"ends in {one.remaining_s / DAY_S:.0f} days")
+        for one in certificates
+    )
+
+
+# --- zenoh's log
+
+DIRECTIVES: Final = ",".join(
+    (
+        "off",
+        "zenoh::net::routing::interceptor=trace",
+        "zenoh_link_tls::unicast=warn",
+        "zenoh_transport::unicast::establishment::accept=debug",
+    )
+)
+"""What zenoh is asked to log; a line for each message that it lets through is among it."""
+
+PIPE_BYTES: Final = 1 << 20
+"""Of zenoh's lines that wait; beyond it they are lost, and nothing waits for them."""
+
+READ_EVERY_S: Final = 0.2
+
+_COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
+_THREAD: Final = re.compile(r"ThreadId\(\d+\)")
+_UNAUTHORIZED: Final = re.compile(
+    r" on (?P<subject>\S+) is unauthorized to (?P<what>.+) \(ingress\) on (?P<key>\S+)"
+)
+_NAME: Final = re.compile(r"(?:CertCommonName|Username)\((.*?)\)")
+_NO_CERTIFICATE: Final = re.compile(r"zenoh_link_tls::unicast: (?P<why>.+?)(?:\. Hint.*)?$")
+_NO_USER: Final = re.compile(r"UsrPwd extension - (?P<why>.+?)(?: at /\S+)?$")
+
+
+class ZenohLog:
+    """Reads lines of zenoh's log, and tells what was refused."""
+
+    def __init__(self, refused: Callable[[str, str, str], None]) -> None:
+        self._refused = refused
+        self._said: dict[str, re.Match[str]] = {}
+        """What each thread of zenoh's said last, before it says that it has refused that."""
+
+    def read(self, line: str) -> None:
+        """Take one line."""
+        line = _COLOURS.sub("", line.rstrip())
+        found = _THREAD.search(line)
+        thread = found[0] if found else ""
+        said = self._said.pop(thread, None)
+        if "Msg intercepted!" in line:
+            if said is not None:
+                name = _NAME.search(said["subject"])
+                self._refused(name[1] if name else "no name", said["what"], said["key"])
+        elif (unauthorized := _UNAUTHORIZED.search(line)) is not None:
+            self._said[thread] = unauthorized
+        elif (without := _NO_CERTIFICATE.search(line)) is not None:
+            self._refused("no certificate of ours", "Connect", without["why"])
+        elif (user := _NO_USER.search(line)) is not None:
+            self._refused("no known name and password", "Connect", user["why"])
+
+
+@contextmanager
+def refusals_of_zenoh(refused: Callable[[str, str, str], None]) -> Iterator[None]:
+    """Report who was refused what, and where, while the block lasts.
+
+    zenoh logs to this process's standard output and offers no other way: it becomes a pipe that is
+    read here. A service prints nothing there.
+    """
+    reading, writing = os.pipe()
+    before = os.dup(1)
+    fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    os.set_blocking(writing, False)
+    os.dup2(writing, 1)
+    os.close(writing)
+    zenoh.init_log_from_env_or(DIRECTIVES)
+    reader = threading.Thread(target=_read_all, args=(reading, refused), name="refusals")
+    reader.start()
+    try:
+        yield
+    finally:
+        os.dup2(before, 1)  # the pipe's last end for writing: the thread ends
+        os.close(before)
+        reader.join()
+
+
+def _read_all(reading: int, refused: Callable[[str, str, str], None]) -> None:
+    log, rest = ZenohLog(refused), b""
+    with os.fdopen(reading, "rb", buffering=0) as pipe:
+        while data := pipe.read(PIPE_BYTES):
+            *lines, rest = (rest + data).split(b"\n")
+            for line in lines:
+                log.read(line.decode(errors="replace"))
+            time.sleep(READ_EVERY_S)

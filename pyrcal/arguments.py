@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from pyrcal.client import remote
 from pyrcal.offline import arguments as offline_arguments
+from pyrcal.playback import arguments as playback_arguments
 from service import __version__
 from service.cli import program
 from service.cli.program import OneLineParser
@@ -41,6 +42,7 @@ def command_line() -> argparse.ArgumentParser:
     program.declare(commands)
     remote.declare(commands)
     offline_arguments.declare(commands)
+    playback_arguments.declare(commands)
     for name, (_, purpose) in OTHER_PROGRAMS.items():
         commands.add_parser(name, help=f"{purpose}: pyrcal {name} --help", add_help=False)
     return parser

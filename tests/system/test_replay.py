@@ -1,127 +1,28 @@
 """A recorded night gives the tracker the very same answers, however often it is played."""
 
+import json
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from itertools import pairwise
 
 import httpx
 import numpy as np
 import pytest
 
-from service.config import load_instrument, load_settings
-from service.config.policy import policy_of
-from service.estimation.lockin import LockInEstimate
-from service.estimation.windows import ClosedLoop as FitLoop
-from service.files.recording import RecordedKind, Recording
-from service.link.intake import Intake
-from service.link.session import Endpoint
-from service.model.misregistration import PARAMETERS, Misregistration
-from service.runtime.engine import Engine
-from service.runtime.worker import Compute, OpticsWorker
-from service.tracking import events as ev
-from service.tracking.products import ReconstructorRecord
-from service.tracking.state import Mode
-from service.wire import DitherRequest, Manifest, decode
-from tests.states import tracker_state
+from service.model.misregistration import PARAMETERS
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
-from tests.unit.tracking.situations import dither_answered
 
 pytestmark = [pytest.mark.system, pytest.mark.long, pytest.mark.timeout(150)]
 
-WINDOW_S = 1.0
-POLICY = replace(
-    policy_of(load_settings(None, {})),
-    acquires=False,
-    flexure_per_degree=np.zeros(4),
-    window_s=WINDOW_S,
-    dither_budget_m=40e-9,
-    longest_pause_s=0.0,
-    drift_rate=np.full(4, 1e-4),
-    floor=np.full(4, 1e-4),
-    update_threshold=np.full(4, 0.01),
-)
 
-
-class Tracker:
-    """The service without network, processes and clocks: time is that of the recording."""
-
-    def __init__(self, instrument):
-        self.bench = OpticsWorker(instrument, Compute(threads=1))
-        self.engine = Engine(tracker_state(system=instrument.name, mode=Mode.HOLD), POLICY, self)
-        self.engine.set_description(self.bench.describe())
-        self.now_s = 0.0
-        self.intake = Intake(Endpoint(system=instrument.name), clock=lambda: self.now_s)
-        self.matrices = {}
-        self.estimates = []
-
-    def play(self, recording):
-        for message in recording.messages():
-            self.now_s = message.time_s
-            match message.kind:
-                case RecordedKind.FRAMES:
-                    self.intake.frames(message.payload, message.attachment)
-                case RecordedKind.STATUS:
-                    self.intake.status(message.payload)
-                case RecordedKind.MATRIX:
-                    self.keep(message)
-            self.look()
-
-    def keep(self, message):
-        manifest = decode(Manifest, message.attachment)
-        matrix = np.frombuffer(message.payload, "<f4").reshape(manifest.layout.shape)
-        self.matrices[manifest.id] = matrix
-        self.engine.post(ev.MatrixFetched(record=ReconstructorRecord.brought(manifest)))
-
-    def look(self):
-        for event in self.intake.events():
-            self.engine.receive(event)
-        self.engine.feed(self.intake.drain())
-
-    def fit(self, window):
-        rtc, registration = self.engine.state.loop.rtc, self.engine.state.alpha.registration
-        loop = FitLoop(
-            reconstructor=self.matrices[window.cm_id],
-            gains=np.array(rtc.gains),
-            leak=rtc.leak,
-            delay_frames=rtc.delay_frames,
-            frame_rate_hz=rtc.frame_rate_hz,
-        )
-        start = Misregistration() if registration is None else registration.alpha
-        estimate = self.bench.fit(window, loop, start)
-        if isinstance(estimate, LockInEstimate):
-            self.estimates.append((window.first_seq, *estimate.alpha.vector))
-            self.engine.post(ev.WindowFitted(estimate=estimate))
-
-    def now_ns(self):
-        return round(1e9 * self.now_s) + 1
-
-    def stepped(self, before, event):
-        pass
-
-    def swapped(self, in_use):
-        pass
-
-    def perform(self, effect):
-        if isinstance(effect, ev.Ask) and isinstance(effect.request, DitherRequest):
-            self.engine.post(
-                dither_answered(
-                    effect.request.id,
-                    accepted=False,
-                    reason="unsupported: a replay",
-                    start_seq=None,
-                )
-            )
-
-
-def replayed(path):
-    tracker = Tracker(load_instrument(str(INSTRUMENT)))
-    with Recording(path) as recording:
-        tracker.play(recording)
-    return tracker
+def tracked(path, settings):
+    """Return what ``pyrcal track`` says of a recording, as it says it."""
+    words = ["track", str(INSTRUMENT), str(path), "--config", str(settings), "--json"]
+    program = [sys.executable, "-m", "pyrcal", *words]
+    return subprocess.run(program, cwd=ROOT, check=True, stdout=subprocess.PIPE).stdout
 
 
 def lived(night):
@@ -151,20 +52,13 @@ def test_a_recorded_night_gives_the_same_answers_every_time(tmp_path):
         rtc = night.rtc("--record", str(path), "--seconds", "16", alpha)
         assert rtc.ended(60.0) == 0, rtc.log
         there = lived(night)
-    first, second = replayed(path), replayed(path)
-    assert len(first.estimates) >= 6
-    assert first.estimates == second.estimates
-    np.testing.assert_array_equal(
-        first.engine.state.alpha.registration.covariance,
-        second.engine.state.alpha.registration.covariance,
-    )
-    assert (
-        first.engine.state.alpha.registration.alpha == second.engine.state.alpha.registration.alpha
-    )
-    assert first.engine.state.dithers.dither.id.startswith("dither-")
+        settings = night.settings
+        first, second = tracked(path, settings), tracked(path, settings)
+    assert first == second
     here = {
-        entry.t_ns_utc: [entry.measured.to_boundary()[name] for name in PARAMETERS]
-        for entry in first.engine.state.alpha.history
+        entry["t_ns_utc"]: [entry["measured"][name] for name in PARAMETERS]
+        for entry in json.loads(first)["entries"]
+        if entry["source"] == "lock-in"
     }
     same = sorted(set(there) & set(here))
     assert len(same) >= 6

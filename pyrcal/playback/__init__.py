@@ -1,0 +1,1 @@
+"""Recorded telemetry through the estimators of the service, without RTC, link or service."""

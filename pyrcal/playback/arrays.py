@@ -1,0 +1,305 @@
+"""Telemetry as arrays, of any recorder: as the messages in which an RTC would have sent it.
+
+An HDF5 file, or an ``.npz`` of NumPy's, with
+
+    slopes            (n_frames, n_slopes)   in the RTC's own order and sign
+    commands_m        (n_frames, n_modes)    on the mirror during the exposure, dither included
+    dither_m          (n_frames, n_modes)    optional: the dither's share of the command
+    reconstructor     (n_controlled, n_slopes)  optional: metres per slope
+    seq               (n_frames,)            optional: counts frames, those missing too
+    gains             (n_modes,) or one      optional: 0 where not controlled, default 0.5
+    dither_modes, dither_frequencies_hz, dither_amplitude_m   optional, (n_dithered,): sines that
+                                             begin with the first frame
+
+and the numbers ``frame_rate_hz``, ``delay_frames`` (default 2), ``leak`` (default 1), ``t0_ns_utc``
+(default 0), as attributes of the HDF5 file or arrays of one number. Metres are metres of OPD.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ConfigurationError
+from service.files import FileKind, kind_of
+from service.files.recording import Message, RecordedKind
+from service.model.instrument import Instrument
+from service.tracking.policy import SECOND_NS
+from service.wire import (
+    BATCH_LIMIT,
+    CHUNK_LIMIT,
+    FRAMES_PER_BATCH,
+    DitherKind,
+    DitherRequest,
+    DitherStatus,
+    FrameHeader,
+    Loop,
+    Manifest,
+    MatrixLayout,
+    Status,
+    checksum,
+    encode,
+    encode_frames,
+)
+
+Array = NDArray[np.float64]
+
+STATUS_S: Final = 0.5
+"""Between two statuses."""
+
+SESSION: Final = "file"
+MATRIX_ID: Final = "of-the-file"
+
+
+@contextmanager
+def opened_arrays(path: Path) -> Iterator[Arrays]:
+    """Open a file of arrays.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is none, misses what is needed, or its arrays do not fit together.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            if zipfile.is_zipfile(path):
+                stored = stack.enter_context(np.load(path, allow_pickle=False))
+                found: dict[str, Any] = {name: stored[name] for name in stored.files}
+                facts: Mapping[str, Any] = {}
+            elif kind_of(path) is FileKind.HDF5:
+                file = stack.enter_context(h5py.File(path, "r", locking=False))
+                found = {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
+                facts = file.attrs
+            else:
+                raise ConfigurationError(f"{path}: expected telemetry in HDF5 or .npz")
+        except (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise ConfigurationError(f"{path}: damaged: {error}") from error
+        yield Arrays(path=path, found=found, facts=facts)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Arrays:
+    """Telemetry of a file; what is large stays in it until it is played."""
+
+    path: Path
+    found: Mapping[str, Any]
+    facts: Mapping[str, Any]
+
+    def messages(self, instrument: Instrument) -> Iterator[Message]:
+        """Yield it as an RTC would have sent it: matrix, statuses, frames.
+
+        Raises
+        ------
+        ConfigurationError
+            If something is missing or of the wrong shape: what was found and expected, and where.
+        """
+        n_modes = instrument.modes.n_modes
+        n_frames, n_slopes = self._shape("slopes", (None, None))
+        _, n_given = self._shape("commands_m", (n_frames, None))
+        if n_given > n_modes:
+            raise self._refusal("commands_m", f"{n_given} modes", f"at most the basis's {n_modes}")
+        seq = self._sequence(n_frames)
+        matrix = self._reconstructor(n_slopes, n_modes)
+        status = self._status(instrument, n_slopes, n_given if matrix is None else len(matrix))
+        if self._has("dither_m"):
+            self._shape("dither_m", (n_frames, n_given))
+        if matrix is not None:
+            yield _matrix_message(matrix, status)
+        every = max(1, round(STATUS_S * status.frame_rate_hz))
+        told = -1
+        for first, last in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
+            since = seq[[first, last - 1]] - seq[0]
+            if since[0] // every != told:
+                told = since[0] // every
+                yield _status_message(status, int(seq[first]), int(since[0]))
+            header = self._header(status, int(seq[first]), last - first, int(since[0]))
+            payload, attachment = encode_frames(header, self._rows(first, last, n_modes))
+            at_s = float(since[1] + 1) / status.frame_rate_hz
+            yield Message(at_s, RecordedKind.FRAMES, payload, attachment)
+
+    def _header(self, status: Status, seq0: int, n: int, since: int) -> FrameHeader:
+        return FrameHeader(
+            session=status.session,
+            seq0=seq0,
+            n=n,
+            t0_ns=status.t_ns + round(since / status.frame_rate_hz * SECOND_NS),
+            dt_ns=round(SECOND_NS / status.frame_rate_hz),
+            n_slopes=status.n_slopes,
+            n_modes=status.n_modes,
+            dither=self._has("dither_m"),
+            cm_id=status.cm_id,
+            basis_id=status.basis_id,
+            config_id=status.config_id,
+        )
+
+    def _rows(self, first: int, last: int, n_modes: int) -> NDArray[np.float32]:
+        """Return some frames as they travel; modes that the file does not tell of stand still."""
+        parts = [np.asarray(self.found["slopes"][first:last], np.float32)]
+        for name in ("commands_m", "dither_m"):
+            if self._has(name):
+                given = np.asarray(self.found[name][first:last], np.float32)
+                parts.append(np.pad(given, ((0, 0), (0, n_modes - given.shape[1]))))
+        return np.hstack(parts)
+
+    def _status(self, instrument: Instrument, n_slopes: int, n_controlled: int) -> Status:
+        n_modes = instrument.modes.n_modes
+        gains = np.zeros(n_modes)
+        given = self._values("gains", 1) if self._has("gains") else np.array([0.5])
+        if len(given) not in {1, n_controlled, n_modes}:
+            expected = f"one number, {n_controlled} or {n_modes}"
+            raise self._refusal("gains", f"{len(given)} numbers", expected)
+        gains[: max(n_controlled, len(given) if len(given) > 1 else 0)] = given
+        rate_hz = self._number("frame_rate_hz", None)
+        if not 0.0 < rate_hz <= 1e6:
+            raise self._refusal("frame_rate_hz", f"{rate_hz:g}", "frames a second, above 0")
+        return Status(
+            delay_frames=self._number("delay_frames", 2.0),
+            gains=tuple(gains.tolist()),
+            leak=self._number("leak", 1.0),
+            session=SESSION,
+            seq=None,
+            t_ns=int(self._number("t0_ns_utc", 0.0)),
+            loop=Loop.CLOSED if n_controlled and gains.any() else Loop.OPEN,
+            frame_rate_hz=rate_hz,
+            n_slopes=n_slopes,
+            n_modes=n_modes,
+            n_controlled=n_controlled,
+            cm_id=MATRIX_ID if self._has("reconstructor") else None,
+            basis_id=instrument.basis_id or SESSION,
+            config_id=instrument.config_id or SESSION,
+            dither=self._dither(rate_hz),
+            max_dither_m=1.0,
+            max_dither_modes=n_modes,
+            magnitude=None,
+        )
+
+    def _dither(self, rate_hz: float) -> DitherStatus | None:
+        """Return the sines that play from the first frame on; None: the file tells of none."""
+        names = ("dither_modes", "dither_frequencies_hz", "dither_amplitude_m")
+        if not any(map(self._has, names)):
+            return None
+        modes, frequencies, amplitudes = (self._values(name, 1) for name in names)
+        if not len(modes) == len(frequencies) == len(amplitudes):
+            sizes = f"{len(modes)} modes, {len(frequencies)} frequencies, {len(amplitudes)} strokes"
+            raise self._refusal("dither_modes", sizes, "one of each for every mode")
+        n_frames, _ = self._shape("slopes", (None, None))
+        request = DitherRequest(
+            id="dither-of-the-file",
+            modes=tuple(int(mode) for mode in modes),
+            amplitude_m=tuple(amplitudes.tolist()),
+            kind=DitherKind.SINE,
+            frequency_hz=tuple(frequencies.tolist()),
+            duration_s=n_frames / rate_hz,
+        )
+        return DitherStatus(request=request, start_seq=int(self._sequence(n_frames)[0]))
+
+    def _reconstructor(self, n_slopes: int, n_modes: int) -> NDArray[np.float32] | None:
+        if not self._has("reconstructor"):
+            return None
+        n_controlled, _ = self._shape("reconstructor", (None, n_slopes))
+        if n_controlled > n_modes:
+            raise self._refusal("reconstructor", f"{n_controlled} rows", f"at most {n_modes}")
+        return np.ascontiguousarray(self.found["reconstructor"][()], "<f4")
+
+    def _sequence(self, n_frames: int) -> NDArray[np.int64]:
+        if not self._has("seq"):
+            return np.arange(n_frames, dtype=np.int64)
+        seq = self._values("seq", 1).astype(np.int64)
+        if len(seq) != n_frames or np.any(np.diff(seq) <= 0):
+            raise self._refusal("seq", f"{len(seq)} numbers", f"{n_frames} that only rise")
+        return seq
+
+    # --- what is in the file
+
+    def _has(self, name: str) -> bool:
+        return name in self.found
+
+    def _shape(self, name: str, expected: tuple[int | None, int | None]) -> tuple[int, int]:
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in expected) + ")"
+        if not self._has(name):
+            there = ", ".join(sorted(self.found)) or "nothing"
+            raise self._refusal(name, f"no such array among {there}", f"one of shape {wanted}")
+        array = self.found[name]
+        fits = len(array.shape) == 2 and all(
+            n > 0 and want in {None, n} for n, want in zip(array.shape, expected, strict=True)
+        )
+        if not fits or array.dtype.kind not in "iuf":
+            raise self._refusal(name, f"{array.dtype} of shape {array.shape}", f"numbers {wanted}")
+        return array.shape[0], array.shape[1]
+
+    def _values(self, name: str, n_dimensions: int) -> Array:
+        if not self._has(name):
+            raise self._refusal(name, "no such array", "one")
+        array = self.found[name]
+        values = array[()] if array.dtype.kind in "iuf" else None
+        values = None if values is None else np.atleast_1d(np.asarray(values, float))
+        if values is None or values.ndim != n_dimensions or not np.all(np.isfinite(values)):
+            raise self._refusal(name, f"{array.dtype} of shape {array.shape}", "finite numbers")
+        return values
+
+    def _number(self, name: str, default: float | None) -> float:
+        given = self.facts.get(name, self.found.get(name, default))
+        if given is None:
+            raise self._refusal(name, "no such number", "it as an attribute or an array of one")
+        try:
+            value = float(np.asarray(given[()] if hasattr(given, "shape") else given).item())
+        except (TypeError, ValueError) as error:
+            raise self._refusal(name, str(given), "one number") from error
+        if not np.isfinite(value) or value < 0.0:
+            raise self._refusal(name, f"{value:g}", "a finite number from 0")
+        return value
+
+    def _refusal(self, name: str, found: str, expected: str) -> ConfigurationError:
+        return ConfigurationError(f"{self.path}: {name}: found {found}, expected {expected}")
+
+
+def _matrix_message(matrix: NDArray[np.float32], status: Status) -> Message:
+    data = matrix.tobytes()
+    layout = MatrixLayout(
+        shape=(matrix.shape[0], matrix.shape[1]),
+        n_chunks=-(-len(data) // CHUNK_LIMIT),
+        chunk_bytes=CHUNK_LIMIT,
+        sha256=checksum(matrix),
+    )
+    manifest = Manifest(
+        id=MATRIX_ID,
+        layout=layout,
+        alpha=None,
+        sigma=None,
+        im_id=None,
+        parent=None,
+        basis_id=status.basis_id,
+        config_id=status.config_id,
+        system=SESSION,
+        created_ns=status.t_ns,
+    )
+    return Message(0.0, RecordedKind.MATRIX, data, encode(manifest))
+
+
+def _status_message(status: Status, seq: int, since: int) -> Message:
+    """Return the status of a frame, ``since`` frames after the first."""
+    seconds = since / status.frame_rate_hz
+    told = replace(status, seq=seq, t_ns=status.t_ns + round(seconds * SECOND_NS))
+    return Message(seconds, RecordedKind.STATUS, encode(told))
+
+
+def _frames_at_once(n_columns: int) -> int:
+    return max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * n_columns)))
+
+
+def _batches(seq: NDArray[np.int64], n_at_once: int) -> Iterator[tuple[int, int]]:
+    """Yield first and end of runs of frames without a gap, of at most so many."""
+    edges = [0, *(np.flatnonzero(np.diff(seq) > 1) + 1).tolist(), len(seq)]
+    for run, end in pairwise(edges):
+        for first in range(run, end, n_at_once):
+            yield first, min(first + n_at_once, end)

@@ -1,0 +1,258 @@
+"""Play recorded telemetry to the tracker: time is that of the recording.
+
+Intake, estimators, worker and tracker are the service's own, so α comes out as it did that night.
+Only the worker's load is missing: live, windows that end while it is busy are fitted together, and
+about the α of a moment later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Concatenate, Final, ParamSpec, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.config.policy import compute_of, policy_of
+from service.config.settings import Settings
+from service.errors import ModelError, UnknownIdError, WireError
+from service.estimation.dither_windows import EndedWindow
+from service.estimation.passive_sums import PASSIVE_INTERVAL_S
+from service.estimation.random_dither import Correlated, NoisyMatrix, joined, noisy_matrix
+from service.files.recording import Message, RecordedKind
+from service.link.intake import Intake
+from service.link.matrices import MeasuredMatrix
+from service.link.session import Endpoint
+from service.model.instrument import Instrument
+from service.runtime.engine import Engine
+from service.runtime.estimates import fit_passive, fitted, read_own_matrix
+from service.runtime.worker import Done, OpticsWorker
+from service.tracking import events as ev
+from service.tracking.events import Effect, Event
+from service.tracking.policy import SECOND_NS
+from service.tracking.products import ReconstructorRecord
+from service.tracking.registration import HistoryEntry, PassiveState
+from service.tracking.state import LogEntry, LoopState, Mode, OperatorState, TrackerState
+from service.tracking.step_context import new_lines
+from service.wire import DitherRequest, Manifest, Reply, Status, decode
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+TICK_S: Final = 1.0
+"""As often as the service's tracker hears that time goes by."""
+
+NOT_CARRIED_OUT: Final = "unsupported: telemetry of before"
+
+
+@dataclass(slots=True, kw_only=True)
+class Track:
+    """What the estimators have made of telemetry."""
+
+    entries: list[HistoryEntry] = field(default_factory=list)
+    """Every measurement of α, in the order in which it was taken in."""
+
+    passive: list[PassiveState] = field(default_factory=list)
+    """What ordinary telemetry says of α by itself, each estimate with its bias in it."""
+
+    lines: list[LogEntry] = field(default_factory=list)
+    """What the tracker has logged."""
+
+    noisy: NoisyMatrix | None = None
+    """The interaction matrix that the last random dither holds; None: there was none."""
+
+    n_frames: int = 0
+    """Used."""
+
+    first_ns_utc: int = 0
+    last_ns_utc: int = 0
+    """End of the first and of the last used frame, the RTC's clock."""
+
+    state: TrackerState
+    """At the end."""
+
+
+class Player:
+    """Driver of an engine without network, processes and clocks."""
+
+    first: Callable[[], Done[None]] | None = None
+    """The one worker there is learns what it is told by itself; nobody else would need it."""
+
+    def __init__(self, instrument: Instrument, settings: Settings, system: str) -> None:
+        """Prepare the optical model.
+
+        Raises
+        ------
+        ModelError
+            If the instrument can be fitted offline but not controlled with, or is too large.
+        """
+        policy = replace(policy_of(settings, instrument), acquires=False)
+        state = TrackerState(
+            system=system,
+            operator=OperatorState(mode=Mode.HOLD),
+            loop=LoopState(basis_id=instrument.basis_id, config_id=instrument.config_id),
+        )
+        self.track = Track(state=state)
+        self._optics = OpticsWorker(instrument, compute_of(settings))
+        self._now_s, self._began_ns = 0.0, 0
+        self._ticked_s = self._summed_s = 0.0
+        self._intake = Intake(Endpoint(system=system), clock=lambda: self._now_s)
+        modes = [mode.config_id for mode in instrument.sensor_modes]
+        self._intake.expect(instrument.basis_id, instrument.config_id, modes)
+        self._matrices: dict[str, NDArray[np.float32]] = {}
+        self._windows: list[EndedWindow] = []
+        self._unheard: str | None = None
+        self._random: Correlated | None = None
+        self._engine = Engine(state, policy, self)
+        self._engine.set_description(self._optics.describe())
+
+    async def play(self, messages: Iterable[Message], progress: Callable[[float], None]) -> Track:
+        """Play messages in the order of sending; ``progress`` is told the seconds played."""
+        for message in messages:
+            self._now_s = max(self._now_s, message.time_s)
+            self._take(message)
+            await self._look()
+            await self._age()
+            progress(self._now_s)
+        self._now_s += 1.0  # what waited for frames that are missing comes
+        await self._look()
+        await self._sum_up()
+        self.track.state = self._engine.state
+        if self._random is not None:
+            self.track.noisy = noisy_matrix(self._random)
+        return self.track
+
+    def _take(self, message: Message) -> None:
+        """Take one message in as the link does; one that breaks the contract is counted there."""
+        try:
+            match message.kind:
+                case RecordedKind.FRAMES:
+                    self._intake.frames(message.payload, message.attachment)
+                case RecordedKind.STATUS:
+                    self._set_clock(message)
+                    self._intake.status(message.payload)
+                case RecordedKind.MATRIX:
+                    self._keep(message)
+                case RecordedKind.LIVELINESS | RecordedKind.ACKNOWLEDGEMENT:
+                    pass  # of a service that is not this one; a status says what came of it
+        except WireError as error:
+            self._intake.malformed(message.kind.name.lower(), error)
+
+    def _set_clock(self, message: Message) -> None:
+        """Have the service's clock agree with the RTC's, from its first status on."""
+        if not self._began_ns:
+            now_ns = decode(Status, message.payload).t_ns
+            self._began_ns = now_ns - round(message.time_s * SECOND_NS)
+
+    def _keep(self, message: Message) -> None:
+        manifest = decode(Manifest, message.attachment)
+        if len(message.payload) != manifest.layout.n_bytes:
+            raise WireError(f"range: {len(message.payload)} bytes of {manifest.id}")
+        matrix = np.frombuffer(message.payload, "<f4").reshape(manifest.layout.shape)
+        self._matrices[manifest.id] = matrix
+        self._engine.post(ev.MatrixFetched(record=ReconstructorRecord.brought(manifest)))
+
+    async def _look(self) -> None:
+        """Take in frames, then the events after them, as the service does."""
+        while True:
+            blocks = self._intake.drain(before_events=True)
+            self._engine.feed(blocks)
+            for block in blocks:
+                if not self.track.n_frames:
+                    self.track.first_ns_utc = block.t0_ns_utc
+                self.track.n_frames += block.n_frames
+                self.track.last_ns_utc = block.next_t_ns - block.dt_ns
+            await self._fit_windows()
+            events = self._intake.events()
+            for event in events:
+                if not isinstance(event, MeasuredMatrix):
+                    self._engine.receive(event)
+            await self._hear_matrix()
+            if not events:
+                return
+
+    async def _fit_windows(self) -> None:
+        windows, self._windows = self._windows, []
+        for window in windows:
+            if isinstance(window, Correlated):
+                self._correlate(window)
+            self._engine.post(await fitted(window, self._engine.state, self, self._matrix))
+
+    def _correlate(self, window: Correlated) -> None:
+        try:
+            self._random = window if self._random is None else joined(self._random, window)
+        except ModelError:  # another dither: its matrix is that of the last one
+            self._random = window
+
+    async def _hear_matrix(self) -> None:
+        """Learn how the RTC lists slopes and counts commands from a matrix that it has taken."""
+        in_use, self._unheard = self._unheard, None
+        record = None if in_use is None else self._engine.state.reconstructor(in_use)
+        if in_use is None or record is None or in_use not in self._matrices:
+            return
+        matrix = self._matrices[in_use]
+        self._engine.learn(in_use, matrix)
+        for event in await read_own_matrix(record, matrix, self._engine.state, self):
+            self._engine.post(event)
+
+    async def _age(self) -> None:
+        if self._now_s - self._ticked_s >= TICK_S:
+            self._ticked_s = self._now_s
+            self._engine.post(ev.Tick())
+        if self._now_s - self._summed_s >= PASSIVE_INTERVAL_S:
+            await self._sum_up()
+
+    async def _sum_up(self) -> None:
+        self._summed_s = self._now_s
+        for event in await fit_passive(self._engine.take_sums(), self._engine.state, self):
+            self._engine.post(event)
+
+    def _matrix(self, matrix_id: str) -> NDArray[np.float32]:
+        if matrix_id not in self._matrices:
+            raise UnknownIdError(f"{matrix_id}: found in no message, expected before its frames")
+        return self._matrices[matrix_id]
+
+    # --- what the engine asks of its driver
+
+    def now_ns(self) -> int:
+        """Return the time of the recording, nanoseconds."""
+        return self._began_ns + round(self._now_s * SECOND_NS)
+
+    def stepped(self, before: TrackerState, event: Event) -> None:
+        """Note what is new."""
+        after = self._engine.state
+        passive = after.alpha.passive
+        if passive is not None and passive is not before.alpha.passive:
+            self.track.passive.append(passive)
+        mine = [line for line in new_lines(before, after) if NOT_CARRIED_OUT not in line.text]
+        self.track.lines += mine
+        seen = {id(entry) for entry in before.alpha.history}
+        self.track.entries += [e for e in after.alpha.history if id(e) not in seen]
+
+    def fit(self, window: EndedWindow) -> None:
+        """Take a window that is to be fitted."""
+        self._windows.append(window)
+
+    def swapped(self, in_use: str | None) -> None:
+        """Note which matrix is in use."""
+        self._unheard = in_use
+
+    def sensor_mode_changed(self, config_id: str) -> None:
+        """Make the model of another mode of the sensor."""
+        self._engine.set_description(self._optics.enter_mode(config_id))
+        self._unheard = self._engine.state.matrices.in_use
+
+    def perform(self, effect: Effect) -> None:
+        """Refuse a dither, whose answer is waited for; nothing else is carried out either."""
+        if isinstance(effect, ev.Ask) and isinstance(effect.request, DitherRequest):
+            refused = Reply(
+                id=effect.request.id, accepted=False, reason=NOT_CARRIED_OUT, start_seq=None
+            )
+            self._engine.post(ev.Answered(request=effect.request, reply=refused))
+
+    async def call(
+        self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs
+    ) -> R:
+        """Run a method of the worker here and now."""
+        return job(self._optics, *args, **kwargs)

@@ -1,0 +1,254 @@
+"""What was made of telemetry: as a table, as one document, as HDF5, as a plot."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.playback.player import Track
+from pyrcal.terminal import table as aligned
+from service.errors import ConfigurationError
+from service.files.container import put_array
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.tracking.policy import SECOND_NS
+from service.tracking.registration import HistoryEntry, Source
+from service.tracking.state import Level
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+_TEXT = h5py.string_dtype()
+
+FORMAT = "pyrcal-track"
+VERSION = 1
+
+DIGITS = (4, 4, 4, 5)
+UNITS = ("subaperture", "subaperture", "degree", "")
+
+ENOUGH = 5
+"""Windows whose scatter says something."""
+
+_COLOURS = {Source.PASSIVE: "0.8", Source.RANDOM: "tab:green", Source.LOCK_IN: "tab:blue"}
+"""What is drawn last decides how much of α is shown."""
+
+_REASONS = 8
+"""Kinds of refusals and warnings that the table names."""
+
+
+def table(track: Track) -> str:
+    """Return the result in a few lines: what was found, by what, and what was the matter."""
+    seconds = (track.last_ns_utc - track.first_ns_utc) / SECOND_NS
+    windows = track.state.windows
+    heading = (
+        f"{track.n_frames} frames, {seconds:.1f} s; {windows.accepted} windows used, "
+        f"{windows.refused} refused"
+    )
+    rows: list[Sequence[str]] = [("", *PARAMETERS)]
+    registration = track.state.alpha.registration
+    if registration is not None:
+        rows.append(("alpha at the end", *_cells(registration.alpha.vector * BOUNDARY_SCALE)))
+        rows.append(("1 sigma", *_cells(registration.sigma * BOUNDARY_SCALE)))
+    for source in Source:
+        of_it = [entry for entry in track.entries if entry.source is source]
+        if of_it:
+            rows.append((f"{source.value}, {len(of_it)}x: scatter / sigma", *_scatter(of_it)))
+            if out := sum(not entry.entered for entry in of_it):
+                rows.append((f"{source.value}: {out}x not believed", *("" for _ in PARAMETERS)))
+    if registration is None and track.passive:
+        last = track.passive[-1]
+        rows.append(("ordinary telemetry alone", *_cells(last.alpha.vector * BOUNDARY_SCALE)))
+        rows.append(("1 sigma, its bias included", *_cells(last.sigma * BOUNDARY_SCALE)))
+    lines = [heading, *aligned(rows)]
+    if registration is None:
+        lines.append(f"alpha was not found: {_why_not(track)}")
+    if track.noisy is not None:
+        lines.append(f"noisy matrix: {len(track.noisy.modes)} modes, S/N {track.noisy.snr:.1f}")
+    return "\n".join([*lines, *_complaints(track)])
+
+
+def _why_not(track: Track) -> str:
+    """Return why nothing could be made of the telemetry, as far as anybody knows."""
+    if not track.n_frames:
+        return "no frame could be used"
+    if track.passive:
+        return f"no dithered window; of ordinary telemetry {len(track.passive)}x: " + (
+            track.passive[-1].text
+        )
+    reasons = (track.state.windows.refused_because, track.state.alpha.passive_unavailable_reason)
+    return "; ".join(filter(None, reasons)) or "it is too short, or holds no dither"
+
+
+def _cells(values: Array) -> list[str]:
+    return [f"{value:.{digits}f}" for digits, value in zip(DIGITS, values, strict=True)]
+
+
+def _scatter(entries: Sequence[HistoryEntry]) -> list[str]:
+    """Return by how much windows scatter, over what they say of themselves.
+
+    Neighbours are compared: a drift is no scatter.
+    """
+    entered = [entry for entry in entries if entry.entered]
+    if len(entered) < ENOUGH:
+        return ["too few"] * len(PARAMETERS)
+    measured = np.array([entry.measured.vector for entry in entered])
+    scatter = np.sqrt(np.mean(np.diff(measured, axis=0) ** 2, axis=0) / 2.0)
+    said = np.sqrt(np.mean([entry.measured_sigma**2 for entry in entered], axis=0))
+    return [f"{ratio:.2f}" for ratio in scatter / said]
+
+
+def _complaints(track: Track) -> list[str]:
+    """Return alarms that last, then what else the tracker warned of, the most frequent first."""
+    lines = [f"alarm {alarm.name}: {alarm.text}" for alarm in track.state.alarms.active]
+    names: Counter[str] = Counter()
+    texts: dict[str, str] = {}
+    for entry in track.lines:
+        if entry.level in {Level.WARNING, Level.ALARM}:
+            names[entry.name] += 1
+            texts[entry.name] = entry.text
+    lines += [f"{name} ({times}x): {texts[name]}" for name, times in names.most_common(_REASONS)]
+    return lines
+
+
+def document(track: Track, source: Path) -> dict[str, Any]:
+    """Return the result as one JSON object; its entries are like REST's of α."""
+    registration = track.state.alpha.registration
+    return {
+        "telemetry": str(source),
+        "n_frames": track.n_frames,
+        "first_ns_utc": track.first_ns_utc,
+        "last_ns_utc": track.last_ns_utc,
+        "alpha": None if registration is None else registration.alpha.to_boundary(),
+        "covariance": None
+        if registration is None
+        else (registration.covariance * np.outer(BOUNDARY_SCALE, BOUNDARY_SCALE)).tolist(),
+        "entries": [_entry(entry) for entry in track.entries],
+        "passive": [
+            {
+                "t_ns_utc": one.t_ns_utc,
+                "alpha": one.alpha.to_boundary(),
+                "sigma": _named(one.sigma) if np.isfinite(one.sigma).all() else None,
+                "text": one.text,
+            }
+            for one in track.passive
+        ],
+        "alarms": [{"name": a.name, "text": a.text} for a in track.state.alarms.active],
+        "windows": {
+            "accepted": track.state.windows.accepted,
+            "refused": track.state.windows.refused,
+        },
+    }
+
+
+def _named(values: Array) -> dict[str, float]:
+    return dict(zip(PARAMETERS, (values * BOUNDARY_SCALE).tolist(), strict=True))
+
+
+def _entry(entry: HistoryEntry) -> dict[str, Any]:
+    return {
+        "t_ns_utc": entry.t_ns_utc,
+        "source": entry.source.value,
+        "measured": entry.measured.to_boundary(),
+        "measured_sigma": _named(entry.measured_sigma),
+        "filtered": entry.filtered.to_boundary(),
+        "filtered_sigma": _named(entry.filtered_sigma),
+        "innovation": entry.innovation,
+        "misfit": entry.misfit if np.isfinite(entry.misfit) else None,
+        "entered": entry.entered,
+        "in_use": entry.in_use,
+    }
+
+
+def fill(file: h5py.File, track: Track, source: Path) -> None:
+    """Write everything found to an HDF5 file; registrations in the units of the parameters."""
+    file.attrs.update(format=FORMAT, version=VERSION, telemetry=str(source))
+    file.attrs["parameters"] = PARAMETERS
+    entries, passive = track.entries, track.passive
+    for name, values, what in (
+        ("t_ns_utc", np.array([e.t_ns_utc for e in entries], np.int64), "(n,) end of telemetry"),
+        ("source", np.array([e.source.value for e in entries], _TEXT), "(n,) estimator"),
+        ("measured", _boundary([e.measured.vector for e in entries]), "(n, 4) by itself"),
+        ("measured_sigma", _boundary([e.measured_sigma for e in entries]), "(n, 4) of the data"),
+        ("filtered", _boundary([e.filtered.vector for e in entries]), "(n, 4) α after it"),
+        (
+            "filtered_sigma",
+            _boundary([e.filtered_sigma for e in entries]),
+            "(n, 4) 1 sigma of it, the model's error included",
+        ),
+        ("entered", np.array([e.entered for e in entries], bool), "(n,) whether it was believed"),
+        ("misfit", np.array([e.misfit for e in entries]), "(n,) residual power over noise"),
+        ("passive/t_ns_utc", np.array([p.t_ns_utc for p in passive], np.int64), "(m,) ends"),
+        ("passive/alpha", _boundary([p.alpha.vector for p in passive]), "(m, 4) its bias in it"),
+        ("passive/sigma", _boundary([p.sigma for p in passive]), "(m, 4) 1 sigma of that"),
+    ):
+        put_array(file, name, values, what)
+    if track.noisy is not None:
+        put_array(file, "interaction_matrix", track.noisy.matrix, "noisy, slope per metre of OPD")
+        put_array(file, "noise", np.median(track.noisy.noise, axis=0), "(n_modes,) 1 sigma")
+        put_array(file, "modes", np.array(track.noisy.modes), "(n_modes,) basis indices")
+
+
+def _boundary(vectors: Sequence[Array]) -> Array:
+    """Return vectors in numeric units as rows in the units of the parameters."""
+    rows: Array = np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE
+    return rows
+
+
+def plot(track: Track, title: str, path: Path) -> None:
+    """Draw α over time, every estimator's and the filtered one.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+    figure.suptitle(title)
+    every = figure.subplots(len(PARAMETERS), 1, sharex=True)
+    for k, axes in enumerate(every):
+        _draw(axes, track, k)
+    if track.entries or track.passive:
+        every[0].legend(fontsize="small", ncols=4)
+    every[-1].set_xlabel("seconds since the first frame")
+    try:
+        figure.savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
+
+
+def _draw(axes: Axes, track: Track, k: int) -> None:
+    """Draw one parameter."""
+
+    def seconds(ends_ns: Sequence[int]) -> Array:
+        return (np.array(ends_ns) - track.first_ns_utc) / SECOND_NS
+
+    passive = _boundary([one.alpha.vector for one in track.passive])[:, k]
+    ends = seconds([one.t_ns_utc for one in track.passive])
+    axes.plot(ends, passive, "x", color="0.6", label="ordinary telemetry, its bias in it")
+    for source, colour in _COLOURS.items():
+        chosen = [entry for entry in track.entries if entry.source is source]
+        if chosen:
+            ends = seconds([entry.t_ns_utc for entry in chosen])
+            values = _boundary([entry.measured.vector for entry in chosen])[:, k]
+            sigma = _boundary([entry.measured_sigma for entry in chosen])[:, k]
+            axes.errorbar(ends, values, sigma, fmt=".", color=colour, label=source.value)
+            margin = 3.0 * _boundary([entry.filtered_sigma for entry in chosen])[:, k].max()
+            axes.set_ylim(values.min() - margin, values.max() + margin)
+    if track.entries:
+        ends = seconds([entry.t_ns_utc for entry in track.entries])
+        filtered = _boundary([entry.filtered.vector for entry in track.entries])[:, k]
+        width = _boundary([entry.filtered_sigma for entry in track.entries])[:, k]
+        axes.plot(ends, filtered, color="tab:red", linewidth=1.0, label="filtered")
+        low, high = filtered - width, filtered + width
+        axes.fill_between(ends, low, high, color="tab:red", alpha=0.15, linewidth=0)
+    axes.set_ylabel(f"{PARAMETERS[k]}\n{UNITS[k]}".strip())
+    axes.grid(alpha=0.3)

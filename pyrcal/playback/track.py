@@ -1,0 +1,93 @@
+"""``pyrcal track``: from recorded telemetry to α over time."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+
+import h5py
+import structlog
+from threadpoolctl import threadpool_limits
+
+from pyrcal.offline.figures import check_plots
+from pyrcal.playback.arrays import opened_arrays
+from pyrcal.playback.player import Player, Track
+from pyrcal.playback.report import document, fill, plot, table
+from pyrcal.terminal import show_progress
+from service.archive.store import write_whole
+from service.config import load_instrument, load_settings
+from service.config.settings import Settings
+from service.files.recording import FORMAT, Message, Recording
+from service.model.instrument import Instrument
+
+FOUND, NOTHING_FOUND = 0, 1
+
+
+def main(options: argparse.Namespace) -> int:
+    """Play the file, print the result, and return the exit status.
+
+    Raises
+    ------
+    PyrcalError
+        If something that was given cannot be used.
+    """
+    if options.plot is not None:
+        check_plots()
+    structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
+    settings = load_settings(options.config, os.environ)
+    instrument = load_instrument(options.instrument)
+    with threadpool_limits(1):
+        track = _followed(options.telemetry, instrument, settings)
+    if options.json:
+        print(json.dumps(document(track, options.telemetry), allow_nan=False))
+    else:
+        print(table(track))
+    if options.output is not None:
+        write_whole(options.output, partial(fill, track=track, source=options.telemetry))
+    if options.plot is not None:
+        plot(track, f"{instrument.name}: {options.telemetry.name}", options.plot)
+    return FOUND if track.entries or track.passive else NOTHING_FOUND
+
+
+def _followed(path: Path, instrument: Instrument, settings: Settings) -> Track:
+    if _is_recording(path):
+        with Recording(path) as recording:
+            return _play(recording.messages(), instrument, settings, recording.system)
+    with opened_arrays(path) as arrays:
+        messages = arrays.messages(instrument)
+        return _play(messages, instrument, settings, instrument.name)
+
+
+def _is_recording(path: Path) -> bool:
+    try:
+        with h5py.File(path, "r", locking=False, swmr=True) as file:
+            return bool(file.attrs.get("format") == FORMAT)
+    except (OSError, RuntimeError):  # read as arrays it is refused with the reason
+        return False
+
+
+def _play(
+    messages: Iterable[Message], instrument: Instrument, settings: Settings, system: str
+) -> Track:
+    show_progress("preparing the optical model")
+    player = Player(instrument, settings, system)
+    return asyncio.run(player.play(messages, _counter()))
+
+
+def _counter() -> Callable[[float], None]:
+    """Return what shows each second that was played."""
+    shown = 0
+
+    def show(seconds: float) -> None:
+        nonlocal shown
+        if seconds >= shown + 1:
+            shown = int(seconds)
+            show_progress(f"{shown} s played")
+
+    return show

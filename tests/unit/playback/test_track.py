@@ -1,0 +1,190 @@
+"""Telemetry of any recorder, through the estimators: what comes out, and what is refused."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from pyrcal.__main__ import main
+from service.config import load_instrument
+from sim_rtc.assembly import build_telescope
+from sim_rtc.options import parse_options
+from studies.campaign.small import SMALL
+from studies.campaign.telemetry import LINE_FRACTIONS
+
+RATE_HZ = 1000.0
+TRUE = {
+    "shift_x_subap": 0.12,
+    "shift_y_subap": -0.08,
+    "rotation_deg": 0.3,
+    "magnification": 1.004,
+}
+N_CONTROLLED = 45
+MODES = (50, 55, 60, 65)
+AMPLITUDE_M = 10e-9
+SECONDS = 9
+
+
+@pytest.fixture(scope="module")
+def telemetry():
+    """A loop of the small telescope as its recorder has it, with sines from its first frame on."""
+    words = ["--instrument", SMALL, f"--n-controlled={N_CONTROLLED}", "--seed=3", "--mag=8"]
+    words.append("--alpha=" + ",".join(str(value) for value in TRUE.values()))
+    telescope = build_telescope(parse_options(words), load_instrument(SMALL))
+    computer = telescope.computer(telescope.feed.blocks())
+    computer.prepare()
+    sines = {
+        "dither_modes": np.array(MODES),
+        "dither_frequencies_hz": np.array([round(f * RATE_HZ) for f in LINE_FRACTIONS], float),
+        "dither_amplitude_m": np.full(len(MODES), AMPLITUDE_M),
+    }
+    start_seq = dithered(computer, sines)
+    batches = []
+    while not batches or batches[-1].seq0 < start_seq + SECONDS * RATE_HZ:
+        batches.append(computer.next_batch())
+    begun = [b for b in batches if b.dither_m is not None and b.seq0 >= start_seq]
+    settings = telescope.settings
+    return sines | {
+        "slopes": np.concatenate([b.slopes for b in begun]),
+        "commands_m": np.concatenate([b.commands_m for b in begun]),
+        "dither_m": np.concatenate([b.dither_m for b in begun]),
+        "reconstructor": telescope.reconstructor.matrix,
+        "gains": np.array(settings.gains),
+        "frame_rate_hz": np.array(RATE_HZ),
+        "delay_frames": np.array(settings.delay_frames),
+        "leak": np.array(settings.leak),
+    }
+
+
+def dithered(computer, sines):
+    from service.wire import DitherKind, DitherRequest
+
+    computer.next_batch()
+    reply = computer.execute(
+        DitherRequest(
+            id="sines",
+            kind=DitherKind.SINE,
+            modes=MODES,
+            amplitude_m=tuple(sines["dither_amplitude_m"]),
+            frequency_hz=tuple(sines["dither_frequencies_hz"]),
+            duration_s=SECONDS + 5.0,
+        )
+    )
+    return reply.start_seq
+
+
+def saved(folder, arrays):
+    path = folder / "night.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def tracked(capsys, path, *words):
+    status = main(["track", SMALL, str(path), "--json", *words])
+    out, err = capsys.readouterr()
+    return status, json.loads(out) if out else None, err
+
+
+def test_sines_in_an_npz_give_alpha(telemetry, tmp_path, capsys):
+    h5, png = tmp_path / "track.h5", tmp_path / "track.png"
+    path = saved(tmp_path, telemetry)
+    status, found, _ = tracked(capsys, path, f"--output={h5}", f"--plot={png}")
+    assert status == 0
+    entries = [entry for entry in found["entries"] if entry["source"] == "lock-in"]
+    assert len(entries) >= 1
+    for name, value in TRUE.items():
+        # what the simulator's mirror is off the drawing turns and scales 144 actuators by 7e-4
+        floor = {"rotation_deg": 0.04, "magnification": 0.0015}.get(name, 0.01)
+        error = found["alpha"][name] - value
+        assert abs(error) < 3.0 * np.hypot(entries[-1]["measured_sigma"][name], floor)
+    assert png.stat().st_size > 10_000
+    with h5py.File(h5) as file:
+        np.testing.assert_array_equal(
+            file["t_ns_utc"][()], [entry["t_ns_utc"] for entry in found["entries"]]
+        )
+        assert file["measured"].shape == (len(found["entries"]), 4)
+
+
+def test_hdf5_says_the_same_as_npz(telemetry, tmp_path, capsys):
+    path = tmp_path / "night.h5"
+    numbers = ("frame_rate_hz", "delay_frames", "leak")
+    with h5py.File(path, "w") as file:
+        for name, values in telemetry.items():
+            if name in numbers:
+                file.attrs[name] = float(values)
+            else:
+                file[name] = values
+    _, one, _ = tracked(capsys, path)
+    _, other, _ = tracked(capsys, saved(tmp_path, telemetry))
+    assert one["entries"] == other["entries"]
+    assert one["entries"]
+
+
+def test_without_a_dither_it_says_what_ordinary_telemetry_says(telemetry, tmp_path, capsys):
+    plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
+    status, found, _ = tracked(capsys, saved(tmp_path, plain))
+    assert status == 0
+    assert found["alpha"] is None
+    assert found["passive"][-1]["sigma"]["shift_x_subap"] > 0.05  # nothing is made from it alone
+    assert main(["track", SMALL, str(tmp_path / "night.npz")]) == 0
+    assert "alpha was not found: no dithered window" in capsys.readouterr().out
+
+
+def without(name):
+    return lambda arrays: arrays.pop(name)
+
+
+def given(name, change):
+    return lambda arrays: arrays.update({name: change(arrays[name])})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (without("slopes"), "slopes: found no such array among"),
+        (without("commands_m"), "commands_m: found no such array among"),
+        (without("frame_rate_hz"), "frame_rate_hz: found no such number"),
+        (given("frame_rate_hz", lambda v: -v), "frame_rate_hz: found -1000"),
+        (given("slopes", lambda v: v.T), "commands_m: found float32 of shape"),
+        (given("commands_m", lambda v: v[:-1]), "commands_m: found float32 of shape"),
+        (given("commands_m", lambda v: np.hstack([v, v])), "expected at most the basis's 90"),
+        (given("dither_m", lambda v: v[:, :7]), "dither_m: found float32 of shape"),
+        (given("reconstructor", lambda v: v.T), "reconstructor: found float32 of shape"),
+        (given("gains", lambda v: v[:4]), "gains: found 4 numbers, expected one number, 45 or 90"),
+        (given("dither_modes", lambda v: v[:2]), "dither_modes: found 2 modes, 4 frequencies"),
+        (given("slopes", lambda v: v.astype("S3")), "slopes: found |S3 of shape"),
+        (lambda arrays: arrays.update(seq=np.zeros(7)), "seq: found 7 numbers, expected"),
+    ],
+)
+def test_what_does_not_fit_is_named(telemetry, tmp_path, capsys, spoil, text):
+    arrays = dict(telemetry)
+    spoil(arrays)
+    status, found, err = tracked(capsys, saved(tmp_path, arrays))
+    assert (status, found) == (2, None)
+    assert text in err
+    assert "Traceback" not in err
+
+
+def test_frames_that_are_missing_are_told_by_their_numbers(telemetry, tmp_path, capsys):
+    keep = np.ones(len(telemetry["slopes"]), bool)
+    keep[1500:1600] = False
+    holed = dict(telemetry) | {"seq": np.flatnonzero(keep)}
+    for name in ("slopes", "commands_m", "dither_m"):
+        holed[name] = telemetry[name][keep]
+    _, found, _ = tracked(capsys, saved(tmp_path, holed))
+    assert found["n_frames"] == keep.sum()
+    assert found["last_ns_utc"] - found["first_ns_utc"] == (len(keep) - 1) * 1_000_000
+
+
+@pytest.mark.parametrize(
+    "fill", [b"", b"PK\x03\x04 no zip", b"SIMPLE  = T", b"\x89HDF\r\n\x1a\nno", b"text"]
+)
+def test_other_files_are_refused_in_one_line(tmp_path, capsys, fill):
+    path = tmp_path / "night"
+    path.write_bytes(fill)
+    status, _, err = tracked(capsys, path)
+    assert status == 2
+    assert str(path) in err
+    assert "Traceback" not in err
+    assert err.count("\n") == 1

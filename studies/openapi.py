@@ -179,6 +179,12 @@ _FOUR: Schema = {
         "shift_y_subap": {**_NUMBER, "description": "Along sensor +y, subapertures."},
         "rotation_deg": {**_NUMBER, "description": "From sensor +x towards +y, degrees."},
         "magnification": {**_NUMBER, "description": "Ratio; 1 is nominal."},
+        "anamorphosis": {
+            "type": "array",
+            "items": {"type": "number"},
+            "description": "Of a registration where it is followed: stretch along x over the mean "
+            "of both axes, less 1, and along 45 deg.",
+        },
     },
     "required": list(PARAMETERS),
 }
@@ -186,7 +192,7 @@ _FOUR: Schema = {
 
 def _put_beside_the_four(schema: Schema) -> None:
     """Add the four parameters of a registration to the keys they lie beside."""
-    four = _FOUR["properties"].items()
+    four = ((name, _FOUR["properties"][name]) for name in PARAMETERS)
     titled = {name: {**said, "title": name.replace("_", " ").title()} for name, said in four}
     schema["properties"] = titled | schema["properties"]
     schema["required"] = [*PARAMETERS, *schema["required"]]

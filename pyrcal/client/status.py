@@ -90,10 +90,20 @@ def _refusal(state: Document) -> list[str]:
 
 def registration_lines(known: Document) -> list[str]:
     """Return the four parameters of a registration, each with its 1 sigma and unit."""
-    return [
+    lines = [
         f"{label:13} {_number(known['alpha'][name], form)} ± "
         f"{_number(known['sigma'][name], form.lstrip('+'))} {unit}".rstrip()
         for name, (label, form, unit) in _ALPHA.items()
+    ]
+    stretched = zip(
+        ("stretch x", "stretch 45"),
+        known["alpha"].get("anamorphosis") or (),
+        known.get("anamorphosis_sigma") or (),
+        strict=False,
+    )
+    return [
+        *lines,
+        *(f"{label:13} {value:+.5f} ± {sigma:.5f}" for label, value, sigma in stretched),
     ]
 
 

@@ -198,7 +198,8 @@ def _kept(saved: Saved) -> dict[str, Any]:
     values = msgspec.to_builtins(saved, enc_hook=plain_numbers)
     known, acquisition = values["registration"], values["acquisition"]
     if known is not None:
-        known["alpha"] = [known["alpha"][name] for name in _NUMERIC]
+        alpha = known["alpha"]
+        known["alpha"] = [*(alpha[name] for name in _NUMERIC), *(alpha["anamorphosis"] or ())]
         for record in (known, *known["biases"]):
             for name in _NOT_KEPT:
                 record.pop(name, None)
@@ -216,7 +217,10 @@ def _saved_of(values: dict[str, Any]) -> Saved:
         raise ValueError(f"expected version {VERSION}")
     known = values["registration"]
     if known is not None:
-        known["alpha"] = dict(zip(_NUMERIC, known["alpha"], strict=True))
+        four, stretches = known["alpha"][:4], known["alpha"][4:]
+        known["alpha"] = dict(zip(_NUMERIC, four, strict=True)) | {
+            "anamorphosis": stretches or None
+        }
         # written when there was one passive estimate
         known.setdefault("biases", [bias for bias in (known.pop("bias", None),) if bias])
     of_before = _voids_of_before(known or {}, values.get("offload"))
@@ -271,8 +275,12 @@ def _check(registration: Registration) -> None:
         (registration.floor, (4,)),
         (np.array(registration.scatter), ()),
     ]
+    n, stretches = 4, registration.stretches
+    if stretches is not None:
+        arrays += [(stretches.covariance, (2, 2)), (stretches.shared, (2, 4))]
+        n = 6
     for k, bias in enumerate(registration.biases):
-        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, 4 + 4 * k))]
+        arrays += [(bias.offset, (4,)), (bias.covariance, (4, 4)), (bias.shared, (4, n + 4 * k))]
         arrays += [(bias.excess, (4,)), (np.array(bias.loop), (len(bias.loop),))]
         arrays += [(np.array(bias.scatter), ())]
         arrays += [(np.array(shape), (4,)) for shape in bias.block.shapes]

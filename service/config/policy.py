@@ -156,5 +156,6 @@ def compute_of(settings: Settings) -> Compute:
         max_condition=settings.control.max_condition,
         slope_noise=settings.control.slope_noise,
         wind_m_s=settings.control.wind_m_s,
+        anamorphosis=settings.tracking.anamorphosis,
         cache=settings.service.cache_dir or usual_folder(os.environ),
     )

@@ -142,6 +142,10 @@ class TrackingTable(Table):
     floor_magnification: float | None = Field(default=None, ge=0.0)
     """Of the magnification."""
 
+    anamorphosis: bool = False
+    """Follow the stretch of the mirror's image, too; else it is as the instrument file says. The
+    four numbers are a little less certain for it until some windows have told."""
+
     bias_memory_s: Positive = 3600.0
     """Time in which the learnt bias of the passive estimate decays to 1/e, seconds."""
 

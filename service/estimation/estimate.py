@@ -130,6 +130,12 @@ class DitheredEstimate(Estimate):
     """Mode of the model whose response each mode's answer certainly is, its own where that is not
     certain; empty: not looked at."""
 
+    with_stretches: NDArray[np.float64] | None = None
+    """``(6, 6)`` covariance of α and its anamorphosis together; None: that is not followed."""
+
+    stretched: float = 0.0
+    """Largest step of an anamorphosis from the linearisation to the estimate."""
+
     @property
     def strong(self) -> NDArray[np.bool_]:
         """``(n,)`` which gains are of modes that tell of α."""

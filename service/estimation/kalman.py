@@ -27,6 +27,12 @@ JUMP_THRESHOLD = 23.5
 JUMP_INFLATION = 10.0
 """After a jump each parameter may have moved by this many σ of the innovation."""
 
+STRETCH_SIGMA = 0.02
+"""1 σ of an anamorphosis about the nominal one before anything was measured."""
+
+STRETCH_RATE = 1e-4 / np.sqrt(60.0)
+"""Its random walk after one second: optics are stretched where they stand, not by the night."""
+
 SCATTER_LEARNING = 0.05
 """Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
 
@@ -51,10 +57,13 @@ class Joint:
     """The random walk of α, and N biases that forget themselves."""
 
     mean: Array
-    """``(4 + 4 N,)`` α in numeric units, then the bias of each passive estimate."""
+    """``(n_alpha + 4 N,)`` α in numeric units, then the bias of each passive estimate."""
 
     covariance: Array
-    """``(4 + 4 N, 4 + 4 N)``."""
+    """Of all of them."""
+
+    n_alpha: int = 4
+    """Numbers of α: 6 with its anamorphosis."""
 
     biases: tuple[Bias, ...] = ()
 
@@ -62,6 +71,11 @@ class Joint:
     def alpha(self) -> Array:
         """``(4,)`` the registration."""
         return self.mean[:4]
+
+    @property
+    def stretches(self) -> Array:
+        """``(2,)`` the anamorphosis; ``(0,)`` where it is not followed."""
+        return self.mean[4 : self.n_alpha]
 
     @property
     def alpha_covariance(self) -> Array:
@@ -72,7 +86,7 @@ class Joint:
         """Return where a bias is among the states; behind them all where nothing is known of it."""
         names = [bias.block.name for bias in self.biases]
         k = names.index(block.name) if block.name in names else len(names)
-        return slice(4 + 4 * k, 8 + 4 * k)
+        return slice(self.n_alpha + 4 * k, self.n_alpha + 4 * k + 4)
 
     def bias_of(self, block: BiasBlock) -> Bias:
         """Return what is known of a bias."""
@@ -84,10 +98,11 @@ class Joint:
         return self.mean[self.place(block)]
 
     def seen(self, block: BiasBlock | None) -> Array:
-        """``(4, 4 + 4 N)`` what a look sees: α and its bias; None: what a window does, α alone."""
+        """Return the four rows a look sees, α and its bias; None: all of α, as a window does."""
+        if block is None:
+            return np.eye(self.n_alpha, len(self.mean))
         sees = np.eye(4, len(self.mean))
-        if block is not None:
-            sees[:, self.place(block)] = np.eye(4)
+        sees[:, self.place(block)] = np.eye(4)
         return sees
 
     def with_bias(self, bias: Bias) -> Joint:
@@ -109,7 +124,26 @@ class Drift:
 
 def begin_joint(measured: Array, covariance: Array) -> Joint:
     """Return the estimate after a first dithered measurement: nothing is known of any bias."""
-    return Joint(mean=measured, covariance=covariance)
+    return Joint(mean=measured, covariance=covariance, n_alpha=len(measured))
+
+
+def with_stretches(joint: Joint, nominal: Array) -> Joint:
+    """Return the estimate with an anamorphosis as it is expected, where it has none yet."""
+    if joint.n_alpha > 4:
+        return joint
+    at, expected = [4, 4], np.square(STRETCH_SIGMA) * np.eye(2)
+    covariance = np.insert(np.insert(joint.covariance, at, 0.0, axis=0), at, 0.0, axis=1)
+    covariance[4:6, 4:6] = expected
+    return replace(joint, mean=np.insert(joint.mean, 4, nominal), covariance=covariance, n_alpha=6)
+
+
+def expecting(joint: Joint, nominal: Array) -> Joint:
+    """Return the estimate after a first measurement, its anamorphosis as likely as it is expected.
+
+    What was measured with it follows as far as it depends on it.
+    """
+    sees = np.eye(2, len(joint.mean), 4)
+    return _seen(joint, sees, nominal, np.square(STRETCH_SIGMA) * np.eye(2))
 
 
 def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint:
@@ -151,8 +185,9 @@ def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | Non
     """
     elapsed = max(elapsed_s, 0.0)
     keep, growth = np.ones(len(joint.mean)), np.zeros(len(joint.mean))
-    keep[4:] = fading = float(np.exp(-elapsed / drift.bias_memory_s))
+    keep[joint.n_alpha :] = fading = float(np.exp(-elapsed / drift.bias_memory_s))
     growth[:4] = drift.alpha_rate**2 * elapsed
+    growth[4 : joint.n_alpha] = STRETCH_RATE**2 * elapsed
     if flexure is not None:
         growth[:4] += flexure**2
     for bias in joint.biases:
@@ -170,15 +205,21 @@ def innovation(
 
     Of a passive estimate with this bias; None: of a dithered window.
     """
-    sees = prior.seen(block)
+    sees = prior.seen(block)[: len(measured)]
     difference = measured - sees @ prior.mean
     total = sees @ prior.covariance @ sees.T + noise
     return float(difference @ np.linalg.solve(total, difference))
 
 
 def corrected(prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None) -> Joint:
-    """Fold in a measurement ``(4,)`` with the covariance ``(4, 4)`` of its own scatter."""
-    sees = prior.seen(block)
+    """Fold in a measurement ``(4,)`` with the covariance ``(4, 4)`` of its own scatter.
+
+    A window's may be ``(6,)``: with its anamorphosis, where that is followed.
+    """
+    return _seen(prior, prior.seen(block)[: len(measured)], measured, noise)
+
+
+def _seen(prior: Joint, sees: Array, measured: Array, noise: Array) -> Joint:
     total = sees @ prior.covariance @ sees.T + noise
     gain = np.linalg.solve(total, sees @ prior.covariance).T
     keep = np.eye(len(prior.mean)) - gain @ sees

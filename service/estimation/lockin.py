@@ -253,30 +253,33 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     known = _images(linearisation, _instrument(spectra, coupling, loop, gains))
     if linearisation.noise_shape is not None:  # an instrument may be weighted by anything
         known /= linearisation.noise_shape**2
-    step = np.zeros(4)
+    n = known.shape[1] - 1
+    step = np.zeros(n)
     for _ in range(N_STEPS):
         normal, score = _normal_equations(slopes, seen, known, gains, step)
         change = np.linalg.solve(normal, score)
-        step = step + change[:4]
-        gains = gains + change[4::2] + 1j * change[5::2]
+        step = step + change[:n]
+        gains = gains + change[n::2] + 1j * change[n + 1 :: 2]
     normal, _ = _normal_equations(slopes, seen, known, gains, step)
     spread, misfit = _side_bins(spectra, linearisation, seen, known, gains, step)
     inverse = np.linalg.inv(normal)
     every = inverse @ spread @ inverse.T
-    covariance = every[:4, :4]
+    every = (every + every.T) / 2
     turns = 2 * np.pi * np.array(spectra.plan.frequencies_hz) / loop.frame_rate_hz
     return LockInEstimate(
-        alpha=linearisation.alpha.stepped(step),
-        covariance=(covariance + covariance.T) / 2,
+        alpha=linearisation.stepped(step),
+        covariance=every[:4, :4],
+        with_stretches=every[:n, :n] if n > 4 else None,
+        stretched=float(np.abs(step[4:]).max(initial=0.0)),
         optical_gain=gains,
         lag_frames=-np.angle(gains) / turns,
         misfit=misfit,
-        step=step,
+        step=step[:4],
         t_ns_utc=spectra.t_end_ns_utc,
         cm_id=spectra.cm_id,
         session=spectra.session,
         modes=spectra.plan.modes,
-        gain_sigma=_modulus_sigma(gains, every[4:, 4:]),
+        gain_sigma=_modulus_sigma(gains, every[n:, n:]),
         weak=_weak(spectra),
         answers_as=_answers_as(spectra, matrix),
         dither_m=_total_dither_m(spectra),
@@ -333,11 +336,11 @@ def _summed(first: Array, answer: Array, coupling: Array) -> Array | None:
 
 
 def _images(linearisation: Linearisation, vectors: Array) -> Array:
-    """Return what the sensor makes of modal vectors, ``(n_lines, 5, n_slopes)``.
+    """Return what the sensor makes of modal vectors, ``(n_lines, 5 or 7, n_slopes)``.
 
-    Index 0 is D v, then the four derivatives of D applied to v.
+    Index 0 is D v, then the derivatives of D applied to v.
     """
-    operators = (linearisation.matrix, *linearisation.derivatives)
+    operators = (linearisation.matrix, *linearisation.rates)
     return np.stack([_apply(operator, vectors) for operator in operators], axis=1, dtype=complex)
 
 
@@ -392,27 +395,27 @@ def _total_dither_m(spectra: Spectra) -> float:
 
 
 def _regressors(images: Array, gain: complex, step: Array) -> Array:
-    """Return ``(6, n_slopes)``: four derivatives by α, then by the two parts of the gain."""
+    """Return ``(n + 2, n_slopes)``: derivatives by α, then by the two parts of the gain."""
     response = images[0] + step @ images[1:]
     return np.vstack([gain * images[1:], response, 1j * response])
 
 
-def _unknowns(line: int) -> Array:
-    """Return where the six unknowns of a line stand among all: α is common, the gain its own."""
-    return np.array([0, 1, 2, 3, 4 + 2 * line, 5 + 2 * line])
+def _unknowns(line: int, n: int) -> Array:
+    """Return where the unknowns of a line stand among all: ``n`` are common, the gain its own."""
+    return np.array([*range(n), n + 2 * line, n + 1 + 2 * line])
 
 
 def _normal_equations(
     slopes: Array, seen: Array, known_gains: Array, gains: Array, step: Array
 ) -> tuple[Array, Array]:
     """Return ``M`` and ``b`` of the instrumental-variable step over all lines."""
-    n = 4 + 2 * len(gains)
+    n = len(step) + 2 * len(gains)
     normal, score = np.zeros((n, n)), np.zeros(n)
     for line, gain in enumerate(gains):
         conjugate = _regressors(known_gains[line], gain, step).conj()
         response = _regressors(seen[line], gain, step)
-        residual = slopes[line] - gain * response[4]
-        at = _unknowns(line)
+        residual = slopes[line] - gain * response[-2]
+        at = _unknowns(line, len(step))
         normal[np.ix_(at, at)] += (conjugate @ response.T).real
         score[at] += (conjugate @ residual).real
     return normal, score
@@ -430,7 +433,7 @@ def _side_bins(
 
     What remains there after the same model is noise with the very spectrum the lines suffer from.
     """
-    n = 4 + 2 * len(gains)
+    n = len(step) + 2 * len(gains)
     spread = np.zeros((n, n))
     misfit = []
     matrix = linearisation.matrix_by(step)
@@ -438,8 +441,8 @@ def _side_bins(
         explained = gain * _apply(matrix, spectra.commands[line, 1:])
         residual = spectra.slopes[line, 1:] - explained
         score = _regressors(known[line], gain, step).conj() @ residual.T
-        at = _unknowns(line)
+        at = _unknowns(line, len(step))
         spread[np.ix_(at, at)] += 0.5 * (score @ score.conj().T).real / score.shape[1]
-        left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[4]
+        left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[-2]
         misfit.append(np.sum(np.abs(left) ** 2) / np.mean(np.sum(np.abs(residual) ** 2, axis=1)))
     return spread, float(np.mean(misfit))

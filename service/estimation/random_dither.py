@@ -308,7 +308,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     noise = np.sqrt(_noise_variance(sums))[:, None]
     # in units of the slopes' noise a mode's weight is the power of its dither
     matrix = linearisation.matrix[:, columns] / noise
-    derivatives = linearisation.derivatives[:, :, columns] / noise
+    derivatives = linearisation.rates[:, :, columns] / noise
     measured = Columns(
         matrix=noisy.matrix / noise, weights=power, rows=np.ones(len(noise), dtype=np.bool_)
     )
@@ -316,7 +316,7 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     if trouble is not None:
         kind, reason = trouble
         return WindowRefused(reason=reason, t_ns_utc=window.t_end_ns_utc, kind=kind)
-    step = np.zeros(4)
+    step = np.zeros(len(derivatives))
     seen = measured.project(matrix, derivatives)
     for _ in range(N_STEPS):
         normal = seen.normal
@@ -329,14 +329,17 @@ def fit_random(window: Correlated, linearisation: Linearisation) -> RandomEstima
     if window.plan.n_batches > 1:
         parts = _residuals_of_batches(sums, seen.gains * response, noise)
     spread = _scatter(_scores(parts, seen), normal)
+    every = inverse @ spread @ inverse.T
     return RandomEstimate(
-        alpha=linearisation.alpha.stepped(step),
-        covariance=inverse @ spread @ inverse.T,
+        alpha=linearisation.stepped(step),
+        covariance=every[:4, :4],
+        with_stretches=every if len(step) > 4 else None,
+        stretched=float(np.abs(step[4:]).max(initial=0.0)),
         optical_gain=seen.gains,
         gain_sigma=_gain_sigma(parts, response, power),
         lag_frames=np.array([lag_frames]),
         misfit=seen.chi / n_free,
-        step=step,
+        step=step[:4],
         t_ns_utc=window.t_end_ns_utc,
         cm_id=window.cm_id,
         session=window.session,

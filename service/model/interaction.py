@@ -34,6 +34,9 @@ Value = TypeVar("Value")
 Way = Callable[[Array], Array]
 """From points of the mirror ``(n_points, 2)`` to the direction in which each of them moves."""
 
+LARGEST_STRETCH = 0.2
+"""Beyond a fifth the image is another one."""
+
 UNKNOWN_REACH_SUBAP = 1.0
 """Slopes this near to surface that a table does not know are left out of comparisons."""
 
@@ -54,15 +57,46 @@ class Linearisation:
     noise_shape: NDArray[np.float64] | None = None
     """``(n_slopes,)`` σ of each slope over their RMS; None: all alike."""
 
+    stretches: NDArray[np.float32] | None = None
+    """``(2, n_slopes, n_modes)`` per unit of each anamorphosis; None: it is not followed."""
+
+    @property
+    def rates(self) -> NDArray[np.float32]:
+        """The derivatives, ``(4 or 6, n_slopes, n_modes)``: of the anamorphosis where followed."""
+        if self.stretches is None:
+            return self.derivatives
+        return np.concatenate([self.derivatives, self.stretches])
+
     def matrix_at(self, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D at a registration close by, to first order, ``(n_slopes, n_modes)``."""
-        return self.matrix_by(alpha.vector - self.alpha.vector)
+        step = alpha.vector - self.alpha.vector
+        if self.stretches is not None:
+            step = np.concatenate([step, alpha.stretches - self.alpha.stretches])
+        return self.matrix_by(step)
 
     def matrix_by(self, step: Array) -> NDArray[np.float32]:
-        """Return D a short ``step`` ``(4,)`` away, numeric units, ``(n_slopes, n_modes)``."""
-        moved = np.tensordot(step.astype(np.float32), self.derivatives, axes=1)
+        """Return D a short ``step`` ``(4,)`` or ``(6,)`` away, ``(n_slopes, n_modes)``."""
+        moved = np.tensordot(step[:4].astype(np.float32), self.derivatives, axes=1)
+        if self.stretches is not None and len(step) > 4:
+            moved += np.tensordot(step[4:].astype(np.float32), self.stretches, axes=1)
         moved += self.matrix
         return np.asarray(moved)
+
+    def stepped(self, step: Array) -> Misregistration:
+        """Return the registration a ``step`` ``(4,)`` or ``(6,)`` from where it was taken.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If it leads to a stretch that no image has: what was fitted does not tell it.
+        """
+        moved = self.alpha.stepped(step[:4])
+        if len(step) == 4:
+            return moved
+        stretches = self.alpha.stretches + step[4:]
+        if np.any(np.abs(stretches) > LARGEST_STRETCH):
+            raise np.linalg.LinAlgError(f"an anamorphosis of {np.abs(stretches).max():.2g}")
+        return moved.stretched(stretches)
 
 
 class InteractionModel:
@@ -84,8 +118,10 @@ class InteractionModel:
         dtype: type[np.float32] | type[np.float64] = np.float32,
         mapper: Mapper = map,
         kept_bytes: float = KEPT_BYTES,
+        anamorphosis: bool = False,
     ) -> None:
         self.instrument = instrument
+        self._anamorphosis = anamorphosis
         self.basis = basis
         binning = instrument.binning  # of the finest subapertures, so fine are points and nodes
         pupil = instrument_pupil(instrument, pupil_sampling * binning)
@@ -157,10 +193,14 @@ class InteractionModel:
         return self.seen(alpha, shapes.astype(self._dtype))
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
-        """Return D(α) and its derivatives together."""
+        """Return D(α) and its derivatives together, by an anamorphosis where it is followed."""
+        alpha = self.instrument.with_anamorphosis(alpha)
         matrix, *rates = self._with_rates(alpha)
         return Linearisation(
             alpha=alpha,
+            stretches=self.stretch_derivatives(alpha).astype(np.float32, copy=False)
+            if self._anamorphosis
+            else None,
             matrix=np.ascontiguousarray(self._as_listed(matrix), np.float32),
             derivatives=np.stack([self._as_listed(rate) for rate in rates]).astype(
                 np.float32, copy=False

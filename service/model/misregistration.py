@@ -111,6 +111,15 @@ class Misregistration:
         """Return the registration with another anamorphosis ``(2,)``."""
         return replace(self, anamorphosis=(float(stretches[0]), float(stretches[1])))
 
+    def distance(self, other: Self) -> NDArray[np.float64]:
+        """Return how far ``(4,)`` the numbers lie from another's.
+
+        That of the magnification counts what stretches an axis, too.
+        """
+        apart = np.abs(self.vector - other.vector)
+        apart[3] += float(np.abs(self.stretches - other.stretches).max())
+        return apart
+
     @property
     def image(self) -> NDArray[np.float64]:
         """``(2, 2)`` from a point of the mirror to the sensor, before the shift."""

@@ -194,6 +194,12 @@ class Alpha:
         return PARAMETERS
 
     @property
+    def anamorphosis_sigma(self) -> tuple[float, ...] | None:
+        """1 σ of both numbers of α's anamorphosis; null: it is not followed."""
+        known = self.registration.stretches
+        return None if known is None else tuple(known.sigma.tolist())
+
+    @property
     def age_s(self) -> float:
         """Since the last telemetry that entered it arrived, seconds."""
         return (self.snapshot.now_ns - self.registration.arrived_ns_utc) / 1e9

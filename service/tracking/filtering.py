@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain
+from service.estimation import kalman
 from service.estimation.estimate import DitheredEstimate, model_error
 from service.estimation.kalman import Drift, Joint, begin_joint, predicted
 from service.estimation.lockin import MAX_LAG_FRAMES
@@ -21,6 +22,7 @@ from service.tracking.jumps import as_previous
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
     HistoryEntry,
+    KnownStretches,
     PassiveBias,
     PointedEstimate,
     PreviousEstimate,
@@ -130,6 +132,21 @@ class WindowEstimate(PointedEstimate):
     misfit: float
     """Residual power over what noise explains; 1: the model explains the window."""
 
+    with_stretches: Array | None = None
+    """``(6, 6)`` covariance of α and its anamorphosis together; None: that is not followed."""
+
+    @property
+    def numbers(self) -> Array:
+        """``(4,)``, or ``(6,)`` with the anamorphosis where that is followed."""
+        if self.with_stretches is None:
+            return self.alpha.vector
+        return np.concatenate([self.alpha.vector, self.alpha.stretches])
+
+    @property
+    def noise(self) -> Array:
+        """Covariance of these numbers."""
+        return self.covariance if self.with_stretches is None else self.with_stretches
+
     @property
     def when(self) -> TelemetrySpan:
         """The telemetry it is of."""
@@ -166,17 +183,44 @@ def predict(context: StepContext, registration: Registration, t_ns_utc: int) -> 
     return predicted(joint_of(registration), drift, elapsed_ns / SECOND_NS, bent)
 
 
+def predict_for(context: StepContext, registration: Registration, window: WindowEstimate) -> Joint:
+    """Return what is known at the end of a window, before it: what it follows is in it."""
+    prior = predict(context, registration, window.t_ns_utc)
+    if window.with_stretches is None:
+        return prior
+    return kalman.with_stretches(prior, registration.alpha.stretches)
+
+
 def joint_of(registration: Registration) -> Joint:
     """Return the filter's state that a registration holds."""
     joint = begin_joint(registration.alpha.vector, registration.covariance)
+    known = registration.stretches
+    if known is not None:
+        mean = np.concatenate([joint.mean, registration.alpha.stretches])
+        every = [[joint.covariance, known.shared.T], [known.shared, known.covariance]]
+        joint = begin_joint(mean, np.block(every))
     for bias in registration.biases:
         covariance = [[joint.covariance, bias.shared.T], [bias.shared, bias.covariance]]
         joint = Joint(
             mean=np.concatenate([joint.mean, bias.offset]),
             covariance=np.block(covariance),
+            n_alpha=joint.n_alpha,
             biases=(*joint.biases, bias),
         )
     return joint
+
+
+def alpha_of(joint: Joint, before: Misregistration) -> Misregistration:
+    """Return α as the filter has it; an anamorphosis that it does not follow is that of before."""
+    alpha = before.moved_to(joint.alpha)
+    return alpha.stretched(joint.stretches) if joint.n_alpha > 4 else alpha
+
+
+def stretches_of(joint: Joint) -> KnownStretches | None:
+    """Return how well the filter knows the anamorphosis; None: it does not follow it."""
+    if joint.n_alpha == 4:
+        return None
+    return KnownStretches(covariance=joint.covariance[4:6, 4:6], shared=joint.covariance[4:6, :4])
 
 
 def biases_of(joint: Joint) -> tuple[PassiveBias, ...]:
@@ -215,8 +259,9 @@ def accept(
     anew = update.jumped or (previous is not None and previous.suspected_jump is not None)
     biases = biases_of(joint)
     registration = Registration(
-        alpha=Misregistration.from_vector(joint.alpha),
+        alpha=alpha_of(joint, measured.alpha),
         covariance=joint.alpha_covariance,
+        stretches=stretches_of(joint),
         floor=measured.floor,
         t_ns_utc=when.ended_ns_utc,
         arrived_ns_utc=context.now_ns,

@@ -250,8 +250,9 @@ def _registration_after_passive(
         was = jumps.sum_of(registration, filtering.joint_of(registration), block)
     return replace(
         registration,
-        alpha=Misregistration.from_vector(joint.alpha),
+        alpha=filtering.alpha_of(joint, registration.alpha),
         covariance=joint.alpha_covariance,
+        stretches=filtering.stretches_of(joint),
         t_ns_utc=max(event.t_ns_utc, registration.t_ns_utc),
         arrived_ns_utc=context.now_ns,
         biases=_biases_after_look(context.state, registration, joint, event, was),

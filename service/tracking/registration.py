@@ -128,7 +128,8 @@ class PassiveBias(Bias):
     """``(4, 4)`` of it."""
 
     shared: Array = field(default_factory=lambda: np.zeros((4, 4)))
-    """``(4, 4 + 4 k)`` covariance of it (rows) with α and the ``k`` biases before it (columns)."""
+    """``(4, n + 4 k)`` covariance of it (rows) with the ``n`` numbers of α, 6 with its
+    anamorphosis, and the ``k`` biases before it (columns)."""
 
     looked_ns_utc: int = 0
     """End of the telemetry of the last passive estimate, the RTC's clock; 0: there was none."""
@@ -143,6 +144,22 @@ class PassiveBias(Bias):
 def without_previous(biases: tuple[PassiveBias, ...]) -> tuple[PassiveBias, ...]:
     """Return biases without what was known before their last looks: it tells nothing of now."""
     return tuple(replace(bias, previous_estimate=None) for bias in biases)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KnownStretches:
+    """How well the anamorphosis in α is known; the numbers themselves are α's."""
+
+    covariance: Array
+    """``(2, 2)`` of both."""
+
+    shared: Array
+    """``(2, 4)`` covariance of both (rows) with the four of α (columns)."""
+
+    @property
+    def sigma(self) -> Array:
+        """``(2,)`` 1 σ of both."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -240,6 +257,9 @@ class Registration:
 
     nominal: Misregistration | None = None
     """Where the law of pointing had the mirror when α was as it is here; None: there is no law."""
+
+    stretches: KnownStretches | None = None
+    """How well its anamorphosis is known; None: that is not followed."""
 
     def bias(self, block: BiasBlock) -> PassiveBias | None:
         """Return what is known of a bias; None: nothing is."""

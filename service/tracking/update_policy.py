@@ -59,7 +59,7 @@ def verdict_invalid_reason(
     registration = state.alpha.registration
     if registration is None or judged is None:
         return None if registration is None else why_of_another_loop(state, judged, gains)
-    moved = np.abs(registration.alpha.vector - judged.alpha.vector)
+    moved = registration.alpha.distance(judged.alpha)
     if np.any(moved + 3.0 * registration.sigma > 3.0 * judged.sigma + REACH):
         return "α ± 3σ reaches further than it was judged for"
     return why_of_another_loop(state, judged, gains)
@@ -140,9 +140,7 @@ def assessment_is_old(state: TrackerState, in_use: ReconstructorRecord) -> bool:
     ):
         return False
     noise = np.sqrt(np.diag(registration.covariance))
-    return bool(
-        np.any(np.abs(registration.alpha.vector - last.alpha.vector) > np.maximum(NOTICED, noise))
-    )
+    return bool(np.any(registration.alpha.distance(last.alpha) > np.maximum(NOTICED, noise)))
 
 
 def _gain_reason(
@@ -240,7 +238,7 @@ def _apart(
         return False
     if record.alpha is None or record.sigma is None:
         return True
-    distance = np.abs(registration.alpha.vector - record.alpha.vector)
+    distance = registration.alpha.distance(record.alpha)
     noise = np.sqrt(np.diag(registration.covariance))
     return bool(np.any(distance > np.maximum(threshold, 3.0 * noise)))
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.alarms import STALE, Interlock, alarm_blocks
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.registration import (
@@ -159,10 +159,12 @@ def change_subapertures(context: StepContext, scale: Array, config_id: str) -> N
 
 def in_subapertures(registration: Registration, scale: Array, config_id: str) -> Registration:
     """Return what is known of α in the subapertures of another mode of the sensor."""
+    known = registration.stretches
     return replace(
         registration,
-        alpha=Misregistration.from_vector(registration.alpha.vector * scale),
+        alpha=registration.alpha.moved_to(registration.alpha.vector * scale),
         covariance=registration.covariance * np.outer(scale, scale),
+        stretches=known and replace(known, shared=known.shared * scale),
         floor=registration.floor * scale,
         grown=registration.grown * scale**2,
         optical_gain=None,

@@ -92,6 +92,7 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
         ),
         floor=filtering.model_error_of(registration, estimate, context.policy),
         misfit=estimate.misfit,
+        with_stretches=estimate.with_stretches,
     )
     process_window(context, measured)
 
@@ -124,7 +125,9 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     """Fold a dithered window in, hold it, or have it decide about the one held before."""
     registration = context.registration
     if registration is None:
-        joint = kalman.begin_joint(measured.alpha.vector, measured.covariance)
+        joint = kalman.begin_joint(measured.numbers, measured.noise)
+        if measured.with_stretches is not None:
+            joint = kalman.expecting(joint, context.nominal.stretches)
         filtering.accept(context, FilterUpdate(joint=joint, n_windows=1, innovation=0.0), measured)
         return
     first = jumps.previous_window(registration)
@@ -154,9 +157,9 @@ def process_window(context: StepContext, measured: WindowEstimate) -> None:
     if far.is_outlier:
         _suspect_jump(context, registration, measured, far)
         return
-    prior = filtering.predict(context, registration, measured.t_ns_utc)
+    prior = filtering.predict_for(context, registration, measured)
     update = FilterUpdate(
-        joint=kalman.corrected(prior, measured.alpha.vector, measured.covariance),
+        joint=kalman.corrected(prior, measured.numbers, measured.noise),
         n_windows=filtering.n_agreeing(context, registration, prior),
         innovation=_innovation(prior, measured),
         scatter=kalman.learnt(registration.scatter, far.mahalanobis_squared),
@@ -217,7 +220,7 @@ def _jump(
     the second wherever the jump fell in it: the loop suffers, and a third would cost seconds.
     """
     policy = context.policy
-    prior = filtering.predict(context, registration, measured.t_ns_utc)
+    prior = filtering.predict_for(context, registration, measured)
     noise = measured.covariance
     whole = jumps.wholly_after(first, measured, registration.alpha, policy)
     if whole:
@@ -227,7 +230,7 @@ def _jump(
     if whole:
         joint = kalman.corrected(joint, first.alpha.vector, noise)
     update = FilterUpdate(
-        joint=kalman.corrected(joint, measured.alpha.vector, measured.covariance),
+        joint=kalman.corrected(joint, measured.numbers, measured.noise),
         n_windows=2 if whole or both.excess > jumps.FARTHEST else 1,
         innovation=_innovation(prior, measured),
         scatter=registration.scatter,

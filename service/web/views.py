@@ -211,7 +211,9 @@ def _plain(value: Any, of: View | None) -> Any:  # noqa: ANN401  any value of a 
     if isinstance(value, _LASTING):
         return _lasting(value)
     if isinstance(value, Misregistration):
-        return named_parameters(value.vector)
+        four = named_parameters(value.vector)
+        told = value.anamorphosis
+        return four if told is None else four | {"anamorphosis": list(told)}
     if isinstance(value, np.ndarray):
         return named_parameters(value)
     if isinstance(value, tuple | list):
@@ -261,7 +263,8 @@ define_view("ModeProofView", mode_limits.ModeProof, "n_proven contrary_modes own
 ALPHA = define_view(
     "AlphaView",
     Alpha,
-    "registration.alpha registration.sigma registration.floor covariance parameters "
+    "registration.alpha registration.sigma anamorphosis_sigma registration.floor covariance "
+    "parameters "
     "registration.t_ns_utc age_s window_age_s "
     "registration.n_windows validity=registration.validity.level "
     "validity_reason=registration.validity.reason "

@@ -47,7 +47,7 @@ from service.runtime.worker.records import (
     waits,
 )
 from service.runtime.worker.rows import SharedRows
-from service.runtime.worker.sensor import REACH, SensorAtWork, length, near_enough
+from service.runtime.worker.sensor import REACH, SensorAtWork, length, settled
 
 MAX_APPROACHES = 5
 """Steps of the coarse model; from the edge of the capture range three are enough."""
@@ -104,6 +104,7 @@ class OpticsWorker:
                 kept_bytes=compute.kept_bytes,
                 mapper=self.rows.map,
                 mode_response=self._mode_response,
+                anamorphosis=compute.anamorphosis,
             )
 
         sampling, nodes, working_point_modes = compute.sampling
@@ -115,7 +116,7 @@ class OpticsWorker:
         )
         self._model = self._sensor.flat
         self._coarse = model(COARSE_SAMPLING, COARSE_SAMPLING, None)
-        self._start = instrument.start
+        self._start = instrument.with_anamorphosis(instrument.start)
         self._wide_capture: dict[tuple[int, ...], tuple[RtcInteractionModel, ...]] = {}
 
     def tidy(self) -> None:
@@ -164,9 +165,10 @@ class OpticsWorker:
 
         def computed() -> dict[str, NDArray[np.float32]]:
             found = self._sensor.linearise(start)
-            return {"matrix": found.matrix, "derivatives": found.derivatives}
+            return {name: getattr(found, name) for name in names}
 
-        what = ("linearisation", *sampling, start.vector.tolist())
+        names = ("matrix", "derivatives", "stretches")[: 3 if self._compute.anamorphosis else 2]
+        what = ("linearisation", *sampling, start.vector.tolist(), *names[2:])
         kept = self._disk_cache.arrays(self._model.instrument, what, computed)
         return Linearisation(alpha=start, **kept, noise_shape=self._model.noise_shape)
 
@@ -288,10 +290,10 @@ class OpticsWorker:
             if near is None:
                 return None
             estimate = fit_window(spectra, self._sensor.linearise(near), loop)
-        if not near_enough(estimate.step, estimate.covariance):
+        if not settled(estimate):
             # near enough; or the coarse model's bias, flat as it is, was more than what settles
             estimate = fit_window(spectra, self._sensor.linearise(estimate.alpha), loop)
-        return estimate if near_enough(estimate.step, estimate.covariance) else None
+        return estimate if settled(estimate) else None
 
     def find(
         self,
@@ -338,7 +340,7 @@ class OpticsWorker:
             for _ in range(MAX_APPROACHES):
                 if isinstance(estimate, WindowRefused):
                     return estimate
-                if near_enough(estimate.step, estimate.covariance):
+                if settled(estimate):
                     return self._against_flat(estimate)
                 begun = start or self._start
                 if np.any(np.abs(estimate.alpha.vector - begun.vector) > FIT_RANGE):

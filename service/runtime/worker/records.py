@@ -90,6 +90,9 @@ class Compute:
     wind_m_s: float = 15.0
     """At which the expected loss of a reconstructor is computed."""
 
+    anamorphosis: bool = False
+    """Whether dithered windows are asked for the anamorphosis, too."""
+
     cache: Path | None = None
     """Folder of what is prepared once; None: it is computed every time."""
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from service.estimation.estimate import DitheredEstimate
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
@@ -28,6 +29,9 @@ but straight, and another linearisation would cost more than it tells."""
 FLAW = np.array([2.5e-4, 2.5e-4, 1.5e-5, 3e-5])
 """What such a step of all four leaves at most, on FLAO with any set of modes (numeric units); it
 grows as the square of the step. A fifteenth of the floor of a flat model."""
+
+STRETCHED = float(SETTLED[3])
+"""The same of an anamorphosis: it is a length as a magnification is."""
 
 REACH = 4.0
 """A step this long, in units of ``SETTLED``, ends well within one of them."""
@@ -84,9 +88,15 @@ class SensorAtWork:
     def near(self, alpha: Misregistration) -> Linearisation:
         """Return the linearisation at hand if it is close enough, else a new one."""
         kept = self._linearisation
-        if kept is None or np.any(np.abs(alpha.vector - kept.alpha.vector) > SETTLED):
+        if kept is None or self._apart(alpha, kept.alpha):
             return self.linearise(alpha)
         return kept
+
+    def _apart(self, *both: Misregistration) -> bool:
+        """Return whether a linearisation at one of two registrations is not for the other."""
+        one, other = (self._instrument.with_anamorphosis(alpha) for alpha in both)
+        stretched = np.abs(one.stretches - other.stretches) > STRETCHED
+        return bool(np.any(np.abs(one.vector - other.vector) > SETTLED) or np.any(stretched))
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return a new linearisation about ``alpha``, and keep it."""
@@ -121,7 +131,12 @@ class SensorAtWork:
         if self.is_flat:
             return near
         ratio = self.ratio().astype(np.float32)
-        return replace(near, matrix=near.matrix / ratio, derivatives=near.derivatives / ratio)
+        return replace(
+            near,
+            matrix=near.matrix / ratio,
+            derivatives=near.derivatives / ratio,
+            stretches=None if near.stretches is None else near.stretches / ratio,
+        )
 
     def follow(self, modes: tuple[int, ...], optical_gain: NDArray[np.complex128]) -> bool:
         """Take the working point from the optical gains of dithered modes; whether it moved.
@@ -162,6 +177,11 @@ class SensorAtWork:
 def length(step: Array) -> float:
     """Return the length of a step ``(4,)`` of α, in units of what counts as settled."""
     return float(np.abs(step / SETTLED).max())
+
+
+def settled(estimate: DitheredEstimate) -> bool:
+    """Return whether a fit may stay where its step has led it."""
+    return near_enough(estimate.step, estimate.covariance) and estimate.stretched < STRETCHED
 
 
 def near_enough(step: Array, covariance: Array) -> bool:

@@ -66,7 +66,7 @@ export class MirrorOnSensor {
     if (alpha) {
       const far = this.#places.map(({ from, to }) => Math.hypot(to[0] - from[0], to[1] - from[1]));
       const most = far.length ? `farthest actuator ${(100 * Math.max(...far)).toFixed(1)} % of a subaperture from its place` : "no actuators are known: modes were measured";
-      text = `${most}`;
+      text = `${most}${stretched(alpha)}`;
     }
     this.text = text;
     this.canvas.setAttribute("aria-label", `Mirror on the sensor: ${text}`);
@@ -188,17 +188,29 @@ function apart(places, pitch, shown) {
   return chosen;
 }
 
+// What is known of an anamorphosis, where it is followed.
+function stretched({ anamorphosis }) {
+  if (!anamorphosis) return "";
+  const [along, askew] = anamorphosis.map((value) => `${value < 0 ? "−" : "+"}${Math.abs(100 * value).toFixed(2)} %`);
+  return `; stretched by ${along} along x, ${askew} along 45 deg`;
+}
+
 function distance([x, y], [otherX, otherY]) {
   return Math.hypot(x - otherX, y - otherY);
 }
 
-// A point of the mirror on the sensor: turned and scaled about the pupil's centre, shifted last.
+// A point of the mirror on the sensor: turned and scaled about the pupil's centre, stretched, shifted last.
 function onSensor([x, y], alpha) {
   const [shiftX, shiftY, rotation, magnification] = PARAMETERS.map((p) => alpha[p.key]);
   const turn = (rotation * Math.PI) / 180;
+  const [along, askew] = alpha.anamorphosis ?? [0, 0];
+  const turned = [
+    magnification * (x * Math.cos(turn) - y * Math.sin(turn)),
+    magnification * (x * Math.sin(turn) + y * Math.cos(turn)),
+  ];
   return [
-    magnification * (x * Math.cos(turn) - y * Math.sin(turn)) + shiftX,
-    magnification * (x * Math.sin(turn) + y * Math.cos(turn)) + shiftY,
+    (1 + along) * turned[0] + askew * turned[1] + shiftX,
+    askew * turned[0] + (1 - along) * turned[1] + shiftY,
   ];
 }
 

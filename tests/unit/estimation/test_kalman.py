@@ -15,10 +15,12 @@ from service.estimation.kalman import (
     allowing,
     begin_joint,
     corrected,
+    expecting,
     forget,
     innovation,
     predicted,
     widened,
+    with_stretches,
 )
 
 DITHERED = np.diag(np.array([0.008, 0.008, np.deg2rad(0.02), 0.0008]) ** 2)
@@ -360,3 +362,47 @@ def test_one_dither_a_minute_holds_the_shifts_to_a_percent_whatever_the_wind():
     rms = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
     assert np.all(rms[:2] < 0.01)
     assert 0.5 < np.mean(np.concatenate(squares)) / 4 < 1.1
+
+
+class TestAnamorphosis:
+    """Two more numbers of α, where they are followed."""
+
+    NOISE = np.diag([*SIGMA, 0.004, 0.003]) ** 2 + 2e-6 * np.outer(*2 * [[1, 1, 0, 0, 1, 0]])
+    SEEN = np.array([0.02, -0.01, 0.001, 1.002, 0.018, -0.003])
+
+    def test_a_first_window_and_what_is_expected_are_weighed_by_their_precision(self):
+        """Expected is 0 with 2 %; what the window knows together follows as it is correlated."""
+        found = expecting(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
+        prior = np.diag([0.0, 0.0, 0.0, 0.0, 2500.0, 2500.0])
+        precision = np.linalg.inv(self.NOISE)
+        expected = np.linalg.solve(precision + prior, precision @ self.SEEN)
+        np.testing.assert_allclose(found.mean, expected, rtol=1e-9)
+        np.testing.assert_allclose(found.covariance, np.linalg.inv(precision + prior), rtol=1e-7)
+        np.testing.assert_array_equal(found.stretches, found.mean[4:])
+
+    def test_one_that_is_followed_from_now_on_is_as_uncertain_as_any(self):
+        before = begun(NOWHERE, DITHERED)
+        found = with_stretches(before, np.array([0.01, 0.0]))
+        assert with_stretches(found, np.ones(2)) is found
+        np.testing.assert_array_equal(found.stretches, [0.01, 0.0])
+        np.testing.assert_array_equal(found.covariance[4:6, 4:6], 4e-4 * np.eye(2))
+        np.testing.assert_array_equal(found.alpha_covariance, before.alpha_covariance)
+        np.testing.assert_array_equal(found.bias(PASSIVE_BIAS), before.bias(PASSIVE_BIAS))
+        assert np.count_nonzero(found.covariance[4:6, :4]) == 0
+
+    def test_a_window_that_does_not_tell_it_tells_the_four(self):
+        prior = expecting(begin_joint(self.SEEN, self.NOISE), np.zeros(2))
+        found = corrected(prior, self.SEEN[:4], DITHERED)
+        assert np.all(np.diag(found.covariance) <= np.diag(prior.covariance) + 1e-15)
+        assert len(found.mean) == 6
+
+    def test_a_jump_of_the_mirror_leaves_it(self):
+        prior = begin_joint(self.SEEN, self.NOISE)
+        wider = widened(prior, DITHERED)
+        np.testing.assert_array_equal(wider.covariance[4:, 4:], prior.covariance[4:, 4:])
+        assert np.all(np.diag(wider.covariance)[:4] > 50.0 * np.diag(DITHERED))
+
+    def test_it_walks_far_more_slowly_than_the_mirror(self):
+        """1e-4 after a minute, where the magnification drifts by 5e-4."""
+        later = predicted(begin_joint(self.SEEN, 0.0 * self.NOISE), DRIFT, 60.0)
+        np.testing.assert_allclose(np.sqrt(np.diag(later.covariance)[4:]), 1e-4)

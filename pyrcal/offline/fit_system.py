@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pyrcal.offline.figures import check_plots
 from pyrcal.offline.fit_file import fit_file
 from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.report import FitReport
-from pyrcal.offline.system import Pair, System
+from pyrcal.offline.system import SHIFTS, Pair, System
 from pyrcal.offline.system_figures import write_system_sheet
 from pyrcal.offline.system_file import load_system
-from pyrcal.offline.system_fit import fit_system
+from pyrcal.offline.system_fit import SystemFit, fit_system
 from pyrcal.offline.system_report import SystemReport, document, fill_system, table
 from pyrcal.terminal import show_progress
 from service.archive.store import write_whole
 from service.errors import MatrixError, PyrcalError
 from service.files.container import DATASET, opened
+from service.model.instrument import Instrument
+from service.model.kinds import Stop
 
 ACCEPTED, REFUSED = 0, 1
+
+PUPIL_SUBAP = 0.02
+"""By which the pupil must lie elsewhere on a grid to be worth another fit."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -39,12 +46,12 @@ def main(options: argparse.Namespace) -> int:
     if options.plot is not None:
         check_plots()
     system = load_system(options.system)
-    stored = matrices_of(system, options.reference, options.dataset)
-    fits = tuple(
-        _fitted(system, pair, one, options.threads)
-        for pair, one in zip(system.pairs, stored, strict=True)
+    stored = dict(
+        zip(system.pairs, matrices_of(system, options.reference, options.dataset), strict=True)
     )
-    report = report_of(system, fits)
+    report = fit_pairs(
+        system, lambda pair, about: _fitted(system, pair, about, stored[pair], options.threads)
+    )
     print(json.dumps(document(report), allow_nan=False) if options.json else table(report))
     if options.output is not None:
         write_whole(options.output, partial(fill_system, report=report))
@@ -53,14 +60,37 @@ def main(options: argparse.Namespace) -> int:
     return ACCEPTED if report.accepted else REFUSED
 
 
-def report_of(system: System, fits: tuple[FitReport, ...]) -> SystemReport:
-    """Return where everything is, from the fits of all pairs; refused ones tell nothing."""
-    accepted = np.array([one.fit.accepted for one in fits])
-    alphas = np.array([one.fit.alpha.vector for one in fits])
-    alphas[~accepted] = np.nan
-    covariances = np.array([one.fit.covariance for one in fits])
-    found = fit_system(system, alphas, covariances) if accepted.any() else None
-    return SystemReport(system=system, fits=fits, found=found)
+def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> SystemReport:
+    """Return where everything is, from a fit of each pair as an instrument.
+
+    A sensor that is shifted has the pupil elsewhere on its grid. Where that was not known, its
+    pairs are fitted again with the pupil there.
+    """
+    fits = {pair: fit(pair, system.instrument(pair)) for pair in system.pairs}
+    at_rest = [one.fit.converged for one in fits.values()]
+    found = _found(system, fits, np.array(at_rest))
+    for number, sensor in enumerate(system.sensors):
+        if found is None or sensor.instrument.stop is Stop.MIRROR:
+            break
+        shift = found.values[system.of_sensor(number)][SHIFTS]
+        if np.hypot(*(shift - [sensor.place.shift.real, sensor.place.shift.imag])) < PUPIL_SUBAP:
+            continue
+        for pair in (pair for pair in system.pairs if pair.sensor == number):
+            about = replace(system.instrument(pair), pupil_shift_subap=tuple(shift.tolist()))
+            fits[pair] = fit(pair, about)
+    accepted = np.array([one.fit.accepted for one in fits.values()])
+    found = _found(system, fits, accepted)
+    return SystemReport(system=system, fits=tuple(fits.values()), found=found)
+
+
+def _found(
+    system: System, fits: dict[Pair, FitReport], used: NDArray[np.bool_]
+) -> SystemFit | None:
+    """Return where everything is by those pairs that are used; None: by none."""
+    alphas = np.array([one.fit.alpha.vector for one in fits.values()])
+    alphas[~used] = np.nan
+    covariances = np.array([one.fit.covariance for one in fits.values()])
+    return fit_system(system, alphas, covariances) if used.any() else None
 
 
 class StoredMatrix(NamedTuple):
@@ -112,12 +142,14 @@ def _check_there(stored: StoredMatrix, names: str) -> None:
             )
 
 
-def _fitted(system: System, pair: Pair, stored: StoredMatrix, threads: int) -> FitReport:
+def _fitted(
+    system: System, pair: Pair, about: Instrument, stored: StoredMatrix, threads: int
+) -> FitReport:
     names = " x ".join(system.names(pair))
     lit = system.lit(pair)
     try:
         report = fit_file(
-            system.instrument(pair),
+            about,
             stored.path,
             FitOptions(modes=lit),
             dataset=stored.dataset,

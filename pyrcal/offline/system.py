@@ -225,9 +225,11 @@ class System:
             *(key for key in about.unknown if key.startswith("wfs.")),
             *(key for key in own.unknown if key.startswith("mirror.")),
         )
+        shift = sensor.place.shift
         return replace(
             about,
             name=f"{sensor.name}-{mirror.name}",
+            pupil_shift_subap=(shift.real, shift.imag) if shift else None,
             mirror=self._drawing(pair),
             modes=own.modes,
             unknown=unknown,

@@ -179,6 +179,10 @@ class Instrument(Telescope):
     pupil: PupilMap | None = None
     """Outline and obscurations as they are; None: a ring, with the spider's arms."""
 
+    pupil_shift_subap: tuple[float, float] | None = None
+    """Where the pupil's centre lies on the sensor's grid with the telescope as stop; None: in its
+    middle."""
+
     law: PointingLaw | None = None
     """Where the mirror lies at any pointing; None: at the same place."""
 
@@ -280,6 +284,7 @@ _LATER = frozenset(
         "sensor_modes",
         "law",
         "pupil",
+        "pupil_shift_subap",
         "spiders_m",
         "spiders_deg",
         "nominal_anamorphosis",

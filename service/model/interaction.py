@@ -247,7 +247,7 @@ class InteractionModel:
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
         """Shift of the pupil images: with the telescope as stop they stay where they are."""
         if self.instrument.stop is Stop.TELESCOPE:
-            return (0.0, 0.0)
+            return self.instrument.pupil_shift_subap or (0.0, 0.0)
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _mirror_points(self, alpha: Misregistration) -> NDArray[np.float64]:
@@ -258,9 +258,8 @@ class InteractionModel:
         self, alpha: Misregistration, points: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return where points of the pupil lie on the mirror, ``(n_points, 2)``."""
-        if self.instrument.stop is Stop.TELESCOPE:
-            points = points - alpha.vector[:2]
-        return self.instrument.with_anamorphosis(alpha).on_mirror(points)
+        beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
+        return self.instrument.with_anamorphosis(alpha).on_mirror(points + beside)
 
     def _rendered(self, alpha: Misregistration) -> Shapes:
         shift = self._image_shift(alpha)

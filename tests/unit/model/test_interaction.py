@@ -209,6 +209,17 @@ def test_the_error_of_a_linearisation_is_of_second_order():
 # --- stops
 
 
+def test_a_pupil_that_lies_elsewhere_is_seen_as_one_that_the_mirror_carries_there():
+    """Both stops, with pupil and mirror shifted alike: the same D, and known all the same."""
+    carried, fixed = small_model(Stop.MIRROR), small_instrument(stop=Stop.TELESCOPE)
+    beside = (SOMEWHERE.shift_x_subap, SOMEWHERE.shift_y_subap)
+    there = InteractionModel(replace(fixed, pupil_shift_subap=beside), small_basis())
+    expected = carried.interaction_matrix(SOMEWHERE)
+    np.testing.assert_allclose(
+        there.interaction_matrix(SOMEWHERE), expected, atol=1e-6 * np.abs(expected).max()
+    )
+
+
 def test_with_the_telescope_as_stop_the_sensor_does_not_know_of_the_shift():
     model = small_model(Stop.TELESCOPE)
     shapes = small_basis().render(model.pupil.points)

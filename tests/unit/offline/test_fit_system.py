@@ -1,13 +1,19 @@
 """``pyrcal fit-system``: files in, where everything is out."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
+from pyrcal.offline.fit_system import fit_pairs
+from pyrcal.offline.system_file import load_system
+from pyrcal.offline.system_report import table
+from service.model.misregistration import Misregistration
 from tests.unit.offline import systems
+from tests.unit.offline.made import a_fit, a_report
 
 NOISE = 0.005
 """Of the largest slope."""
@@ -142,3 +148,60 @@ def test_a_matrix_of_another_shape_names_its_pair(folder, capsys):
     line = refusal(folder, capsys, "short.h5")
     assert "lgs1 x dm1: " in line
     assert "found shape (" in line
+
+
+def told_by(system, values, asked_for):
+    """Return a fit of any pair that tells the truth, and notes where the pupil was taken to lie."""
+    told = dict(zip(system.pairs, system.alphas(values), strict=True))
+
+    def fit(pair, about):
+        asked_for.append((pair, about.pupil_shift_subap))
+        alpha = Misregistration.from_vector(told[pair])
+        return a_report(a_fit(alpha=alpha, covariance=np.diag([1e-6, 1e-6, 1e-8, 1e-8])))
+
+    return fit
+
+
+def test_pairs_of_a_shifted_sensor_are_fitted_again_with_the_pupil_there(folder):
+    system, asked_for = load_system(folder / "system.toml"), []
+    values = system.nominal.copy()
+    values[system.of_sensor(1)][:2] = [0.3, -0.1]
+    report = fit_pairs(system, told_by(system, values, asked_for))
+    first, again = asked_for[:4], asked_for[4:]
+    assert [one for _, one in first] == [None] * 4
+    assert [pair for pair, _ in again] == [pair for pair in system.pairs if pair.sensor == 1]
+    assert np.array([one for _, one in again]) == pytest.approx(np.tile([0.3, -0.1], (2, 1)))
+    assert report.accepted
+
+
+def test_pairs_that_disagree_are_refused_and_the_worst_is_named(folder):
+    system = load_system(folder / "system.toml")
+    fit = told_by(system, system.nominal, [])
+    wrong = system.pairs[3]
+
+    def one_wrong(pair, about):
+        report = fit(pair, about)
+        moved = report.fit.alpha.stepped(np.array([0.0, 0.0, 0.01, 0.0]) * (pair == wrong))
+        return replace(report, fit=replace(report.fit, alpha=moved))
+
+    report = fit_pairs(system, one_wrong)
+    assert not report.accepted
+    assert report.verdict.startswith("refused: the pairs disagree (chi2 ")
+    assert "rotation_deg by " in report.verdict
+
+
+def test_a_refused_pair_is_left_out_and_named(folder):
+    system = load_system(folder / "system.toml")
+    fit = told_by(system, system.nominal, [])
+
+    def one_refused(pair, about):
+        report = fit(pair, about)
+        if pair == system.pairs[1]:
+            refused = {"accepted": False, "verdict": "refused: too much noise"}
+            report = replace(report, fit=replace(report.fit, **refused))
+        return report
+
+    report = fit_pairs(system, one_refused)
+    assert report.verdict == "refused: 1 of 4 pairs: lgs1 x dm2: too much noise"
+    assert np.isnan(report.found.misfit[1]).all()
+    assert "  refused" in table(report)

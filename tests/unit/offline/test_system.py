@@ -1,9 +1,11 @@
 """What pairs see of a system: hand cases, rates, and D in the drawing or by α."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pyrcal.offline.system import ARCSEC_RAD, Pair
+from pyrcal.offline.system import ARCSEC_RAD, SHIFTS, Pair
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from tests.unit.offline import systems
@@ -96,8 +98,12 @@ def test_d_at_alpha_is_that_of_the_system_moved_there(system, pair):
     """By α of the nominal drawing, or drawn where everything is: the same matrix."""
     values = systems.moved(system, np.random.default_rng(5))
     alpha = Misregistration.from_vector(system.alphas(values)[system.pairs.index(pair)])
+    shift = tuple(values[system.of_sensor(pair.sensor)][SHIFTS])
     model = RtcInteractionModel(
-        system.instrument(pair), system.basis(pair), pupil_sampling=4, detector_nodes=4
+        replace(system.instrument(pair), pupil_shift_subap=shift),
+        system.basis(pair),
+        pupil_sampling=4,
+        detector_nodes=4,
     )
     ours, drawn = model.interaction_matrix(alpha), systems.matrix(system, pair, values)
     assert np.abs(ours - drawn).max() < 2e-5 * np.abs(drawn).max()

@@ -9,7 +9,7 @@ from typing import Annotated, Self
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import AwareDatetime, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, AwareDatetime, BeforeValidator, Field, model_validator
 
 from service.archive import Archive, Mark, Night
 from service.archive.nights import FOREVER_NS, TREND_S, Annotation, TrendSample
@@ -32,7 +32,20 @@ def _said_as_a_clock_does(value: object) -> object:
     return value
 
 
-Clock = Annotated[AwareDatetime, BeforeValidator(_said_as_a_clock_does)]
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_LAST = _EPOCH + timedelta(microseconds=FOREVER_NS // 1000)
+
+
+def _in_nanoseconds(time: datetime) -> datetime:
+    if not _EPOCH <= time <= _LAST:
+        expected = f"{_EPOCH:%Y-%m-%dT%H:%M:%SZ} to {_LAST:%Y-%m-%dT%H:%M:%SZ}, in nanoseconds"
+        raise ValueError(f"found {time.isoformat()}, expected a time from {expected}")
+    return time
+
+
+Clock = Annotated[
+    AwareDatetime, BeforeValidator(_said_as_a_clock_does), AfterValidator(_in_nanoseconds)
+]
 
 
 class TimeParameters(views.Parameters):
@@ -81,9 +94,6 @@ class RangeParameters(TimeParameters):
     points: Points | None = None
     """At most so many entries of the whole range, whatever the limit: the lowest and the highest of
     each parameter in each part of it."""
-
-
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def _nanoseconds(time: datetime | None) -> int | None:

@@ -47,7 +47,7 @@ TOGETHER = {
 
 ANYWHERE = (
     r"expected printable characters|found [-\d.e+]+, expected a valid integer|"
-    "a time in nanoseconds or as RFC 3339|since <= until"
+    "a time in nanoseconds or as RFC 3339|expected a time from 1970-|since <= until"
 )
 """Names and reasons that act on a terminal; a whole number that is written as 36.0; times."""
 

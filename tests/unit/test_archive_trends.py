@@ -143,3 +143,23 @@ async def test_the_trends_are_answered_with_how_far_apart_they_are(client, servi
     thin = (await client.get("/v1/trends", params={"points": 8})).json()
     assert len(thin["samples"]) <= 8
     assert thin["interval_s"] > 15 * 100 / 8
+
+
+PATHS = ("trends", "nights", "marks", "annotations", "audit", "alpha/history")
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("query", ["since=0020-01-01T00:00:00Z", "until=9999-01-01T00:00:00Z"])
+async def test_a_time_that_no_clock_here_can_have_is_refused_with_those_that_can(
+    client, path, query
+):
+    told = await client.get(f"/v1/{path}?{query}")
+    assert told.status_code == 422, told.text
+    expected = "expected a time from 1970-01-01T00:00:00Z to 2262-04-11T23:47:16Z"
+    assert expected in told.json()["detail"]
+
+
+@pytest.mark.parametrize("path", ["trends", "nights", "marks", "annotations"])
+async def test_the_first_and_the_last_time_there_can_be_are_answered(client, path):
+    query = "since=1970-01-01T00:00:00Z&until=2262-04-11T23:47:16Z"
+    assert (await client.get(f"/v1/{path}?{query}")).status_code == 200

@@ -91,7 +91,7 @@ def create_app(
     app.add_middleware(RequestId)
     app.state.service = service
     app.state.keys = keys
-    app.state.bodies = set()
+    app.state.bodies = {}
     app.state.slopes = page.SlopesCache()
     app.state.stream = page.Stream(service, over or asyncio.Event())
     problems.install(app)

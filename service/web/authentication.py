@@ -24,7 +24,8 @@ from typing_extensions import override
 
 from service.archive import Actor, AuditEntry, Channel
 from service.errors import ConfigurationError, UnknownIdError
-from service.web.connections import RETRY_S, Middleware, bounded, to_its_end
+from service.web.bodies import bounded
+from service.web.connections import RETRY_S, Middleware, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
 from service.web.problems import INVALID, UNKNOWN, problem
 from service.web.views import answer, define_view, held, shows

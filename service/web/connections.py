@@ -1,4 +1,4 @@
-"""Limits of time and memory, request ids, idempotency.
+"""Idle connections, request ids, idempotency, what a client has already.
 
 The same POST sent twice, by a double click or a lost answer, is carried out once; what a client has
 already is not sent again.
@@ -26,17 +26,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bound_contextvars
 from typing_extensions import override
 
-from service.errors import BusyError, PyrcalError, TooLargeError, TooSlowError
-from service.web.problems import known_problem, problem
-
-MAX_BODY_BYTES = 1_000_000
-"""Of a request; uploads to be fitted have a limit of their own."""
-
-BODY_S = 20.0
-"""Longest time the body of a request may take to come, seconds."""
-
-MAX_BODIES = 50
-"""Bodies that may be on their way at once, but for those that come in one piece, as orders do."""
+from service.web.bodies import STREAMED, again
+from service.web.problems import problem
 
 IDLE_S = 10.0
 """Longest time a request's head may take, seconds, or nothing be taken of an answer."""
@@ -49,9 +40,6 @@ TICK_S = 0.9
 
 RETRY_S = 5
 """When a client that finds no place should come again, seconds."""
-
-STREAMED = ("POST", "/v1/fits")
-"""The route that reads its body itself: it goes to the disk, with its own limits."""
 
 
 class Middleware:
@@ -75,20 +63,6 @@ class Middleware:
         raise NotImplementedError
 
 
-async def bounded(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Run a request with its whole body, if that comes in time and is not too large."""
-    request = Request(scope)
-    if (request.method, request.url.path) != STREAMED:
-        try:
-            body = await _whole(request, receive)
-        except PyrcalError as error:
-            return await known_problem(request, error)(scope, receive, send)
-        if body is None:
-            return None
-        receive = again(body, receive)
-    return await app(scope, receive, send)
-
-
 async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
     """Run a request; one still at work when the service ends gets an error, if possible."""
     begun = False
@@ -106,57 +80,6 @@ async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -
             status = HTTPStatus.SERVICE_UNAVAILABLE
             headers = {"Retry-After": str(RETRY_S)}
             await problem(Request(scope), status, "ending", detail, headers)(scope, receive, send)
-
-
-async def _whole(request: Request, receive: Receive) -> bytes | None:
-    """Return the body of a request; None: the client went away before it was whole.
-
-    Raises
-    ------
-    TooLargeError, TooSlowError, BusyError
-        If it is beyond the limit, has not come in time, or too many others are on their way.
-    """
-    told = request.headers.get("content-length", "")
-    if told.isdecimal() and int(told) > MAX_BODY_BYTES:
-        raise _too_large(f"{int(told) / 1e6:.1f} MB")
-    body, place = bytearray(), None
-    on_their_way: set[object] = request.app.state.bodies
-    try:
-        async with asyncio.timeout(BODY_S):
-            while True:
-                message = await receive()
-                if message["type"] == "http.disconnect":
-                    return None
-                body += message.get("body", b"")
-                if len(body) > MAX_BODY_BYTES:
-                    raise _too_large("more")
-                if not message.get("more_body", False):
-                    return bytes(body)
-                if place is None and len(on_their_way) >= MAX_BODIES:
-                    raise BusyError(f"{MAX_BODIES} bodies are on their way, the most there may be")
-                on_their_way.add(place := place or object())
-    except TimeoutError as error:
-        raise TooSlowError(f"body: {len(body)} bytes came within {BODY_S:g} s, not all") from error
-    finally:
-        on_their_way.discard(place)
-
-
-def _too_large(found: str) -> TooLargeError:
-    return TooLargeError(f"body: found {found}, expected at most {MAX_BODY_BYTES / 1e6:.1f} MB")
-
-
-def again(body: bytes, receive: Receive) -> Receive:
-    """Return a ``receive`` that begins with this body."""
-    first = True
-
-    async def replayed() -> Message:
-        nonlocal first
-        if not first:
-            return await receive()
-        first = False
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    return replayed
 
 
 class Server(uvicorn.Server):

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from service.api import create_app
-from service.web import connections
+from service.web import bodies, connections
 from service.web.authentication import Hosts
 from service.web.connections import Server
 from tests.system.pace import in_time
@@ -217,7 +217,7 @@ async def test_a_connection_may_rest_between_requests_as_before(service, monkeyp
 
 
 async def test_a_body_that_does_not_come_is_ended_with_408(service, monkeypatch):
-    monkeypatch.setattr(connections, "BODY_S", 0.5)
+    monkeypatch.setattr(bodies, "BODY_S", 0.5)
     monkeypatch.setattr(connections, "IDLE_S", 0.5)
     async with serving(service) as port:
         head = b"POST /v1/refit HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
@@ -278,24 +278,64 @@ SLOW_BODY = (
 )
 
 
-async def test_slow_bodies_keep_no_order_out_and_are_answered_503_where_there_are_too_many(
-    service, monkeypatch
+def begun(kind):
+    """Return a request that tells of a body, and that much of it."""
+    lines = {"chunked": b"Transfer-Encoding: chunked\r\n", "length": b"Content-Length: 100\r\n"}
+    head = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    return head + lines[kind] + b"\r\n"
+
+
+@pytest.mark.parametrize("held", [SLOW_BODY, begun("chunked"), begun("length")])
+async def test_slow_bodies_keep_no_order_out_that_comes_in_pieces_itself(
+    service, monkeypatch, held
 ):
-    monkeypatch.setattr(connections, "MAX_BODIES", 3)
+    """The one that has been on its way longest gives way, and hears why."""
+    monkeypatch.setattr(bodies, "MAX_BODIES", 3)
     async with serving(service) as port:
-        held = [await connected(port, SLOW_BODY) for _ in range(3)]
-        await asyncio.sleep(0.2)
+        slow = []
+        for _ in range(3):
+            slow.append(await connected(port, held))
+            await asyncio.sleep(0.1)
         reader, writer = await connected(port, SLOW_BODY)
-        status, head, problem = parts(await asyncio.wait_for(reader.readuntil(b"}"), 5.0))
-        assert (status, problem["type"]) == (503, "urn:pyrcal:problem:busy")
-        assert b"retry-after" in head
+        status, _, problem = parts(await asyncio.wait_for(slow[0][0].readuntil(b"}"), 2.0))
+        assert (status, problem["type"]) == (408, "urn:pyrcal:problem:too-slow")
+        writer.write(b" " * 98 + b"}")
+        assert b"202 Accepted" in await asyncio.wait_for(reader.readuntil(b"\r\n"), 5.0)
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}") as client:
             assert (await client.post("/v1/stop", json={"by": "Ada"})).status_code == 202
-        for _, line in (*held, (reader, writer)):
+        for _, line in (*slow, (reader, writer)):
             line.close()
-        await asyncio.sleep(0.2)
+    assert len(service.commands) == 2
+
+
+async def test_a_body_that_trickles_is_ended_long_before_a_large_one_would_be(service, monkeypatch):
+    monkeypatch.setattr(bodies, "PATIENCE_S", 0.3)
+    async with serving(service) as port:
         reader, writer = await connected(port, SLOW_BODY)
-        writer.write(b" " * 98 + b"}")
+
+        async def trickle():
+            with contextlib.suppress(ConnectionError):
+                while True:
+                    await asyncio.sleep(0.05)
+                    writer.write(b" ")
+
+        task = asyncio.create_task(trickle())
+        status, _, problem = parts(await asyncio.wait_for(reader.readuntil(b"}"), 5.0))
+        assert (status, problem["type"]) == (408, "urn:pyrcal:problem:too-slow")
+        assert "expected at least 1000 bytes a second" in problem["detail"]
+        task.cancel()
+        writer.close()
+    assert service.commands == []
+
+
+async def test_a_body_that_comes_fast_enough_may_come_in_many_pieces(service, monkeypatch):
+    monkeypatch.setattr(bodies, "PATIENCE_S", 0.3)
+    async with serving(service) as port:
+        head = SLOW_BODY.replace(b"Length: 100", b"Length: 8001")
+        reader, writer = await connected(port, head)
+        for k in range(8):
+            await asyncio.sleep(0.1)
+            writer.write(b" " * 1000 if k < 7 else b" " * 999 + b"}")
         assert b"202 Accepted" in await asyncio.wait_for(reader.readuntil(b"\r\n"), 5.0)
         writer.close()
 

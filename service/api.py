@@ -12,6 +12,7 @@ from fastapi.routing import APIRoute
 from starlette.routing import BaseRoute
 
 from service import __version__
+from service.config.settings import ApiTable
 from service.runtime.supervisor import Supervisor
 from service.runtime.uploads import FitQueue
 from service.web import (
@@ -26,7 +27,7 @@ from service.web import (
     state,
 )
 from service.web.authentication import Authentication, Hosts
-from service.web.connections import Idempotency, RequestId, Server, Unchanged
+from service.web.connections import Idempotency, RequestId, SecurityHeaders, Server, Unchanged
 from service.web.keys import KeyFile
 
 REQUESTS_WITHIN_S = 2
@@ -47,14 +48,15 @@ async def answer(
     service: Supervisor,
     desk: FitQueue,
     listener: socket.socket,
-    names: tuple[str, ...],
+    settings: ApiTable,
     keys: KeyFile,
     over: asyncio.Event,
 ) -> None:
-    """Answer requests under these ``names`` until it is ``over``."""
+    """Answer requests as the ``settings`` say, until it is ``over``."""
     host, port = listener.getsockname()[:2]
-    app = create_app(service, desk, hosts=Hosts(bound=host, allowed=names), keys=keys, over=over)
-    server = Server(app, over, within_s=REQUESTS_WITHIN_S)
+    hosts = Hosts(bound=host, allowed=(settings.host, *settings.allowed_hosts))
+    app = create_app(service, desk, hosts=hosts, keys=keys, over=over)
+    server = Server(app, over, within_s=REQUESTS_WITHIN_S, proxies=settings.trusted_proxies)
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
     await server.serve(sockets=[listener])
 
@@ -89,6 +91,7 @@ def create_app(
         Authentication, hosts=hosts or Hosts(), keys=keys, audit=lambda entry: service.audit(entry)
     )
     app.add_middleware(RequestId)
+    app.add_middleware(SecurityHeaders)
     app.state.service = service
     app.state.keys = keys
     app.state.bodies = {}

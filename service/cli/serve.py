@@ -24,6 +24,7 @@ from service.cli.program import announced, leave
 from service.config import Settings
 from service.config.link_tables import link_security
 from service.config.policy import keeping_of, policy_of
+from service.config.settings import ApiTable
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
 from service.files.recording import LastTelemetry
@@ -100,10 +101,9 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
             bridge.expect(instrument.basis_id, instrument.config_id, modes)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)
             desk = _desk(settings, instrument)
-            names = (settings.api.host, *settings.api.allowed_hosts)
             keys = KeyFile(settings.service.data_dir)
             try:
-                return await _until_stopped(supervisor, desk, listener, names, keys)
+                return await _until_stopped(supervisor, desk, listener, settings.api, keys)
             finally:
                 workers.close()
 
@@ -112,7 +112,7 @@ async def _until_stopped(
     supervisor: Supervisor,
     desk: FitQueue,
     listener: socket.socket,
-    names: tuple[str, ...],
+    settings: ApiTable,
     keys: KeyFile,
 ) -> int:
     desk.open()
@@ -123,7 +123,7 @@ async def _until_stopped(
         await asyncio.to_thread(import_module, "service.api")
         from service import api
 
-        await api.answer(supervisor, desk, listener, names, keys, ending.asked)
+        await api.answer(supervisor, desk, listener, settings, keys, ending.asked)
 
     work = asyncio.create_task(supervisor.run())
     web = asyncio.create_task(answer())

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, get_args, get_origin
 from pydantic import Field, model_validator
 
 from service.config.link_tables import ZenohTable
-from service.config.sources import Id, Table, in_file, nearest, read_toml, validated
+from service.config.sources import Id, Network, Table, in_file, nearest, read_toml, validated
 from service.errors import ConfigurationError
 
 PREFIX = "PYRCAL_"
@@ -58,6 +58,10 @@ class ApiTable(Table):
     allowed_hosts: tuple[str, ...] = ()
     """Names under which it may be asked besides loopback and ``host``, without a port: the
     machine's, or a proxy's."""
+
+    trusted_proxies: tuple[Network, ...] = ()
+    """Addresses and networks of proxies whose ``X-Forwarded-For`` and ``X-Forwarded-Proto`` are
+    believed; of others they are ignored."""
 
 
 class DitherTable(Table):

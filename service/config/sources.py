@@ -11,10 +11,11 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import is_dataclass
+from ipaddress import ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, ValidationError
 from pydantic_core import ErrorDetails
 
 from service.errors import ConfigurationError, MatrixError
@@ -46,6 +47,19 @@ class Table(BaseModel):
 
 Id = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9._-]{1,64}$")]
 """An id as the wire allows it."""
+
+
+def _known_network(text: str) -> str:
+    try:
+        ip_network(text)
+    except ValueError as error:
+        expected = "an address or a network, like 127.0.0.1 or 10.0.7.0/24"
+        raise ValueError(f"found {text!r}, expected {expected}") from error
+    return text
+
+
+Network = Annotated[str, AfterValidator(_known_network)]
+"""An IP address, or all of a network."""
 
 Schema = TypeVar("Schema", bound=Table)
 Place = Callable[[tuple[str, ...]], str]

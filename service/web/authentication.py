@@ -36,6 +36,12 @@ COOKIE = "pyrcal_key"
 MOST_TOLD, TOLD_WITHIN_S = 20, 60.0
 """Refusals that are told one by one within so many seconds; the others are only counted."""
 
+MAX_HEADERS = 100
+"""Of a request; browsers send about twenty, proxies a few more."""
+
+_LAST = {"Connection": "close"}
+"""What follows on such a connection is not to be trusted."""
+
 _READS = {"GET", "HEAD", "OPTIONS"}
 
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
@@ -239,6 +245,8 @@ class Authentication(Middleware):
 
     def _stranger(self, request: Request) -> Refusal | None:
         """Return why a request is not for this service, or not of its own page; None: it is."""
+        if (refusal := _misshapen(request)) is not None:
+            return refusal
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if not self._hosts.know(host):
             detail = (
@@ -322,6 +330,20 @@ class Authentication(Middleware):
         return key in keys
 
 
+def _misshapen(request: Request) -> Refusal | None:
+    """Return why nobody honest sends such a head; None: they may."""
+    n_headers = len(request.headers)
+    if n_headers > MAX_HEADERS:
+        detail = f"found {n_headers} headers, expected at most {MAX_HEADERS}"
+        status = HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
+        return Refusal(status, "headers", detail, _LAST)
+    if {"content-length", "transfer-encoding"}.issubset(request.headers):
+        # a proxy that goes by the one and a server that goes by the other see other requests
+        detail = "found Content-Length and Transfer-Encoding, expected one of them"
+        return Refusal(HTTPStatus.BAD_REQUEST, "two-lengths", detail, _LAST)
+    return None
+
+
 def _without_key(needed: KeyScope, *, shown: bool) -> Refusal:
     """Return the refusal of a request without a key, or with one that is none."""
     expected = f"expected a key of scope {needed}"
@@ -390,8 +412,14 @@ async def session(request: Request) -> Response:
     """Return the name and scope of the key."""
     key: Key | None = request.user
     if key is None:
-        return answer(Session(name=None, scope=KeyScope.ADMIN))
-    return answer(Session(name=key.name, scope=key.scope))
+        return _not_kept(answer(Session(name=None, scope=KeyScope.ADMIN)))
+    return _not_kept(answer(Session(name=key.name, scope=key.scope)))
+
+
+def _not_kept(answered: Response) -> Response:
+    """Return an answer about keys: a browser that others use after this one must not have it."""
+    answered.headers["Cache-Control"] = "no-store"
+    return answered
 
 
 @router.post("/session", openapi_extra=needs(KeyScope.READ), responses={200: shows(SESSION)})
@@ -404,7 +432,7 @@ async def log_in(request: Request) -> Response:
     answered = await session(request)
     secret, _ = shown_key(request)
     if request.user is not None and secret is not None:
-        safe = request.headers.get("origin", "").startswith("https:")
+        safe = request.url.scheme == "https" or request.headers.get("origin", "")[:6] == "https:"
         answered.set_cookie(COOKIE, secret, secure=safe, httponly=True, samesite="strict")
         request.app.state.service.audit(actor_of(request).entry("session.begun"))
     return answered
@@ -419,7 +447,7 @@ async def log_out(response: Response) -> None:
 @router.get("/keys", openapi_extra=needs(KeyScope.ADMIN), responses={200: shows(KEYS)})
 async def keys(request: Request, file: KeysDep) -> Response:
     """Return the names and scopes of all keys."""
-    return answer(Holders(keys=file.all() if request.user is not None else ()))
+    return _not_kept(answer(Holders(keys=file.all() if request.user is not None else ())))
 
 
 @router.delete(

@@ -96,9 +96,14 @@ class Server(uvicorn.Server):
         Set when the service ends.
     within_s
         For requests that are under way then.
+    proxies
+        Addresses and networks whose word is taken for who asks, and how: ``X-Forwarded-For``,
+        ``X-Forwarded-Proto``.
     """
 
-    def __init__(self, app: ASGIApp, over: asyncio.Event, *, within_s: int) -> None:
+    def __init__(
+        self, app: ASGIApp, over: asyncio.Event, *, within_s: int, proxies: tuple[str, ...] = ()
+    ) -> None:
         config = uvicorn.Config(
             app,
             http="h11",
@@ -106,6 +111,8 @@ class Server(uvicorn.Server):
             log_config=None,
             access_log=False,
             timeout_graceful_shutdown=within_s,
+            proxy_headers=bool(proxies),
+            forwarded_allow_ips=list(proxies),
         )
         super().__init__(config)
         self._over = over
@@ -259,6 +266,21 @@ REQUEST_ID = "x-request-id"
 
 _USABLE = re.compile(r"[A-Za-z0-9._-]{1,64}")
 """An id of the client's own that is harmless in a log."""
+
+
+class SecurityHeaders(Middleware):
+    """Has no answer taken for another type than it says, nor kept where it does not say so."""
+
+    @override
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def headed(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers.setdefault("X-Content-Type-Options", "nosniff")
+                headers.setdefault("Cache-Control", "no-store")
+            await send(message)
+
+        await self._app(scope, receive, headed)
 
 
 class RequestId(Middleware):

@@ -81,11 +81,13 @@ Responses = dict[int | str, dict[str, Any]]
 
 INVALID: Responses = {422: problem_response("A parameter or a field of the body cannot be used")}
 EVERYWHERE: Responses = {
+    400: problem_response("Content-Length and Transfer-Encoding were sent together"),
     401: problem_response("A key is needed, and none was given, or a wrong one"),
     403: problem_response("The key's scope does not allow it, or another site's page has sent it"),
     408: problem_response("The request did not come in time"),
     413: problem_response("The body is larger than this service takes"),
     421: problem_response("Host is a name that this service does not know"),
+    431: problem_response("More headers than this service takes"),
 }
 UNKNOWN: Responses = {404: problem_response("No such thing")}
 DECISION: Responses = {

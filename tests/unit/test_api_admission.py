@@ -13,6 +13,7 @@ from service.api import create_app
 from service.web import bodies, connections
 from service.web.authentication import Hosts
 from service.web.connections import Server
+from service.web.keys import KeyFile, KeyScope
 from tests.system.pace import in_time
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.tracking.situations import POLICY
@@ -148,10 +149,10 @@ async def test_a_body_within_the_limit_reaches_the_service(service):
 
 
 @contextlib.asynccontextmanager
-async def serving(service, keys=None):
+async def serving(service, keys=None, proxies=()):
     listener = socket.create_server(("127.0.0.1", 0))
     over = asyncio.Event()
-    server = Server(create_app(service, keys=keys), over, within_s=2)
+    server = Server(create_app(service, keys=keys), over, within_s=2, proxies=proxies)
     task = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started:  # noqa: ASYNC110 - uvicorn has no event for it
         await asyncio.sleep(0.01)
@@ -393,3 +394,69 @@ async def test_half_an_order_is_no_order(service):
         writer.close()
         await asyncio.sleep(0.2)
     assert service.commands == []
+
+
+# --- heads, and who stands behind a proxy
+
+
+@pytest.mark.parametrize(
+    "path", ["/v1/state", "/v1/nothing", "/v1/session", "/healthz", "/metrics", "/openapi.json"]
+)
+async def test_no_answer_is_taken_for_another_type_or_kept_unasked(service, path):
+    async with client_of(service) as client:
+        answer = await client.get(path)
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    asked_again = path in {"/v1/state", "/healthz", "/openapi.json"}
+    kept = "private, no-cache" if asked_again else "no-store"
+    assert answer.headers["cache-control"] == kept
+
+
+async def test_a_request_of_two_lengths_is_refused_and_nothing_after_it_is_read(service):
+    async with serving(service) as port:
+        head = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4\r\n"
+        smuggled = b"POST /v1/rollback HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        body = b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n"
+        reader, writer = await connected(port, head + body + smuggled)
+        status, told, problem = parts(await asyncio.wait_for(reader.read(), 5.0))
+        assert (status, problem["type"]) == (400, "urn:pyrcal:problem:two-lengths")
+        assert b"connection: close" in told
+        writer.close()
+    assert service.commands == []
+
+
+@pytest.mark.parametrize(("n_headers", "expected"), [(90, 200), (101, 431), (10_000, 431)])
+async def test_more_headers_than_anybody_sends_are_refused(service, n_headers, expected):
+    async with serving(service) as port:
+        more = b"".join(b"a%d: b\r\n" % k for k in range(n_headers))
+        head = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
+        reader, writer = await connected(port, head + more + b"\r\n")
+        assert b" %d " % expected in await asyncio.wait_for(reader.readline(), 5.0)
+        writer.close()
+
+
+FORWARDED = {"X-Forwarded-For": "6.6.6.6", "X-Forwarded-Proto": "https"}
+
+
+@pytest.mark.parametrize(
+    ("proxies", "address", "secure"),
+    [
+        ((), "127.0.0.1", False),
+        (("10.0.0.7",), "127.0.0.1", False),
+        (("127.0.0.1",), "6.6.6.6", True),
+        (("127.0.0.0/24",), "6.6.6.6", True),
+    ],
+)
+async def test_who_asks_is_said_by_nobody_but_the_proxies_that_are_named(
+    service, tmp_path, proxies, address, secure
+):
+    keys = KeyFile(tmp_path)
+    secret = keys.add("ada", KeyScope.OPERATE)
+    headers = {"Authorization": f"Bearer {secret}", **FORWARDED}
+    async with (
+        serving(service, keys, proxies) as port,
+        httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}") as client,
+    ):
+        await client.post("/v1/stop", json={"by": "Ada"}, headers=headers)
+        told = await client.post("/v1/session", headers=headers)
+    assert service.trail[-1].address == address
+    assert ("Secure" in told.headers["set-cookie"]) == secure

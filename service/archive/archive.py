@@ -12,7 +12,7 @@ from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
 from service.archive.nights import Nights, TrendSample
 from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive, Recordings
 from service.archive.serialisation import TrackingFile
-from service.archive.store import Store
+from service.archive.store import FOLDER_MODE, Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.tracking.operation_records import MeasurementRecord
 from service.tracking.products import ReconstructorRecord
@@ -88,7 +88,7 @@ class Archive:
             damaged.
         """
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
+            self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
             self._lock = _locked(self.directory / "lock")
             told = [line for folder in self.stores for line in folder.prepare()]
         except OSError as error:

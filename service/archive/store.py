@@ -28,6 +28,10 @@ DAMAGE = (OSError, RuntimeError, *NOT_UNDERSTOOD)
 Record = TypeVar("Record", bound=Product)
 
 
+FOLDER_MODE = 0o700
+"""Of a folder that is made: the orders of a night and who gave them are nobody else's."""
+
+
 class Folder:
     """A file for each of what is kept, and beside it, as JSON, what is to be known."""
 
@@ -55,7 +59,7 @@ class Folder:
         OSError
             If the folder cannot be made.
         """
-        self.directory.mkdir(parents=True, exist_ok=True)
+        self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
         told = []
         for leftover in sorted(self.directory.glob("*.part")):
             try:

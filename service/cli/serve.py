@@ -8,10 +8,12 @@ import ctypes
 import logging
 import signal
 import socket
+import stat
 import sys
 import threading
 import time
 from importlib import import_module
+from pathlib import Path
 from typing import Literal, TextIO, cast
 
 import structlog
@@ -89,6 +91,7 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
     )
     with _listener(settings.api.host, settings.api.port) as listener:
         archive.open()
+        warn_of_readers(archive.directory)
         where = "http://{}:{}".format(*listener.getsockname()[:2])
         last = LastTelemetry(
             settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
@@ -106,6 +109,14 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
                 return await _until_stopped(supervisor, desk, listener, settings.api, keys)
             finally:
                 workers.close()
+
+
+def warn_of_readers(folder: Path) -> None:
+    """Log that other users of this machine can read a data folder, as those of before let them."""
+    mode = stat.S_IMODE(folder.stat().st_mode)
+    if mode & stat.S_IRWXO:
+        text = f"{folder}: everybody on this machine can read it ({mode:o}): chmod 700 {folder}"
+        structlog.get_logger().warning("service.data-dir", text=text)
 
 
 async def _until_stopped(

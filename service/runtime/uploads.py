@@ -152,7 +152,7 @@ class FitQueue:
         """
         shutil.rmtree(self._folder, ignore_errors=True)
         try:
-            self._folder.mkdir(parents=True)
+            self._folder.mkdir(mode=0o700, parents=True)
         except OSError as error:
             raise errors.ArchiveError(
                 f"{self._folder}: cannot be made: {error.strerror}"

@@ -168,7 +168,7 @@ class KeyFile:
     def _alone(self) -> Iterator[None]:
         """Keep others from changing the file."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             folder = os.open(self.path.parent, os.O_RDONLY)
         except OSError as error:
             raise ConfigurationError(f"{self.path.parent}: cannot be used: {error}") from error

@@ -1,9 +1,11 @@
 """Products that outlive the service: real files, a real index, real processes killed on the way."""
 
+import contextlib
 import os
 import random
 import signal
 import sqlite3
+import stat
 import subprocess
 import sys
 import threading
@@ -19,6 +21,7 @@ from service.control.gate import GateVerdict
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.model.misregistration import Misregistration
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
+from service.web.keys import KeyFile, KeyScope
 from service.wire import checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(3, 4)
@@ -81,6 +84,15 @@ def damage(path):
 def test_making_an_archive_touches_nothing(tmp_path):
     Archive(tmp_path / "var")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folders_it_makes_are_its_owners_alone(tmp_path):
+    with contextlib.closing(Archive(tmp_path / "var")) as archive:
+        archive.open()
+        KeyFile(tmp_path / "of-keys").add("ada", KeyScope.READ)
+        made = [path for path in tmp_path.rglob("*") if path.is_dir()]
+        assert len(made) >= 6
+        assert {stat.S_IMODE(path.stat().st_mode) for path in made} == {0o700}
 
 
 def test_an_archive_that_is_not_open_says_so(tmp_path):

@@ -5,6 +5,9 @@ import subprocess
 import sys
 
 import pytest
+from structlog.testing import capture_logs
+
+from service.cli.serve import warn_of_readers
 
 POOLS_OF_MANY_THREADS = """
 import ctypes, threading
@@ -40,3 +43,12 @@ def test_many_threads_share_two_pools_of_memory():
     words = [sys.executable, "-c", POOLS_OF_MANY_THREADS]
     told = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60.0).stdout
     assert 1 <= told.count("<heap nr=") <= 3
+
+
+@pytest.mark.parametrize(("mode", "n_warnings"), [(0o700, 0), (0o750, 0), (0o755, 1), (0o701, 1)])
+def test_a_data_folder_that_others_can_read_is_named_with_what_to_do(tmp_path, mode, n_warnings):
+    tmp_path.chmod(mode)
+    with capture_logs() as told:
+        warn_of_readers(tmp_path)
+    assert len(told) == n_warnings
+    assert all(f"chmod 700 {tmp_path}" in line["text"] for line in told)

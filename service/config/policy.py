@@ -11,7 +11,7 @@ from service.archive.retention import RetentionPolicy
 from service.config.settings import OffloadTable, Settings
 from service.control.reconstructor import InversionMethod
 from service.files.disk_cache import usual_folder
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, TabulatedModes
 from service.model.misregistration import BOUNDARY_SCALE
 from service.runtime.worker import Compute, Sampling
 from service.tracking.alarms import Interlock, Severity
@@ -25,15 +25,22 @@ AT_WORK = (0.001, 0.005, 0.0005)
 """The same where it is compared with the response at the working point."""
 
 
-def floor_of(settings: Settings) -> NDArray[np.float64]:
+MEASURED_PITCH = 0.30 / 8.22
+"""Distance between actuators over the pupil's diameter where these floors were measured: FLAO."""
+
+
+def floor_of(settings: Settings, instrument: Instrument | None = None) -> NDArray[np.float64]:
     """Return the model-error floor ``(4,)`` in boundary units: subapertures, degrees, ratio.
 
     What the settings leave open is what campaigns on the diffractive telescope found
-    (docs/results/night.md).
+    (docs/results/night.md). Influence functions are wrong by a share of their width: of a mirror
+    of few actuators, rotation and magnification are as much more uncertain as it is coarser.
     """
     tracking = settings.tracking
     flat = settings.compute.working_point_modes is None
     shift, rotation, magnification = FLAT if flat else AT_WORK
+    coarser = _coarser(instrument)
+    rotation, magnification = rotation * coarser, magnification * coarser
     given = (tracking.floor_shift_subap, tracking.floor_rotation_deg, tracking.floor_magnification)
     shift, rotation, magnification = (
         found if asked is None else asked
@@ -42,10 +49,18 @@ def floor_of(settings: Settings) -> NDArray[np.float64]:
     return np.array([shift, shift, rotation, magnification])
 
 
+def _coarser(instrument: Instrument | None) -> float:
+    """Return how much coarser an analytic mirror is than FLAO's; of others nothing is known."""
+    if instrument is None or isinstance(instrument.mirror, TabulatedModes):
+        return 1.0
+    return max(1.0, instrument.mirror.pitch_m / instrument.diameter_m / MEASURED_PITCH)
+
+
 def policy_of(settings: Settings, instrument: Instrument | None = None) -> Policy:
     """Return the policy in numeric units: radians, rates per square root of a second.
 
-    ``instrument`` tells the modes of its sensor and its law of pointing; None: it has neither.
+    ``instrument`` tells the modes of its sensor, its law of pointing and how coarse its mirror is;
+    None: it has neither, and a mirror like FLAO's.
     """
     dither, tracking, control = settings.dither, settings.tracking, settings.control
     per_minute = _vector(
@@ -67,7 +82,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         window_s=dither.window_s,
         longest_window_s=dither.longest_window_s,
         drift_rate=per_minute / np.sqrt(60.0),
-        floor=floor_of(settings) / BOUNDARY_SCALE,
+        floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,
         flexure_per_degree=_vector(
             tracking.flexure_subap_per_degree,

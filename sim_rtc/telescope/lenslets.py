@@ -68,7 +68,9 @@ class DiffractiveLenslets:
         full lenslet, the wings beyond its pixels counted.
         """
         phase = self._wavenumber * self._under(2.0 * opd_m[self._edge] - opd_m[self._inside])
-        field = self._amplitude * np.exp(1j * phase)
+        field = np.empty(phase.shape, np.complex64)
+        np.multiply(self._amplitude, np.cos(phase), out=field.real)
+        np.multiply(self._amplitude, np.sin(phase), out=field.imag)
         n, nodes, rows = self._wfs.n_subapertures, self._n_nodes, self._transform
         seen = rows @ field.reshape(n, nodes, n * nodes)
         seen = seen.reshape(-1, nodes) @ rows.T

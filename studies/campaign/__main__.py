@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from service.cli.program import status_of
-from service.config import load_settings
+from service.config import load_instrument, load_settings
 from service.config.policy import floor_of
 from studies.campaign.night import play
 from studies.campaign.plan import Estimator, Night
@@ -42,7 +42,7 @@ def main() -> int:
     environment = {}
     if given.working_point_modes is not None:
         environment["PYRCAL_COMPUTE__WORKING_POINT_MODES"] = str(given.working_point_modes)
-    floor = floor_of(load_settings(None, environment))
+    floor = floor_of(load_settings(None, environment), load_instrument(given.instrument))
     text = table(file.rows, floor, pooled=given.winds_in_turn is not None)
     tell(text, given.table, "pyrcal campaign")
     if given.plot is not None:
@@ -87,6 +87,8 @@ def campaign_parser() -> argparse.ArgumentParser:
     parser.add_argument("--working-point-modes", type=int)
     parser.add_argument("--modes", type=_modes, metavar="MODE,MODE...", help="that are dithered")
     parser.add_argument("--camera", choices=("ccd", "emccd"), default="ccd")
+    parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of sums to look at again")
     add_workers(parser, os.cpu_count() or 1)
     return parser
@@ -117,6 +119,8 @@ def _nights(given: argparse.Namespace) -> Iterator[Night]:
             working_point_modes=given.working_point_modes,
             modes=given.modes,
             camera=given.camera,
+            instrument=given.instrument,
+            rate_hz=given.rate,
         )
 
 

@@ -54,7 +54,7 @@ def play(night: Night, keep: Path | None = None) -> list[dict[str, Any]]:
         rows, known = [], Misregistration()
         # of this night alone: it follows the seeing, and rows must not depend on other nights
         bench = OpticsWorker(
-            load_instrument("flao-lbt"),
+            load_instrument(night.instrument),
             Compute(threads=1, sampling=Sampling(working_point_modes=night.working_point_modes)),
         )
         for k, seen in enumerate(_kept(night, keep)):
@@ -87,7 +87,7 @@ def _kept(night: Night, keep: Path | None) -> Iterator[Seen]:
 
 def _simulated_windows(night: Night) -> Iterator[Seen]:
     options = parse_options(simulated(night))
-    telescope = build_telescope(options, load_instrument("flao-lbt"))
+    telescope = build_telescope(options, load_instrument(night.instrument))
     true, error = telescope.optics.start().alpha, WavefrontError(telescope.weights)
     with Ahead(telescope.feed.blocks()) as ahead:
         computer = telescope.computer(iter(ahead))
@@ -104,6 +104,10 @@ def _simulated_windows(night: Night) -> Iterator[Seen]:
 def simulated(night: Night) -> list[str]:
     """Return the simulator's options of a night."""
     words = [*night.words(37 + 61 * night.seed), f"--n-controlled={night.n_controlled}"]
+    if night.instrument != "flao-lbt":
+        words.append(f"--instrument={night.instrument}")
+    if night.rate_hz is not None:
+        words.append(f"--rate={night.rate_hz:g}")
     if night.camera == "emccd":
         words += ["--read-noise=0.4", "--excess-noise=2"]
     return words + options_for(night.trouble, LINE_FRACTIONS[1])

@@ -67,6 +67,10 @@ class Night(Observed):
     """The simulator's usual one, with 4 electrons of read noise, or "emccd": 0.4, and twice the
     photon noise."""
 
+    instrument: str = "flao-lbt"
+    rate_hz: float | None = None
+    """Frames per second; None: the simulator's usual ones."""
+
     @property
     def dithered(self) -> tuple[int, ...]:
         """The modes a dither moves."""

@@ -39,11 +39,14 @@ class RowFile:
         """All there are, those of earlier runs first."""
 
     def missing(self, plans: Iterable[Plan]) -> list[Plan]:
-        """Return those of these records that no row is of; a row has the fields of its record."""
+        """Return those of these records that no row is of; a row has the fields of its record.
+
+        What an older row does not have yet was as it is by default.
+        """
         every = list(plans)
-        names = [field.name for field in fields(every[0])] if every else []
-        done = {json.dumps([row[name] for name in names]) for row in self.rows}
-        return [p for p in every if json.dumps([getattr(p, name) for name in names]) not in done]
+        usual = {field.name: field.default for field in fields(every[0])} if every else {}
+        done = {json.dumps([row.get(*each) for each in usual.items()]) for row in self.rows}
+        return [p for p in every if json.dumps([getattr(p, name) for name in usual]) not in done]
 
     def add(self, *rows: Row) -> None:
         """Keep more rows; they are in the file when this returns."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,12 @@ Array = NDArray[np.float64]
 GROUPED_BY = (
     "plant", "truth", "estimator", "trouble", "magnitude", "profile", "wind_m_s", "gain",
     "n_controlled", "amplitude_nm", "window_s", "working_point_modes", "modes", "camera",
+    "instrument", "rate_hz",
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line of the table."""
+
+LATER = {"instrument": "flao-lbt", "rate_hz": None}
+"""What rows of before do not have."""
 
 HEADER = heading(
     *("night", "windows (refused)", "bias x, y % / mdeg / %", "scatter", "scatter/σ", "chi2/4"),
@@ -34,7 +39,7 @@ def table(rows: list[Row], floor: Array, *, pooled: bool = False) -> str:
     groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
     for row in rows:
         common = row | {"wind_m_s": None} if pooled else row
-        values = (common[name] for name in GROUPED_BY)
+        values = ((LATER | common)[name] for name in GROUPED_BY)
         groups[tuple(tuple(v) if isinstance(v, list) else v for v in values)].append(row)
     return HEADER + "".join(_line(key, group, floor) for key, group in groups.items())
 
@@ -99,6 +104,10 @@ def _name(key: dict[str, Any]) -> str:
         words.append("working point")
     if key["modes"]:
         words.append("modes " + " ".join(str(mode) for mode in key["modes"]))
+    if key["instrument"] != "flao-lbt":
+        words.insert(0, Path(key["instrument"]).stem)
+    if key["rate_hz"]:
+        words.append(f"{key['rate_hz']:g} Hz")
     if key["camera"] != "ccd":
         words.append(key["camera"])
     if key["trouble"] != "none":

@@ -1,11 +1,15 @@
 """From the user's settings to the tracker's policy."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from service.config import load_settings
+from service.config import load_instrument, load_settings
 from service.config.policy import AT_WORK, FLAT, floor_of, policy_of
 from service.errors import ConfigurationError
+
+LENSLETS = Path(__file__).parents[1] / "data" / "lenslets.toml"
 
 
 def policy(**tracking):
@@ -53,6 +57,22 @@ def test_the_floor_is_that_of_the_model_in_use(environment, expected):
     np.testing.assert_array_equal(
         floor_of(load_settings(None, environment)), [shift, shift, rotation, magnification]
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "coarser"),
+    [("flao-lbt", 1.0), ("aof-ut4", 1.0), (str(LENSLETS), 0.28 / 3 * 8.22 / 0.3)],
+)
+def test_the_floor_of_a_coarse_mirror_is_as_much_larger(name, coarser):
+    """Rotation and magnification by the pitch over the diameter; a finer mirror has FLAO's."""
+    settings = load_settings(None, {})
+    shift, rotation, magnification = FLAT
+    np.testing.assert_allclose(
+        floor_of(settings, load_instrument(name)),
+        [shift, shift, coarser * rotation, coarser * magnification],
+    )
+    given = load_settings(None, {"PYRCAL_TRACKING__FLOOR_ROTATION_DEG": "0.01"})
+    assert floor_of(given, load_instrument(name))[2] == 0.01
 
 
 def test_a_floor_that_is_given_overrules_the_measured_one():

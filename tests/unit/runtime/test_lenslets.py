@@ -85,7 +85,7 @@ def test_on_spots_with_noise_alpha_is_followed_a_jump_is_found_and_sigma_is_hone
             "--n-controlled=60",
             "--seed=1",
         ],
-        policy_of(load_settings(None, {}, {"dither.longest_pause_s": 0.0})),
+        policy_of(load_settings(None, {}, {"dither.longest_pause_s": 0.0}), lenslets),
         Mode.AUTO,
         OpticsWorker(lenslets, Compute(threads=1)),
         latencies=latencies_of(1.0),

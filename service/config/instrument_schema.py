@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
@@ -223,6 +223,7 @@ def read_instrument_file(name_or_path: str | Path) -> InstrumentFile:
     path = instrument_path(name_or_path)
     written = read_toml(path)
     kind = _kind(written, path)
+    _check_one_sensor(written, kind, path)
     taken = unknown_values(kind)
     unknown = frozenset(key for key in taken if _value(written, key) == "unknown")
     tables = dict(written)
@@ -252,6 +253,28 @@ def _kind(written: Mapping[str, Any], path: Path) -> SensorKind:
     if not isinstance(name, str) or name not in KINDS:
         refuse(f"{path}: wfs.kind", repr(name), " or ".join(repr(known) for known in KINDS))
     return KINDS[name]
+
+
+def _check_one_sensor(written: Mapping[str, Any], kind: SensorKind, path: Path) -> None:
+    """Refuse a file of several sensors, or with keys of two kinds of them."""
+    wfs = written.get("wfs", {})
+    if isinstance(wfs, list):
+        refuse(
+            f"{path}: wfs",
+            f"{len(wfs)} tables [[wfs]]",
+            "one table [wfs]: a service has one sensor, the next one a file and service of its own",
+        )
+    if not isinstance(wfs, dict):
+        return  # refused with the other tables
+    known = {name: {field.name for field in fields(one.table)} for name, one in KINDS.items()}
+    for key in sorted(set(wfs) - known[kind.name]):
+        others = [f'"{name}"' for name, keys in known.items() if key in keys]
+        if others:
+            found = f'kind = "{kind.name}"' if "kind" in wfs else "no kind"
+            raise ConfigurationError(
+                f"{path}: wfs.{key}: belongs to kind = {' or '.join(others)}, found {found}: leave "
+                "it out, or give the other sensor a file of its own"
+            )
 
 
 @contextmanager

@@ -22,7 +22,7 @@ GROUPED_BY = (
 )  # fmt: skip
 """Nights that differ in nothing but the seed make one line of the table."""
 
-LATER = {"instrument": "flao-lbt", "rate_hz": None}
+LATER: Row = {"instrument": "flao-lbt", "rate_hz": None}
 """What rows of before do not have."""
 
 HEADER = heading(

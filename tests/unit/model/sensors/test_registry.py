@@ -101,7 +101,11 @@ def test_what_may_be_unknown_of_it_is(write):
     [
         (WFS.replace("curvature", "shear"), "", "wfs.kind: found 'shear', expected 'pyramid' or"),
         (WFS.replace("extra_m", "extra"), "", "wfs.extra: unknown key, did you mean extra_m?"),
-        (WFS + "modulation_lambda_over_d = 3.0\n", "", "modulation_lambda_over_d: unknown key"),
+        (
+            WFS + "modulation_lambda_over_d = 3.0\n",
+            "",
+            'modulation_lambda_over_d: belongs to kind = "pyramid"',
+        ),
         (WFS, '[slopes]\nkind = "intensity"\n', "found intensity of a curvature, expected xy"),
         (
             WFS,

@@ -182,14 +182,29 @@ def test_its_light_tells_nothing_of_the_pupil(lenslets):
         ("wavelength_m", 'centroid = "matched"\nwavelength_m', "wfs.centroid"),
         ("wavelength_m", "pixels_per_subaperture = 1\nwavelength_m", "pixels_per_subaperture"),
         ("shack-hartmann", "curvature", "'curvature', expected 'pyramid' or 'shack-hartmann'"),
-        ("n_subapertures", "modulation_lambda_over_d = 3.0\nn_subapertures", "unknown key"),
+        ("n_subapertures", "tilt = 3.0\nn_subapertures", "wfs.tilt: unknown key"),
+        (
+            "n_subapertures",
+            "modulation_lambda_over_d = 3.0\nn_subapertures",
+            'wfs.modulation_lambda_over_d: belongs to kind = "pyramid", found kind = '
+            '"shack-hartmann": leave it out, or give the other sensor a file of its own',
+        ),
+        ('kind = "shack-hartmann"', 'centroid = "cog"', "wfs.centroid: belongs to kind"),
+        (
+            "[mirror]",
+            '[[wfs]]\nkind = "pyramid"\nn_subapertures = 30\n[mirror]',
+            "wfs: found 2 tables [[wfs]], expected one table [wfs]: a service has one sensor",
+        ),
         ("[modes]", '[slopes]\nkind = "intensity"\n[modes]', "intensity of a shack-hartmann"),
         ("[modes]", '[slopes]\nnormalisation = "local"\n[modes]', "no meaning beside wfs.kind"),
     ],
 )
 def test_what_is_no_lenslets_is_refused_in_one_line(tmp_path, old, new, said):
     path = tmp_path / "other.toml"
-    path.write_text(FILE.read_text("utf-8").replace(old, new, 1), "utf-8")
+    text = FILE.read_text("utf-8").replace(old, new, 1)
+    if "[[wfs]]" in new:
+        text = text.replace("[wfs]", "[[wfs]]", 1)
+    path.write_text(text, "utf-8")
     with pytest.raises(ConfigurationError) as refused:
         load_instrument(path)
     assert said in str(refused.value)

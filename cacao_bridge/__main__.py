@@ -6,7 +6,7 @@ import argparse
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -22,8 +22,9 @@ from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
 from pyrcal.terminal import print_lines
 from service.cli.program import leave, log_to_terminal, status_of, stop_signal
-from service.config.link_tables import Router, client_security
-from service.wire import FrameHeader, Keys, encode, encode_frames
+from service.config.link_tables import Router, client_security, secret_of
+from service.wire import FrameHeader, Keys, Role, encode, encode_frames
+from service.wire.signing import Signatures
 from sim_rtc.computer.feed import Background
 from sim_rtc.link.matrices import Matrices
 from sim_rtc.link.replies import Replies
@@ -83,9 +84,12 @@ def _run(options: argparse.Namespace, stopped: threading.Event) -> int:
 class Sender(Background):
     """Sends rows in a thread of its own while a ``with`` block lasts: a put may wait."""
 
-    def __init__(self, frames: zenoh.ext.AdvancedPublisher) -> None:
+    def __init__(
+        self, frames: zenoh.ext.AdvancedPublisher, sign: Callable[[bytes, bytes], bytes]
+    ) -> None:
         super().__init__("sender")
         self._frames = frames
+        self._sign = sign
         self._waiting: queue.Queue[tuple[FrameHeader, NDArray[np.float32]]] = queue.Queue(_BACKLOG)
 
     def offer(self, header: FrameHeader, rows: NDArray[np.float32]) -> None:
@@ -103,7 +107,7 @@ class Sender(Background):
             except queue.Empty:
                 continue
             payload, attachment = encode_frames(header, rows)
-            self._frames.put(payload, attachment=attachment)
+            self._frames.put(payload, attachment=self._sign(attachment, payload))
 
 
 class Bridge:
@@ -113,8 +117,11 @@ class Bridge:
         """Raise ``ConfigurationError`` if a file of the settings is not what it should be."""
         self._settings = settings
         self._router = Router(
-            endpoint=settings.wire.connect, security=client_security(settings.zenoh)
+            endpoint=settings.wire.connect,
+            security=client_security(settings.zenoh),
+            secret=secret_of(settings.zenoh),
         )
+        self._signatures = Signatures(self._router.secret, Role.RTC)
         self._cacao = Cacao(settings)
         self._n_sent = 0
 
@@ -125,13 +132,18 @@ class Bridge:
             while not self._cacao.known and not stopped.is_set():
                 self._cacao.poll()  # which matrix cacao has, before anybody may ask
                 stopped.wait(_UNLINKED_PAUSE_S)
-            replies = Replies(keys, self._cacao)
+            replies = Replies(keys, self._cacao, self._signatures)
             while (session := open_session(self._router, stopped)) is not None:
                 with session:
                     replies.declare(session)
                     with (
-                        Matrices(session, keys, self._cacao) as matrices,
-                        Sender(frames_publisher(session, keys, 1.0 / _LEAST_BATCH_S)) as sender,
+                        Matrices(
+                            session, keys, self._cacao, signatures=self._signatures
+                        ) as matrices,
+                        Sender(
+                            frames_publisher(session, keys, 1.0 / _LEAST_BATCH_S),
+                            lambda *message: self._signatures.sign(keys.frames, *message),
+                        ) as sender,
                         Token(session, keys, None),
                     ):
                         self._speak(session, keys, matrices, sender, stopped)
@@ -158,7 +170,7 @@ class Bridge:
                 matrices.look()
             now_s = time.monotonic()
             if now_s >= next_status_s or self._cacao.session != last_session:
-                status.put(encode(self._cacao.status()))
+                status.put(self._signatures.sign(keys.status, encode(self._cacao.status())))
                 last_session, next_status_s = self._cacao.session, now_s + _STATUS_PERIOD_S
                 if lifeline.cut(session, now_s):
                     _log.warning("link.cut-off", text=lifeline.text)

@@ -27,6 +27,7 @@ from service.wire import (
     Role,
     decode,
 )
+from service.wire.signing import Signatures
 
 if TYPE_CHECKING:
     import zenoh
@@ -70,6 +71,9 @@ class ReceivedMessage:
     alive: bool = False
     """Of a token: whether it came; else it went."""
 
+    refused: str = ""
+    """Why its signature is not accepted; empty: it is, or none is asked for."""
+
 
 def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
     """Return the systems whose RTC is at a router, waiting at most ``wait_s``.
@@ -100,6 +104,7 @@ class RtcConnection:
     def __init__(self, endpoint: Endpoint, *, as_service: bool = True) -> None:
         self._endpoint = endpoint
         self.keys = Keys(endpoint.system)
+        self._signatures = Signatures(endpoint.security.secret, Role.SERVICE)
         self._as_service = as_service
         self._outbox = Outbox(OFFERED_S)
         self._messages: deque[ReceivedMessage] = deque(maxlen=MOST_WAITING)
@@ -173,7 +178,7 @@ class RtcConnection:
         LinkError
             If there is none, or one that cannot be read.
         """
-        answer = link.send_command(self._opened, self._endpoint, command)
+        answer = link.send_command(self._opened, self._endpoint, command, self._signatures)
         try:
             return decode(Reply, answer)
         except WireError as error:
@@ -189,7 +194,8 @@ class RtcConnection:
         """
         began_s = time.monotonic()
         selector = self.keys.command(kind)
-        answer = link.ask(self._opened, selector, ANSWER_S, payload, Encodings.COMMAND)
+        signed = self._signatures.sign(selector, payload)
+        answer = link.ask(self._opened, selector, ANSWER_S, signed, Encodings.COMMAND)
         return answer, time.monotonic() - began_s
 
     def applied(self) -> tuple[Manifest, NDArray[np.float32]]:
@@ -202,7 +208,7 @@ class RtcConnection:
         LinkError
             If there is no answer.
         """
-        return link.fetch_applied(self._opened, self.keys)
+        return link.fetch_applied(self._opened, self.keys, self._signatures)
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
         """Serve a matrix from now on.
@@ -222,7 +228,8 @@ class RtcConnection:
     def put_commit(self, matrix_id: str, data: bytes) -> None:
         """Send a manifest, or bytes that are none."""
         key = self.keys.commit(matrix_id)
-        link.put(self._opened, key, data, Encodings.COMMIT, urgent=True)
+        signed = self._signatures.sign(key, data)
+        link.put(self._opened, key, signed, Encodings.COMMIT, urgent=True)
 
     @property
     def _opened(self) -> zenoh.Session:
@@ -232,19 +239,31 @@ class RtcConnection:
 
     def _on_message(self, topic: Topic) -> Callable[[zenoh.Sample], None]:
         def on_sample(sample: zenoh.Sample) -> None:
-            attachment = sample.attachment
+            key, data = str(sample.key_expr), sample.payload.to_bytes()
+            attachment = None if sample.attachment is None else sample.attachment.to_bytes()
             self._messages.append(
                 ReceivedMessage(
                     topic=topic,
-                    key=str(sample.key_expr),
+                    key=key,
                     at_s=time.monotonic(),
-                    data=sample.payload.to_bytes(),
-                    attachment=None if attachment is None else attachment.to_bytes(),
+                    data=data,
+                    attachment=attachment,
+                    refused=self._why_unsigned(topic, key, data, attachment),
                     recoverable=sample.source_info is not None,
                 )
             )
 
         return on_sample
+
+    def _why_unsigned(self, topic: Topic, key: str, data: bytes, attachment: bytes | None) -> str:
+        try:
+            if topic is Topic.FRAMES:
+                self._signatures.check(key, attachment or b"", data)
+            elif topic is not Topic.MEASURED or self.keys.chunk_index_of(key) is None:
+                self._signatures.check(key, data)
+        except WireError as error:
+            return str(error)
+        return ""
 
     def _on_token(self, token: tuple[str, bool]) -> None:
         key, alive = token
@@ -264,4 +283,4 @@ class RtcConnection:
             except (UnknownIdError, WireError) as error:
                 query.reply_err(str(error).encode())
             else:
-                query.reply(key, data)
+                query.reply(key, self._signatures.sign(key, data) if part is None else data)

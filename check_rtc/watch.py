@@ -112,6 +112,8 @@ class TelemetryObserver:
         return Counter(arrival.header.session for arrival in self.arrivals)
 
     def _take(self, item: ReceivedMessage) -> None:
+        if item.refused:
+            raise WireError(item.refused)
         match item.topic:
             case Topic.FRAMES:
                 self._frames(item, decode_frames(item.data, item.attachment))

@@ -1,11 +1,11 @@
 """A whole RTC, from docs/rtc.md alone: ``python -m examples.rtc ENDPOINT SYSTEM PLANT.npz``.
 
-PLANT.npz has a telescope and the ``matrix`` (n_controlled, n_slopes) to begin with.
+PLANT.npz has a telescope and the ``matrix`` (n_controlled, n_slopes) to begin with. On a secured
+link two more: zenoh's configuration (rtc.json5), and the file of the secret, if one is shared.
 """
 
 import functools
 import hashlib
-import json
 import sys
 import threading
 import time
@@ -15,9 +15,11 @@ import numpy as np
 import zenoh
 import zenoh.ext
 
+from examples.secured import Signing, connect
 from examples.telescope import Telescope
 
-endpoint, system, file = sys.argv[1:]
+endpoint, system, file, *secured = sys.argv[1:]
+signing = Signing(*secured[1:])
 plant, root, start_ns, lock = np.load(file), f"ao/v1/{system}", time.time_ns(), threading.Lock()
 telescope, R, (n_slopes, n) = Telescope(plant), plant["matrix"], plant["response"].shape
 c, hz, most_m, seq, n_next, used = np.zeros((2, n)), 500.0, 50e-9, 0, len(R), {}
@@ -71,9 +73,13 @@ def in_use():  # the matrix that the loop multiplies with, and its manifest
 
 def answer(query):
     with query, lock:
-        kind, chunk = str(query.key_expr).split("/")[-1], query.parameters.get("chunk")
-        data, told = in_use() if kind == "applied" else (b"", reply(kind, query.payload.to_bytes()))
-        query.reply(query.key_expr, data if chunk else msgpack.packb(told))
+        key, chunk, data = str(query.key_expr), query.parameters.get("chunk"), b""
+        if key.endswith("applied"):
+            data, told = in_use()
+        else:
+            obeyed = functools.partial(reply, key.split("/")[-1])
+            told = signing.vouched(key, query.payload.to_bytes(), obeyed)
+        query.reply(key, data if chunk else signing.sign(key, told))
 
 
 @functools.cache
@@ -102,8 +108,9 @@ def swap(commit):  # every part is asked for, and none waited for
 
 def take(commits):  # in a thread of its own: it waits
     for commit in commits:
-        said = swap(commit.payload.to_bytes()) | {"session": now["session"]}
-        session.put(f"{root}/cm/ack", msgpack.packb(said), congestion_control=block)
+        key, ack = str(commit.key_expr), f"{root}/cm/ack"
+        said = signing.vouched(key, commit.payload.to_bytes(), swap) | {"session": now["session"]}
+        session.put(ack, signing.sign(ack, said), congestion_control=block)
 
 
 def frame():  # slopes, commands and dither; then the loop's answer, two frames later
@@ -120,10 +127,9 @@ def frame():  # slopes, commands and dither; then the loop's answer, two frames 
 
 
 retry = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
-connect = {"endpoints": [endpoint], "timeout_ms": -1, "retry": retry}
-settings = {"mode": "client", "connect": connect, "timestamping": {"enabled": True}}
-config = zenoh.Config.from_json5(json.dumps(settings))
-session, block = zenoh.open(config), zenoh.CongestionControl.BLOCK
+where = {"endpoints": [endpoint], "timeout_ms": -1, "retry": retry}
+settings = {"mode": "client", "connect": where, "timestamping": {"enabled": True}}
+session, block = connect(settings, *secured[:1]), zenoh.CongestionControl.BLOCK
 recovery = {"cache": zenoh.ext.CacheConfig(round(hz / 2)), "publisher_detection": True}
 recovery["sample_miss_detection"] = zenoh.ext.MissDetectionConfig(heartbeat=0.2)
 frames = zenoh.ext.declare_advanced_publisher(session, f"{root}/tel/frames", **recovery)
@@ -142,9 +148,9 @@ while True:
             rows += frame()
             seq += 1
         now.update(seq=seq - 1, t_ns=head["t0_ns"] + 9 * head["dt_ns"])
-        status = msgpack.packb(now)
+        status = signing.sign(f"{root}/tel/status", now)
     payload = np.array(rows, "<f4").tobytes()
-    frames.put(payload, attachment=msgpack.packb(head))
+    frames.put(payload, attachment=signing.sign(f"{root}/tel/frames", head, payload))
     if seq % 100 == 0:
         session.put(f"{root}/tel/status", status)
     time.sleep(max(0.0, start_ns / 1e9 + seq / hz - time.time()))

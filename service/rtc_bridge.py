@@ -29,6 +29,7 @@ from service.link.leader_election import Standby
 from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
 from service.link.session import Endpoint
 from service.link.statistics import LinkStatistics
+from service.wire.signing import Signatures
 
 if TYPE_CHECKING:
     import zenoh
@@ -54,6 +55,7 @@ class Bridge:
         self._intake = Intake(endpoint)
         self._measured = MeasuredIntake(self._keys)
         self._outbox = Outbox(endpoint.offer_s)
+        self._signatures = Signatures(endpoint.security.secret, wire.Role.SERVICE)
         self.guard = LinkGuard(endpoint.security)
         """Who comes onto a secured link, and what was refused to whom."""
         self._session: zenoh.Session | None = None
@@ -260,7 +262,8 @@ class Bridge:
 
     async def fetch_applied(self) -> tuple[wire.Manifest, NDArray[np.float32]]:
         """Return the reconstructor the RTC uses, as :func:`service.link.session.fetch_applied`."""
-        return await asyncio.to_thread(link.fetch_applied, self._opened(), self._keys)
+        read_back = link.fetch_applied
+        return await asyncio.to_thread(read_back, self._opened(), self._keys, self._signatures)
 
     def publish_state(self, message: wire.StateMessage) -> None:
         """Publish the service's state; dropped while the network is slow."""
@@ -315,6 +318,7 @@ class Bridge:
         header = None
         if attachment is not None:
             header = link.bytes_of(attachment, wire.ATTACHMENT_LIMIT, "an attachment")
+        self._signatures.check(self._keys.frames, header or b"", payload)
         self._record(RecordedKind.FRAMES, payload, header or b"")
         self._intake.frames(
             payload,
@@ -325,11 +329,13 @@ class Bridge:
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, wire.STATUS_LIMIT, "a status")
+        self._signatures.check(self._keys.status, data)
         self._record(RecordedKind.STATUS, data)
         self._intake.status(data)
 
     def _on_ack(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, wire.MESSAGE_LIMIT, "an acknowledgement")
+        self._signatures.check(self._keys.acknowledgement, data)
         self._record(RecordedKind.ACKNOWLEDGEMENT, data)
         acknowledgement = wire.decode(wire.Acknowledgement, data)
         matrix_id = acknowledgement.id
@@ -340,7 +346,10 @@ class Bridge:
 
     def _on_measured(self, sample: zenoh.Sample) -> None:
         data = link.bytes_of(sample.payload, wire.CHUNK_LIMIT, "a measured matrix")
-        if (event := self._measured.take(str(sample.key_expr), data)) is not None:
+        key = str(sample.key_expr)
+        if self._keys.chunk_index_of(key) is None:
+            self._signatures.check(key, data)
+        if (event := self._measured.take(key, data)) is not None:
             self._intake.event(event)
 
     def _on_alive(self, token: tuple[str, bool]) -> None:
@@ -356,8 +365,11 @@ class Bridge:
             except (UnknownIdError, WireError) as error:
                 query.reply_err(str(error).encode())
             else:
-                encoding = wire.Encodings.COMMIT if part is None else wire.Encodings.BYTES
-                query.reply(key, data, encoding=encoding)
+                if part is None:
+                    signed = self._signatures.sign(key, data)
+                    query.reply(key, signed, encoding=wire.Encodings.COMMIT)
+                else:  # what the signed manifest has the sum of
+                    query.reply(key, data, encoding=wire.Encodings.BYTES)
 
     def _prepare(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> Offer:
         layout = wire.layout_of(matrix, manifest.layout.chunk_bytes)
@@ -381,11 +393,12 @@ class Bridge:
         other = self._intake.other_session
         if other is not None:  # it may list its slopes otherwise
             raise LinkError(f"{name} was not sent: the RTC may have begun session {other}")
-        link.put(session, keys.commit(name), offer.commit, wire.Encodings.COMMIT, urgent=True)
+        signed = self._signatures.sign(keys.commit(name), offer.commit)
+        link.put(session, keys.commit(name), signed, wire.Encodings.COMMIT, urgent=True)
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: wire.Command) -> wire.Reply:
-        answer = link.send_command(self._driven(), self._endpoint, command)
+        answer = link.send_command(self._driven(), self._endpoint, command, self._signatures)
         try:
             reply = wire.decode(wire.Reply, answer)
         except WireError as error:

@@ -14,11 +14,13 @@ from service.wire import (
     Loop,
     LoopRequest,
     Reply,
+    Role,
     Status,
     checksum,
     encode,
     encode_frames,
 )
+from service.wire.signing import Signatures
 from sim_rtc.computer.reconstructors import Terms
 from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session
 from sim_rtc.link.matrices import Matrices
@@ -190,17 +192,18 @@ class Bridge:
 
     def run(self, router, n_frames):
         """Be an RTC of the service at ``router``, which may be late, for so many frames."""
-        keys = Keys(self.identity.system)
+        keys, signed = Keys(self.identity.system), Signatures(router.secret, Role.RTC)
         with open_session(router, threading.Event()) as session:
-            Replies(keys, self).declare(session)
+            Replies(keys, self, signed).declare(session)
             frames = frames_publisher(session, keys, RATE_HZ / BATCH)
             status, told_s, said = status_publisher(session, keys), 0.0, None
-            with Matrices(session, keys, self) as matrices, Token(session, keys, None):
+            matrices = Matrices(session, keys, self, signatures=signed)
+            with matrices, Token(session, keys, None):
                 while self.seq < n_frames:
                     payload, attachment = encode_frames(*self.batch())
-                    frames.put(payload, attachment=attachment)
+                    frames.put(payload, attachment=signed.sign(keys.frames, attachment, payload))
                     if self.swaps:
                         matrices.look()
                     if time.monotonic() - told_s > STATUS_PERIOD_S or said != self.session:
                         said, told_s = self.session, time.monotonic()
-                        status.put(encode(self.status()))
+                        status.put(signed.sign(keys.status, encode(self.status())))

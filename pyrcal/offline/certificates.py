@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import secrets
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
@@ -30,6 +31,9 @@ AUTHORITY_DAYS: Final = 3650
 
 CLOCKS_DIFFER: Final = timedelta(hours=1)
 """A certificate holds from so long before it was made."""
+
+SECRET: Final = "signing.key"
+"""File of what service and RTC may sign their messages with."""
 
 DONE: Final = 0
 
@@ -65,6 +69,8 @@ def _make(folder: Path, hosts: tuple[str, ...], port: int, days: float) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         authority = _authority(folder)
+        if not (folder / SECRET).exists():
+            _write_secret(folder / SECRET, secrets.token_hex(32).encode() + b"\n")
         for role in LinkRole:
             _write(folder, str(role), _signed_by(authority, role, hosts, days))
             _write_settings(folder.absolute(), role, hosts[0], port)
@@ -157,11 +163,14 @@ def _write_settings(folder: Path, role: LinkRole, host: str, port: int) -> None:
     ca, endpoint = folder / "ca.pem", f"tls/{host}:{port}"
     others = [str(folder / f"{other}.pem") for other in LinkRole if other is not role]
     watched = f"watched = {json.dumps(others)}\n" if role is LinkRole.SERVICE else ""
+    signing = f"\n# [zenoh.signing]\n# key_file = {json.dumps(str(folder / SECRET))}\n"
+    if role is LinkRole.VIEWER:
+        signing = ""
     how = "listen" if role is LinkRole.SERVICE else "connect"
     (folder / f"{role}.toml").write_text(
         f"[zenoh]\n{how} = {json.dumps([endpoint])}\n\n[zenoh.tls]\n"
         f"ca = {json.dumps(str(ca))}\ncertificate = {json.dumps(str(own))}\n"
-        f"key = {json.dumps(str(key))}\n{watched}",
+        f"key = {json.dumps(str(key))}\n{watched}{signing}",
         encoding="utf-8",
     )
     if role is LinkRole.SERVICE:

@@ -22,6 +22,9 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 USERS: Final = "transport/auth/usrpwd"
 """Of zenoh's configuration."""
 
+SHORTEST_SECRET: Final = 32
+"""Characters."""
+
 _ENCRYPTED: Final = re.compile("(tls|quic)/")
 
 Names = tuple[Annotated[str, Field(min_length=1, max_length=64)], ...]
@@ -83,6 +86,13 @@ class AccessTable(Table):
         return self
 
 
+class SigningTable(Table):
+    """``[zenoh.signing]``: service and RTC vouch for what they send, whoever runs the router."""
+
+    key_file: Path
+    """The file whose first line is the secret that both share; nobody else may read it."""
+
+
 class CredentialsTable(Table):
     """``[zenoh]`` of a program that only connects: who it is, and whom it trusts."""
 
@@ -91,6 +101,9 @@ class CredentialsTable(Table):
 
     users: UsersTable | None = None
     """Names and passwords; left out: none are asked for."""
+
+    signing: SigningTable | None = None
+    """A shared secret; left out: nothing is signed, and no signature is asked for."""
 
 
 class ZenohTable(CredentialsTable):
@@ -178,6 +191,9 @@ class Router:
     security: Mapping[str, object]
     """What zenoh is told about certificates and users; empty: it shows nothing."""
 
+    secret: bytes | None = None
+    """What messages are signed with; None: they are not."""
+
 
 def router_of(path: Path | None, connect: str | None) -> Router:
     """Return the router that a settings file names, or ``connect`` instead.
@@ -189,7 +205,7 @@ def router_of(path: Path | None, connect: str | None) -> Router:
     """
     zenoh = read_link_tables(path, connect=connect)
     endpoint = (*zenoh.connect, DEFAULT_ENDPOINT)[0]
-    return Router(endpoint=endpoint, security=client_security(zenoh))
+    return Router(endpoint=endpoint, security=client_security(zenoh), secret=secret_of(zenoh))
 
 
 def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
@@ -204,8 +220,9 @@ def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
         If a file is missing, or others can read what is secret.
     """
     told: dict[str, object] = {**client_security(zenoh)}
+    secret = secret_of(zenoh)
     if not told:
-        return LinkSecurity()
+        return LinkSecurity(secret=secret)
     access = zenoh.access
     names = {
         LinkRole.RTC: access.rtc,
@@ -222,6 +239,7 @@ def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
         zenoh=told,
         roles={name: str(role) for role, every in names.items() for name in every},
         certificates=() if zenoh.tls is None else _certificates_of(zenoh.tls),
+        secret=secret,
         warn_s=DAY_S * (0.0 if zenoh.tls is None else zenoh.tls.warn_days),
     )
 
@@ -248,6 +266,20 @@ def client_security(credentials: CredentialsTable) -> dict[str, dict[str, object
     return security
 
 
+def secret_of(credentials: CredentialsTable) -> bytes | None:
+    """Return the secret that messages are signed with; None: they are not.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file is missing, others can read it, or the secret is short enough to be guessed.
+    """
+    if credentials.signing is None:
+        return None
+    line = _first_line(credentials.signing.key_file, "zenoh.signing.key_file", SHORTEST_SECRET)
+    return line.encode()
+
+
 def _certificates(tls: TlsTable) -> dict[str, object]:
     ca = _there(tls.ca, "zenoh.tls.ca")
     own, key = _there(tls.certificate, "zenoh.tls.certificate"), _secret(tls.key, "zenoh.tls.key")
@@ -264,10 +296,7 @@ def _certificates(tls: TlsTable) -> dict[str, object]:
 
 
 def _own_user(users: UsersTable) -> dict[str, object]:
-    path, key = users.password_file, "zenoh.users.password_file"
-    password = next(iter(Path(_secret(path, key)).read_text(encoding="utf-8").splitlines()), "")
-    if not password:
-        refuse(key, f"nothing in the first line of {path}", "a password")
+    password = _first_line(users.password_file, "zenoh.users.password_file", 1)
     return {"user": users.name, "password": password}
 
 
@@ -275,6 +304,15 @@ def _users_file(users: UsersTable) -> str:
     if users.file is None:
         refuse("zenoh.users.file", "none", "a file with NAME:PASSWORD of all who may connect")
     return _secret(users.file, "zenoh.users.file")
+
+
+def _first_line(path: Path, key: str, shortest: int) -> str:
+    lines = Path(_secret(path, key)).read_text(encoding="utf-8").splitlines()
+    line = lines[0].strip() if lines else ""
+    if len(line) < shortest:
+        found = f"{len(line)} characters in the first line of {path}"
+        refuse(key, found, f"at least {shortest}")
+    return line
 
 
 def _there(path: Path, key: str) -> str:

@@ -61,6 +61,9 @@ class LinkSecurity:
     """The role of each name that has one; empty: no names are known."""
 
     certificates: tuple[Certificate, ...] = ()
+    secret: bytes | None = None
+    """What messages are signed with; None: they are not, and no signature is asked for."""
+
     warn_s: float = 30 * DAY_S
     """So long before its end a certificate is spoken of."""
 

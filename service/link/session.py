@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from service import wire
 from service.errors import LinkError, WireError
 from service.link.guard import OPEN, LinkSecurity
+from service.wire.signing import Signatures
 
 HISTORY_S = 0.5
 """Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
@@ -277,7 +278,9 @@ def latency_s(session: zenoh.Session, sample: zenoh.Sample, now_ns: int) -> floa
     return (now_ns - stamp.get_time_as_ntp64().as_nanos()) * 1e-9
 
 
-def send_command(session: zenoh.Session, endpoint: Endpoint, command: wire.Command) -> bytes:
+def send_command(
+    session: zenoh.Session, endpoint: Endpoint, command: wire.Command, signatures: Signatures
+) -> bytes:
     """Return the RTC's answer to a command, repeated with the same id until there is one.
 
     Raises
@@ -285,7 +288,7 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: wire.Comma
     WireError
         If the command breaks the contract.
     LinkError
-        If there is none after all attempts.
+        If there is none after all attempts, or it is not signed as it must be.
     """
     payload, kind = wire.encode(command), wire.command_kind(command)
     selector = wire.Keys(endpoint.system).command(kind)
@@ -293,9 +296,10 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: wire.Comma
         if attempt:
             time.sleep(ABSENT_PAUSE_S)
         timeout_s, began_s = endpoint.command_timeout_s, time.monotonic()
-        answer = ask(session, selector, timeout_s, payload, wire.Encodings.COMMAND)
+        signed = signatures.sign(selector, payload)
+        answer = ask(session, selector, timeout_s, signed, wire.Encodings.COMMAND)
         if answer is not None:
-            return answer
+            return _vouched(answer, selector, command, signatures)
         # zenoh ends a query at once that nobody serves
         if kind in OPTIONAL and time.monotonic() - began_s < timeout_s / 2:
             reason = f"unsupported: the RTC offers no {kind}"
@@ -308,19 +312,29 @@ def send_command(session: zenoh.Session, endpoint: Endpoint, command: wire.Comma
     )
 
 
+def _vouched(answer: bytes, selector: str, command: wire.Command, signatures: Signatures) -> bytes:
+    try:
+        signatures.check(selector, answer)
+    except WireError as error:
+        raise LinkError(f"the reply to command {command.id} is unusable: {error}") from error
+    return answer
+
+
 def fetch_applied(
-    session: zenoh.Session, keys: wire.Keys
+    session: zenoh.Session, keys: wire.Keys, signatures: Signatures
 ) -> tuple[wire.Manifest, NDArray[np.float32]]:
     """Return the reconstructor the RTC uses, checked against its manifest.
 
     Raises
     ------
     WireError
-        If what comes breaks the contract or the checksum differs.
+        If what comes breaks the contract, is not signed as it must be or the checksum differs.
     LinkError
         If the RTC does not answer or has none.
     """
-    manifest = wire.decode(wire.Manifest, _asked(session, keys.applied))
+    told = _asked(session, keys.applied)
+    signatures.check(keys.applied, told)
+    manifest = wire.decode(wire.Manifest, told)
     assembler = wire.ChunkAssembler()
     assembler.announce(manifest.layout)
     for index in range(manifest.layout.n_chunks):

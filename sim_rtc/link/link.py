@@ -19,7 +19,8 @@ import zenoh
 from typing_extensions import override
 
 from service.files.recording import RecordedKind, RecordingWriter
-from service.wire import Keys, encode, split
+from service.wire import Keys, Role, encode, split
+from service.wire.signing import Signatures
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of
@@ -68,6 +69,8 @@ class Link(Background):
         self._clock = clock
         self._detector = detector
         self._keys = Keys(computer.identity.system)
+        self._router = options.router
+        self._signatures = Signatures(self._router.secret, Role.RTC)
         self._backlog: deque[tuple[Batch, int, float]] = deque()
         """Batches, when their first exposure ended, nanoseconds, and at what loop time."""
         self._ready = threading.Condition()
@@ -105,8 +108,8 @@ class Link(Background):
 
     @override
     def _work(self) -> None:
-        replies = Replies(self._keys, self._computer)
-        while (session := open_session(self._options.router, self._stopped)) is not None:
+        replies = Replies(self._keys, self._computer, self._signatures)
+        while (session := open_session(self._router, self._stopped)) is not None:
             self._speak(session, replies)
 
     def _speak(self, session: zenoh.Session, replies: Replies) -> None:
@@ -121,6 +124,7 @@ class Link(Background):
                     session,
                     self._keys,
                     self._computer,
+                    signatures=self._signatures,
                     plan=self._plan,
                     recorder=self._recorder,
                 ) as matrices,
@@ -144,7 +148,8 @@ class Link(Background):
                 self._note_matrix(batch.cm_id)
                 header, rows = frames_of(batch, self._computer.identity, t0_ns, self._clock.dt_ns)
                 for payload, attachment in self._faults.messages(header, rows, time_s):
-                    frames.put(payload, attachment=attachment)
+                    signed = self._signatures.sign(self._keys.frames, attachment, payload)
+                    frames.put(payload, attachment=signed)
                     self._record(RecordedKind.FRAMES, payload, attachment)
             if self._computer.has_news:
                 matrices.look()
@@ -152,7 +157,7 @@ class Link(Background):
             now_s = time.monotonic()
             if now_s >= next_status_s and not self._absent.is_set():
                 data = self._status()
-                status.put(data)
+                status.put(self._signatures.sign(self._keys.status, data))
                 self._record(RecordedKind.STATUS, data)
                 next_status_s = now_s + _STATUS_PERIOD_S
                 if lifeline.cut(session, now_s):

@@ -25,6 +25,7 @@ from service.wire import (
     encode,
     split,
 )
+from service.wire.signing import UNSIGNED, Signatures
 from sim_rtc.computer.feed import Background
 from sim_rtc.computer.measure import Measurement, product
 from sim_rtc.computer.reconstructors import Outcome, Staging
@@ -56,6 +57,7 @@ class Matrices(Background):
         keys: Keys,
         computer: Computer,
         *,
+        signatures: Signatures = UNSIGNED,
         plan: FaultPlan | None = None,
         recorder: RecordingWriter | None = None,
     ) -> None:
@@ -63,6 +65,7 @@ class Matrices(Background):
         self._session = session
         self._keys = keys
         self._computer = computer
+        self._signatures = signatures
         self._staging = Staging(computer.terms, limit_bytes=computer.largest_matrix_bytes)
         self._events: queue.Queue[Event] = queue.Queue(_MOST_EVENTS)
         self._rtc_session = computer.session
@@ -150,6 +153,7 @@ class Matrices(Background):
         if self._plan.active(FaultKind.DEAF):
             return
         try:
+            self._signatures.check(key, data)
             manifest = decode(Manifest, data)
             if manifest.id != self._keys.matrix_id_of(key):
                 raise WireError(f"id: {manifest.id} in the manifest at {key}")
@@ -179,6 +183,7 @@ class Matrices(Background):
         if data is None:
             return
         try:
+            self._signatures.check(self._keys.current, data)
             manifest = decode(Manifest, data)
         except WireError as error:
             _log.warning("reconstructor.refused", reason=str(error))
@@ -239,7 +244,8 @@ class Matrices(Background):
         data = encode(acknowledgement)
         if self._recorder is not None:
             self._recorder.put(RecordedKind.ACKNOWLEDGEMENT, data)
-        acknowledge(self._session, self._keys, data)
+        signed = self._signatures.sign(self._keys.acknowledgement, data)
+        acknowledge(self._session, self._keys, signed)
 
     def _send(self, measured: Measurement) -> None:
         """Solve what was measured; send the matrix in parts, then its manifest."""
@@ -253,9 +259,10 @@ class Matrices(Background):
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=zenoh.Priority.DATA_LOW,
             )
+        key = self._keys.measured_commit(manifest.id)
         self._session.put(
-            self._keys.measured_commit(manifest.id),
-            encode(manifest),
+            key,
+            self._signatures.sign(key, encode(manifest)),
             encoding=Encodings.MEASURED_COMMIT,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,

@@ -25,6 +25,7 @@ from service.wire import (
     encode,
     split,
 )
+from service.wire.signing import UNSIGNED, Signatures
 from sim_rtc.computer.measure import Measurement
 from sim_rtc.computer.reconstructors import Terms
 from sim_rtc.computer.telemetry import Identity, Reconstructor
@@ -69,18 +70,20 @@ class Computer(Protocol):
 class Replies:
     """The RTC's queryables; they answer on the network's threads."""
 
-    def __init__(self, keys: Keys, computer: Computer) -> None:
+    def __init__(self, keys: Keys, computer: Computer, signatures: Signatures = UNSIGNED) -> None:
         self._keys = keys
+        self._signatures = signatures
         self._computer = computer
         self._cache = ReplyCache(computer.execute)
 
     def declare(self, session: zenoh.Session) -> None:
         """Let the session answer from now on."""
-        answer_commands(session, self._keys, self._reply)
-        answer_applied(session, self._keys, self._applied)
+        answer_commands(session, self._keys, self._reply, self._signatures)
+        answer_applied(session, self._keys, self._applied, self._signatures)
 
     def _reply(self, kind: CommandKind, data: bytes) -> Reply:
         try:
+            self._signatures.check(self._keys.command(kind), data)
             reply = self._cache.handle(decode_command(kind, data), time.monotonic())
         except WireError as error:
             reply = Reply(id=command_id(data), accepted=False, reason=str(error), start_seq=None)
@@ -100,7 +103,10 @@ class Replies:
 
 
 def answer_commands(
-    session: zenoh.Session, keys: Keys, reply: Callable[[CommandKind, bytes], Reply]
+    session: zenoh.Session,
+    keys: Keys,
+    reply: Callable[[CommandKind, bytes], Reply],
+    signatures: Signatures = UNSIGNED,
 ) -> None:
     """Let a session answer commands of every kind by ``reply``."""
 
@@ -108,7 +114,7 @@ def answer_commands(
         def answer(query: zenoh.Query) -> None:
             with query:
                 data = b"" if query.payload is None else query.payload.to_bytes()
-                reply_bytes = encode(reply(kind, data))
+                reply_bytes = signatures.sign(keys.command(kind), encode(reply(kind, data)))
                 query.reply(keys.command(kind), reply_bytes, encoding=Encodings.REPLY)
 
         return answer
@@ -118,7 +124,10 @@ def answer_commands(
 
 
 def answer_applied(
-    session: zenoh.Session, keys: Keys, applied: Callable[[], tuple[bytes, list[bytes]] | None]
+    session: zenoh.Session,
+    keys: Keys,
+    applied: Callable[[], tuple[bytes, list[bytes]] | None],
+    signatures: Signatures = UNSIGNED,
 ) -> None:
     """Let a session serve the matrix in use: its manifest, or one chunk."""
 
@@ -130,7 +139,8 @@ def answer_applied(
                 return
             manifest, chunks = found
             if wanted is None:
-                query.reply(keys.applied, manifest, encoding=Encodings.COMMIT)
+                signed = signatures.sign(keys.applied, manifest)
+                query.reply(keys.applied, signed, encoding=Encodings.COMMIT)
             elif wanted.isdecimal() and int(wanted) < len(chunks):
                 query.reply(keys.applied, chunks[int(wanted)], encoding=Encodings.BYTES)
             else:

@@ -35,6 +35,7 @@ from service.wire import (
     encode_frames,
     split,
 )
+from service.wire.signing import Signatures
 from tests.system.pace import patience
 
 T0_NS = 1_800_000_000_000_000_000
@@ -67,7 +68,10 @@ def client_session(endpoint, stamped=True, **more):
 class FakeRtc:
     """Sends what a test tells it to, stages and applies what it is sent."""
 
-    def __init__(self, endpoint, system="bench", session="s1", n_slopes=6, n_modes=4, **more):
+    def __init__(
+        self, endpoint, system="bench", session="s1", n_slopes=6, n_modes=4, secret=None, **more
+    ):
+        self.signatures = Signatures(secret, Role.RTC)
         self.keys = Keys(system)
         self.session = session
         self.n_slopes, self.n_modes = n_slopes, n_modes
@@ -130,6 +134,7 @@ class FakeRtc:
         header = self.header(seq0, n, **changes)
         rows = self.rows(header) if rows is None else rows
         payload, attachment = encode_frames(header, rows)
+        attachment = self.signatures.sign(self.keys.frames, attachment, payload)
         self.send_raw(payload, attachment, plain=plain)
 
     def send_raw(self, payload, attachment, plain=False):
@@ -166,7 +171,8 @@ class FakeRtc:
 
     def send_status(self, **changes):
         """Send a status message."""
-        self.zenoh.put(self.keys.status, encode(self.status(**changes)))
+        status = encode(self.status(**changes))
+        self.zenoh.put(self.keys.status, self.signatures.sign(self.keys.status, status))
 
     def send_bytes(self, key, data):
         """Put anything anywhere."""
@@ -196,7 +202,7 @@ class FakeRtc:
         )
         self.zenoh.put(
             self.keys.acknowledgement,
-            encode(message),
+            self.signatures.sign(self.keys.acknowledgement, encode(message)),
             encoding=Encodings.ACKNOWLEDGEMENT,
             congestion_control=zenoh.CongestionControl.BLOCK,
             priority=zenoh.Priority.DATA_HIGH,
@@ -227,6 +233,7 @@ class FakeRtc:
             if index is not None:
                 assembler.add(index, data)
             else:
+                self.signatures.check(key, data)
                 manifest = decode(Manifest, data)
                 assembler.announce(manifest.layout)
                 self.waiting[name][1] = manifest
@@ -253,7 +260,7 @@ class FakeRtc:
                 query.reply_err(b"no matrix in use")
                 return
             manifest, part = self.applied["manifest"], query.parameters.get("chunk")
-            data = encode(manifest)
+            data = self.signatures.sign(self.keys.applied, encode(manifest))
             if part is not None:
                 data = split(self.applied["matrix"], manifest.layout.chunk_bytes)[int(part)]
             query.reply(query.key_expr, data)
@@ -269,6 +276,7 @@ class FakeRtc:
                 return
             data = query.payload.to_bytes()
             try:
+                self.signatures.check(self.keys.command(kind), data)
                 command = decode_command(kind, data)
             except WireError as error:
                 reply = Reply(
@@ -277,7 +285,8 @@ class FakeRtc:
             else:
                 self.commands.append(command)
                 reply = Reply(id=command.id, accepted=True, reason="", start_seq=77)
-            query.reply(query.key_expr, encode(reply))
+            key = self.keys.command(kind)
+            query.reply(key, self.signatures.sign(key, encode(reply)))
 
 
 def main(endpoint, system, session, n_slopes, n_modes, rate_hz, per_batch):

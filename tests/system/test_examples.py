@@ -1,8 +1,13 @@
 """The programs of examples/ do what they say: an RTC from the contract alone is calibrated."""
 
+import time
+
+import msgpack
 import numpy as np
 import pytest
+import zenoh
 
+from tests.system.cable import free_port
 from tests.system.night import ALPHA, INSTRUMENT, N_START, N_TARGET, ROOT, a_night, wait_for
 from tests.system.stranger import small_telescope
 from tests.system.test_check_rtc import checked_beside, late_with_the_machine
@@ -24,7 +29,7 @@ def plant(tmp_path):
 
 
 def test_they_are_as_short_as_the_page_says():
-    for name, most in (("subscribe", 42), ("rtc", 150)):
+    for name, most in (("subscribe", 42), ("rtc", 160), ("secured", 60)):
         text = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
         assert text.count("\n") <= most
         assert "service" not in {
@@ -62,6 +67,39 @@ def test_the_rtc_is_registered_and_swaps_a_matrix_that_a_subscriber_gets_too(tmp
         assert passive.ended(40.0) == 0, passive.log
         assert f"the RTC there is that of system {SYSTEM}" in passive.log
         assert night.state["in_use"] == in_use
+
+
+def test_the_rtc_joins_a_secured_link_and_takes_what_is_signed_alone(tmp_path, plant):
+    """Its swap, its gains and its replies: the service's own, and none of a stranger's."""
+    folder, port = tmp_path / "tls", free_port()
+    make = ["pyrcal", "certificates", "new", str(folder), "--zenoh-port", str(port)]
+    with a_night(tmp_path) as night:
+        assert night.start("certificates", make).ended(20.0) == 0
+        table = (folder / "service.toml").read_text().replace("# ", "")
+        night.settings.write_text(night.settings.read_text() + table)
+        night.zenoh = f"tls/127.0.0.1:{port}"
+        service = night.service("auto", wait=False)
+        secured = [str(folder / "rtc.json5"), str(folder / "signing.key")]
+        night.start("rtc", ["examples.rtc", night.zenoh, SYSTEM, str(plant), *secured])
+        wait_for(lambda: night.ready(service), 60.0, lambda: service.log)
+        night.wait_for_modes(N_START, 60.0)
+        gains, before = night.rtc_says("gains"), night.state["in_use"]
+        # the RTC's own certificate, stolen, and the service's: all but the secret
+        thief = zenoh.Config.from_file(secured[0])
+        tls = thief.get_json("transport/link/tls").replace("tls/rtc", "tls/service")
+        thief.insert_json5("transport/link/tls", tls)
+        order = {"v": 1, "id": "mine", "gains": [1.9] * len(gains), "leak": 1.0, "loop": None}
+        with zenoh.open(thief) as session:
+            asked = msgpack.packb(order | {"n_controlled": None})
+            key = f"ao/v1/{SYSTEM}/cmd/rtc/loop"
+            (reply,) = session.get(key, payload=asked, timeout=5.0)
+            said = msgpack.unpackb(reply.ok.payload.to_bytes())
+            assert (said["accepted"], said["reason"]) == (False, "signature: none")
+            session.put(f"ao/v1/{SYSTEM}/cm/mine/commit", msgpack.packb({"v": 1, "id": "mine"}))
+            session.put(f"ao/v1/{SYSTEM}/tel/status", msgpack.packb({"v": 1}))
+            time.sleep(1.0)
+        assert night.rtc_says("gains") == gains
+        assert night.rtc_says("cm_id") == before
 
 
 @pytest.mark.long

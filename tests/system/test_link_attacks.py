@@ -18,9 +18,11 @@ import zenoh
 
 from service.config.link_tables import AccessTable, TlsTable, UsersTable, ZenohTable, link_security
 from service.errors import LinkError
-from service.link.guard import OPEN
+from service.link.guard import OPEN, LinkSecurity
 from service.rtc_bridge import Bridge, Endpoint
-from service.wire import LoopRequest
+from service.runtime.readiness import complaints
+from service.wire import LoopRequest, Role
+from service.wire.signing import Signatures
 from tests.system.cable import free_port
 from tests.system.fake_rtc import FakeRtc
 from tests.system.pace import Deadline
@@ -237,6 +239,11 @@ def bench(listen, security, **of_rtc):
             assert not deadline.passed, "the RTC was not let in"
             time.sleep(0.01)
         scene = Bench(bridge, rtc)
+        scene.listen = listen[0]
+        rtc.send_status()  # whose start orders are signed for
+        while bridge.statistics().statuses_received < 1:
+            assert not deadline.passed, "the RTC is not heard"
+            time.sleep(0.01)
         assert scene.drives()
         rtc.send(0)
         yield scene
@@ -247,7 +254,6 @@ def secured(folder):
     zenoh_table = tables(folder, free_port())
     security = link_security(zenoh_table, "bench")
     with bench(zenoh_table.listen, security, **certificate(folder / "ours", "rtc")) as scene:
-        scene.listen = zenoh_table.listen[0]
         yield scene
 
 
@@ -266,7 +272,6 @@ def generous(folder):
     control["rules"].append(rule | {"messages": [*told, "declare_liveliness_subscriber"]})
     control["policies"].append({"rules": ["told"], "subjects": ["viewer"]})
     with bench(zenoh_table.listen, security, **certificate(folder / "ours", "rtc")) as scene:
-        scene.listen = zenoh_table.listen[0]
         yield scene
 
 
@@ -372,3 +377,117 @@ def test_with_passwords_on_loopback_no_attack_succeeds_either(tmp_path):
         for how in (user("viewer", "wrong"), user("nobody", "a"), {}):
             with pytest.raises(zenoh.ZError):
                 attacker(listen[0], **how).close()
+
+
+# ---------------------------------------------------------------- a router that somebody else runs
+
+SECRET = b"what RTC and service alone know."
+FORGERIES = (command, own_matrix, forged_acknowledgement)
+"""Who runs the router reads all and may send anything: what remains is that nobody believes it."""
+
+
+@pytest.fixture
+def signed():
+    """A link on which anybody may say anything, and what RTC and service say is signed."""
+    listen = (f"tcp/127.0.0.1:{free_port()}",)
+    with bench(listen, LinkSecurity(secret=SECRET), secret=SECRET) as scene:
+        yield scene
+
+
+def test_what_nobody_has_signed_is_not_believed(signed):
+    with attacker(signed.listen) as session:
+        before = signed.bridge.statistics()
+        assert [forge.__name__ for forge in FORGERIES if forge(session, signed)] == ["command"]
+        assert [order.id for order in signed.rtc.commands if order.id == "mine"] == []
+        forged_frames(session, signed)
+        forged_status(session, signed)
+        after = signed.bridge.statistics()
+    assert after.batches_received == before.batches_received
+    assert after.statuses_received == before.statuses_received
+    assert set(after.messages_malformed) == {"ack", "frames", "status"}
+    texts = {each.text for each in after.dispositions if each.outcome == "malformed"}
+    assert texts == {"signature: none, and one is asked for"}
+
+
+def test_what_was_said_before_is_not_believed_again(signed):
+    """The stranger keeps all that is said, and says it once more."""
+    kept = []
+
+    def keep(sample):
+        attachment = sample.attachment
+        kept.append((str(sample.key_expr), sample.payload.to_bytes(), attachment))
+
+    with attacker(signed.listen) as session:
+        held = session.declare_subscriber(f"{ROOT}/**", keep)
+        time.sleep(SETTLED_S)
+        signed.rtc.send(signed.next_seq())
+        signed.rtc.send_status()
+        signed.rtc.acknowledge(None, None, "rejected", "range: x")
+        time.sleep(SETTLED_S)
+        held.undeclare()
+        before = signed.bridge.statistics()
+        said = {key.removeprefix(f"{ROOT}/"): rest for key, *rest in kept}
+        assert {"tel/frames", "tel/status", "cm/ack"} <= set(said)
+        for key in ("tel/frames", "tel/status", "cm/ack"):
+            payload, attachment = said[key]
+            session.put(f"{ROOT}/{key}", payload, attachment=attachment)
+        time.sleep(SETTLED_S)
+        after = signed.bridge.statistics()
+    assert after.batches_received == before.batches_received
+    assert after.statuses_received == before.statuses_received
+    assert after.acknowledgements_received == before.acknowledgements_received
+    texts = {each.text for each in after.dispositions if each.outcome == "malformed"}
+    assert len(texts) >= 1
+    assert all(text.endswith("came before, or too late") for text in texts)
+
+
+def test_an_order_of_before_counts_no_more(signed):
+    """The stranger stands between: hears an order as the RTC does, and gives it again."""
+    heard = []
+
+    def between(query):
+        with query:
+            heard.append(query.payload.to_bytes())
+
+    key = f"{ROOT}/cmd/rtc/loop"
+    with attacker(signed.listen) as session:
+        held = session.declare_queryable(key, between, complete=True)
+        time.sleep(SETTLED_S)
+        for _ in range(3):
+            signed.drives()
+        held.undeclare()
+        time.sleep(SETTLED_S)
+        n_before = len(signed.rtc.commands)
+        assert heard
+        answers = [msgpack.unpackb(data) for order in heard for data in asked(session, key, order)]
+        # what the RTC did not get the first time it may carry out once, and nothing twice
+        again = [msgpack.unpackb(data) for order in heard for data in asked(session, key, order)]
+    assert answers
+    assert not any(answer["accepted"] for answer in again)
+    assert all(answer["reason"].startswith("signature: ") for answer in again)
+    assert len(signed.rtc.commands) <= n_before + len(heard)
+
+
+def test_an_rtc_that_signs_and_a_service_that_does_not_ask_understand_each_other():
+    listen = (f"tcp/127.0.0.1:{free_port()}",)
+    with bench(listen, OPEN) as scene:
+        scene.rtc.signatures = Signatures(SECRET, Role.RTC)
+        before = scene.bridge.statistics().statuses_received
+        scene.rtc.send_status()
+        time.sleep(SETTLED_S)
+        assert scene.bridge.statistics().statuses_received == before + 1
+
+
+def test_an_rtc_that_does_not_sign_is_named_where_signatures_are_asked_for():
+    listen = (f"tcp/127.0.0.1:{free_port()}",)
+    endpoint = Endpoint(system="bench", listen=listen, security=LinkSecurity(secret=SECRET))
+    with Bridge(endpoint) as bridge, FakeRtc(listen[0]) as rtc:
+        deadline = Deadline(15.0)
+        while not bridge.statistics().messages_malformed.get("status"):
+            assert not deadline.passed
+            rtc.send_status()
+            time.sleep(0.1)
+        assert "signature: none" in complaints(bridge.statistics())["messages-refused"]
+        order = LoopRequest(id="a", leak=0.98)
+        with pytest.raises(LinkError, match="unusable: signature: none, and one is asked for"):
+            asyncio.run(bridge.command(order))

@@ -28,7 +28,17 @@ def folder(tmp_path):
     return tmp_path / "tls"
 
 
-def test_the_checker_finds_the_simulator_through_certificates(folder):
+def sign(folder, *names):
+    """Have programs sign what they send."""
+    for name in names:
+        path = folder / f"{name}.toml"
+        path.write_text(path.read_text().replace("# ", ""))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_the_checker_finds_the_simulator_through_certificates(folder, signed):
+    if signed:
+        sign(folder, "rtc", "service")
     where = ("--instrument", INSTRUMENT)
     rtc = pyrcal("sim", *where, "--config", folder / "rtc.toml", "--quiet", "--seconds", "60")
     try:

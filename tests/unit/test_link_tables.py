@@ -10,7 +10,12 @@ import zenoh
 
 from service.config import load_settings
 from service.config.certificates import read_certificate
-from service.config.link_tables import AccessTable, link_security, read_link_tables
+from service.config.link_tables import (
+    AccessTable,
+    link_security,
+    read_link_tables,
+    secret_of,
+)
 from service.errors import ConfigurationError
 from service.link.guard import LinkSecurity
 from service.wire import Keys
@@ -61,6 +66,16 @@ def test_the_files_that_are_written_are_settings_and_zenohs_own(folder):
     assert rtc.connect == service.listen
     config = zenoh.Config.from_file(str(folder / "viewer.json5"))
     assert json.loads(config.get_json("connect/endpoints")) == ["tls/localhost:7447"]
+
+
+def test_service_and_rtc_may_share_a_secret_that_a_viewer_does_not_get(folder, tmp_path):
+    for role in ("service", "rtc"):
+        path = tmp_path / f"{role}.toml"
+        path.write_text((folder / f"{role}.toml").read_text().replace("# ", ""))
+        assert len(secret_of(read_link_tables(path))) == 64
+    assert "signing" not in (folder / "viewer.toml").read_text()
+    assert (folder / "signing.key").stat().st_mode & 0o077 == 0
+    assert secret_of(read_link_tables(folder / "rtc.toml")) is None
 
 
 # --- what zenoh is told
@@ -198,6 +213,15 @@ def test_beside_certificates_there_is_no_way_without(folder):
     assert "found tcp/127.0.0.1:7447 beside [zenoh.tls], expected tls/HOST:PORT" in found
 
 
+def test_a_secret_that_could_be_guessed_is_refused(tmp_path):
+    key = tmp_path / "key"
+    key.touch(0o600)
+    key.write_text("sesame\n")
+    signing = f'[zenoh.signing]\nkey_file = "{key}"\n'
+    assert "found 6 characters in the first line" in refusal(tmp_path, signing)
+    assert "expected at least 32" in refusal(tmp_path, signing)
+
+
 @pytest.mark.parametrize("key", ["ca", "certificate", "key"])
 def test_a_missing_file_is_named_with_its_key(folder, key):
     secured = '[zenoh]\nlisten = ["tls/127.0.0.1:7447"]\n'
@@ -223,7 +247,7 @@ def test_a_router_with_passwords_needs_those_of_all(tmp_path):
     own = tmp_path / "own"
     own.touch(0o600)
     users = f'[zenoh.users]\nname = "service"\npassword_file = "{own}"\n'
-    assert "nothing in the first line" in refusal(tmp_path, users)
+    assert "found 0 characters in the first line" in refusal(tmp_path, users)
     own.write_text("sesame\n")
     assert "expected a file with NAME:PASSWORD of all" in refusal(tmp_path, users)
     client = f'[zenoh]\nconnect = ["tcp/127.0.0.1:7447"]\n{users}'

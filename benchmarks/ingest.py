@@ -1,6 +1,6 @@
 """Telemetry into the service while it computes: what is lost, and how late it comes.
 
-``python -m benchmarks.ingest [--seconds 60] [--rate 1000] [--batch 1] [--json FILE]``
+``python -m benchmarks.ingest [--seconds 60] [--batch 1] [--secured HOW] [--json FILE]``
 
 Three processes, as in the field: a sender that puts full-size frames at the frame rate, the
 service's own link, and a nice'd worker that linearises the optical model without pause.
@@ -13,7 +13,11 @@ import json
 import multiprocessing
 import os
 import socket
+import subprocess
+import sys
+import tempfile
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -21,7 +25,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ingest_processes import Sending, compute_without_pause, send_frames
+from service.config.link_tables import Router, link_security, read_link_tables, router_of
+from service.link.guard import refusals_of_zenoh
 from service.rtc_bridge import Bridge, Endpoint
+
+SYSTEM = "benchmark"
+
+SIGNING = '[zenoh.signing]\nkey_file = "%s/signing.key"\n'
 
 START_TIMEOUT_S = 60.0
 """For the worker to build its basis and finish a first linearisation."""
@@ -47,6 +57,13 @@ class Result:
 
     latency_p99_s: float
     latency_max_s: float
+    secured: str
+    """How: nothing, certificates and access, signatures, both."""
+
+    link_processor_s: float
+    """Processor time of the service's link, all of its threads."""
+
+    sender_processor_s: float
     cpus: int | None
 
 
@@ -81,10 +98,43 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace) -> Result:
     """Return what one run of sender, link and worker gave."""
-    endpoint = Endpoint(system="benchmark", listen=(f"tcp/127.0.0.1:{_free_port()}",))
+    with tempfile.TemporaryDirectory() as folder:
+        endpoint, router = _both_ends(Path(folder), arguments.secured)
+        watched = refusals_of_zenoh(_refused) if endpoint.security.zenoh else nullcontext()
+        with watched:
+            return _measured(arguments, endpoint, router)
+
+
+def _refused(who: str, what: str, where: str) -> None:
+    raise SystemExit(f"{who} was refused {what} on {where}")
+
+
+def _both_ends(folder: Path, secured: str) -> tuple[Endpoint, Router]:
+    """Return the service's end and the RTC's, with certificates and secret of their own."""
+    port = _free_port()
+    if secured == "nothing":
+        listen = f"tcp/127.0.0.1:{port}"
+        return Endpoint(system=SYSTEM, listen=(listen,)), Router(endpoint=listen, security={})
+    make = ["certificates", "new", str(folder), "--zenoh-port", str(port)]
+    subprocess.run([sys.executable, "-m", "pyrcal", *make], check=True, capture_output=True)
+    for name in ("service", "rtc"):
+        path = folder / f"{name}.toml"
+        text = path.read_text(encoding="utf-8")
+        if secured == "signatures":
+            text = text.partition("[zenoh.tls]")[0].replace("tls/", "tcp/") + SIGNING % folder
+        elif secured == "both":
+            text = text.replace("# ", "")
+        path.write_text(text, encoding="utf-8")
+    zenoh = read_link_tables(folder / "service.toml")
+    security = link_security(zenoh, SYSTEM)
+    endpoint = Endpoint(system=SYSTEM, listen=zenoh.listen, security=security)
+    return endpoint, router_of(folder / "rtc.toml", None)
+
+
+def _measured(arguments: argparse.Namespace, endpoint: Endpoint, router: Router) -> Result:
     sending = Sending(
-        endpoint=endpoint.listen[0],
-        system=endpoint.system,
+        router=router,
+        system=SYSTEM,
         frame_rate_hz=arguments.rate,
         frames_per_message=arguments.batch,
         seconds=arguments.seconds,
@@ -93,8 +143,9 @@ def measure(arguments: argparse.Namespace) -> Result:
     )
     spawn = multiprocessing.get_context("spawn")
     stop, n_fits, n_sent = spawn.Event(), spawn.Value("q", 0), spawn.Value("q", 0)
+    sender_ns = spawn.Value("q", 0)
     worker = spawn.Process(target=compute_without_pause, args=(stop, n_fits), daemon=True)
-    sender = spawn.Process(target=send_frames, args=(sending, n_sent), daemon=True)
+    sender = spawn.Process(target=send_frames, args=(sending, n_sent, sender_ns), daemon=True)
     worker.start()
     _wait_until_positive(n_fits)
     with Bridge(endpoint) as bridge:
@@ -102,7 +153,9 @@ def measure(arguments: argparse.Namespace) -> Result:
         bridge.set_wakeup(consumer.on_wakeup)
         fits_before = n_fits.value
         sender.start()
+        began_ns = time.process_time_ns()
         sender.join(arguments.seconds + START_TIMEOUT_S)
+        link_ns = time.process_time_ns() - began_ns
         fits_computed = n_fits.value - fits_before
         statistics = bridge.statistics()
     stop.set()
@@ -121,6 +174,9 @@ def measure(arguments: argparse.Namespace) -> Result:
         latency_p50_s=p50,
         latency_p99_s=p99,
         latency_max_s=highest,
+        secured=arguments.secured,
+        link_processor_s=1e-9 * link_ns,
+        sender_processor_s=1e-9 * sender_ns.value,
         cpus=os.cpu_count(),
     )
 
@@ -147,7 +203,9 @@ def _report(result: Result) -> str:
         f"{result.frames_overwritten} overwritten, "
         f"while {result.fits_computed} linearisations were computed\n"
         f"put to consumer: p50 {1e3 * result.latency_p50_s:.2f} ms, "
-        f"p99 {1e3 * result.latency_p99_s:.2f} ms, max {1e3 * result.latency_max_s:.1f} ms"
+        f"p99 {1e3 * result.latency_p99_s:.2f} ms, max {1e3 * result.latency_max_s:.1f} ms\n"
+        f"processor time, secured by {result.secured}: link {result.link_processor_s:.2f} s, "
+        f"sender {result.sender_processor_s:.2f} s in {result.seconds:g} s"
     )
 
 
@@ -159,6 +217,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=1, help="frames per message, 1 to 50")
     parser.add_argument("--n-slopes", type=int, default=1408)
     parser.add_argument("--n-modes", type=int, default=594)
+    ways = ("nothing", "certificates", "signatures", "both")
+    parser.add_argument("--secured", choices=ways, default="nothing", help="the link, by what")
     parser.add_argument("--json", type=Path, metavar="FILE")
     return parser.parse_args()
 

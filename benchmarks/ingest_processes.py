@@ -16,10 +16,12 @@ import zenoh.ext
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
+from service.config.link_tables import Router
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import karhunen_loeve_basis
-from service.wire import FrameHeader, Keys, encode_frames
+from service.wire import FrameHeader, Keys, Role, encode_frames
+from service.wire.signing import Signatures
 
 CACHE_S = 5.0
 HEARTBEAT_MS = 200
@@ -31,15 +33,14 @@ QUEUE_MESSAGES = 16
 class Sending:
     """What the sender is to do."""
 
-    endpoint: str
-    """Of the service's router."""
-
     system: str
     frame_rate_hz: float
     frames_per_message: int
     seconds: float
     n_slopes: int
     n_modes: int
+    router: Router
+    """What is shown and signed on a secured link."""
 
     @property
     def bytes_per_frame(self) -> int:
@@ -47,30 +48,35 @@ class Sending:
         return 4 * (self.n_slopes + 2 * self.n_modes)
 
 
-def send_frames(sending: Sending, n_sent: Synchronized[int]) -> None:
+def send_frames(
+    sending: Sending, n_sent: Synchronized[int], processor_ns: Synchronized[int]
+) -> None:
     """Put frames at the frame rate from a real zenoh client; the timestamp is the time of put."""
+    key, signatures = Keys(sending.system).frames, Signatures(sending.router.secret, Role.RTC)
     n = sending.frames_per_message
     rows = np.random.default_rng(0).standard_normal(
         (n, sending.bytes_per_frame // 4), dtype=np.float32
     )
     n_messages = round(sending.seconds * sending.frame_rate_hz / n)
-    with zenoh.open(_client(sending.endpoint)) as session:
+    with zenoh.open(_client(sending.router)) as session:
         publisher = zenoh.ext.declare_advanced_publisher(
             session,
-            Keys(sending.system).frames,
+            key,
             congestion_control=zenoh.CongestionControl.DROP,
             cache=zenoh.ext.CacheConfig(round(CACHE_S * sending.frame_rate_hz / n)),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(
                 heartbeat=HEARTBEAT_MS / 1000, sporadic_heartbeat=None
             ),
         )
-        start = time.perf_counter()
+        start, began_ns = time.perf_counter(), time.process_time_ns()
         for message in range(n_messages):
             payload, attachment = encode_frames(_header(sending, message * n), rows)
-            publisher.put(payload, attachment=attachment)
+            signed = signatures.sign(key, attachment, payload)
+            publisher.put(payload, attachment=signed)
             n_sent.value += n
             behind = time.perf_counter() - start - (message + 1) * n / sending.frame_rate_hz
             time.sleep(max(0.0, -behind))
+        processor_ns.value = time.process_time_ns() - began_ns
         time.sleep(2 * HEARTBEAT_MS / 1000)
 
 
@@ -102,16 +108,17 @@ def _header(sending: Sending, seq0: int) -> FrameHeader:
     )
 
 
-def _client(endpoint: str) -> zenoh.Config:
+def _client(router: Router) -> zenoh.Config:
     config = zenoh.Config()
     settings: dict[str, object] = {
         "mode": "client",
-        "connect/endpoints": [endpoint],
+        "connect/endpoints": [router.endpoint],
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,
         "transport/shared_memory/enabled": False,
         "transport/link/tx/queue/size/data": QUEUE_MESSAGES,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": WAIT_BEFORE_DROP_US,
+        **router.security,
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

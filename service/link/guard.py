@@ -229,21 +229,26 @@ def refusals_of_zenoh(refused: Callable[[str, str, str], None]) -> Iterator[None
     os.dup2(writing, 1)
     os.close(writing)
     zenoh.init_log_from_env_or(DIRECTIVES)
-    reader = threading.Thread(target=_read_all, args=(reading, refused), name="refusals")
+    over = threading.Event()
+    reader = threading.Thread(target=_read_all, args=(reading, refused, over), name="refusals")
     reader.start()
     try:
         yield
     finally:
-        os.dup2(before, 1)  # the pipe's last end for writing: the thread ends
+        os.dup2(before, 1)
         os.close(before)
+        over.set()  # the pipe need not end: processes that were started meanwhile have it, too
         reader.join()
 
 
-def _read_all(reading: int, refused: Callable[[str, str, str], None]) -> None:
-    log, rest = ZenohLog(refused), b""
+def _read_all(
+    reading: int, refused: Callable[[str, str, str], None], over: threading.Event
+) -> None:
+    log, rest, is_over = ZenohLog(refused), b"", False
+    os.set_blocking(reading, False)
     with os.fdopen(reading, "rb", buffering=0) as pipe:
-        while data := pipe.read(PIPE_BYTES):
-            *lines, rest = (rest + data).split(b"\n")
+        while not is_over:
+            is_over = over.wait(READ_EVERY_S)
+            *lines, rest = (rest + (pipe.read(PIPE_BYTES) or b"")).split(b"\n")
             for line in lines:
                 log.read(line.decode(errors="replace"))
-            time.sleep(READ_EVERY_S)

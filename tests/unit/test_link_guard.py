@@ -103,22 +103,24 @@ def test_a_certificate_is_named_before_it_ends_and_when_it_has():
 
 
 SCRIPT = """
-import os, time
+import os, subprocess, sys
 from service.link.guard import refusals_of_zenoh
 found = []
 with refusals_of_zenoh(lambda *what: found.append(what)):
     os.write(1, b"{line}\\n")
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     for _ in range(200):
         try:
             os.write(1, b"x" * 65_000 + b"\\n")
         except BlockingIOError:
             break
 print(found[0][0], flush=True)
+child.communicate(b"end\\n")
 os.write(1, b"and on")
 """
 
 
-def test_the_pipe_never_waits_and_standard_output_is_as_before(tmp_path):
+def test_the_pipe_never_waits_not_even_for_a_child_and_standard_output_is_as_before(tmp_path):
     line = WRONG_USER
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT.replace("{line}", line)],

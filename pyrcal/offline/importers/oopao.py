@@ -60,6 +60,9 @@ _OF_SENSOR = {
 _SAME_SHAPE = 1e-3
 """Largest deviation of an influence function from the Gaussian that is told, of its height."""
 
+_ROUNDING = 1e-9
+"""Stretches below it are none."""
+
 _SAMPLED_ACTUATORS = 24
 """Influence functions that are held against it."""
 
@@ -300,8 +303,7 @@ def _drawn(dm: Any, places_m: Array, n_points: int, diameter_m: float) -> Array:
     points = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2) * _mirrored(dm)
     centres = places_m @ linear.T - [float(moved.shiftX), float(moved.shiftY)]
     # its Gaussian is as wide as the scaled pitch along the axes of the anamorphosis, unturned
-    angle = np.deg2rad(float(moved.anamorphosisAngle))
-    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    axes = rotation(np.deg2rad(float(moved.anamorphosisAngle))).T
     scales = 1.0 + np.array([float(moved.radialScaling), float(moved.tangentialScaling)])
     pitch = diameter_m / float(dm.nActAlongDiameter) * scales
     apart = (points - centres[:, None]) @ axes / pitch
@@ -322,37 +324,45 @@ def _linear(moved: Any) -> NDArray[np.float64]:  # noqa: ANN401
 
 def _where_it_lies(moved: Any, tel: Any, n_subapertures: int) -> tuple[str, ...]:  # noqa: ANN401
     """Return the registration that a mirror has been given, as a note; nothing where none."""
-    linear = _linear(moved)
-    if np.allclose(linear, np.eye(2)) and not moved.shiftX and not moved.shiftY:
+    if np.allclose(_linear(moved), np.eye(2)) and not moved.shiftX and not moved.shiftY:
         return ()
-    counts = "α counts from where OOPAO's mirror lies without its misReg"
-    if not np.isclose(moved.radialScaling, moved.tangentialScaling):
-        return (f"{counts}, which also stretches it",)
-    return (f"{counts}, which is α = {registration_of(moved, tel, n_subapertures)}",)
+    alpha = registration_of(moved, tel, n_subapertures)
+    stretched = np.abs(alpha.stretches).max() > _ROUNDING
+    text = f", stretched by {alpha.stretches[0]:+.4f}, {alpha.stretches[1]:+.4f}"
+    return (
+        "α counts from where OOPAO's mirror lies without its misReg, which is "
+        f"α = {alpha}{text if stretched else ''}",
+    )
 
 
 def registration_of(moved: Any, tel: Any, n_subapertures: int) -> Misregistration:  # noqa: ANN401
-    """Return the registration that OOPAO's ``MisRegistration`` is; a stretch is left out."""
+    """Return the registration that OOPAO's ``MisRegistration`` is."""
     linear, per_subaperture = _linear(moved), _steps(tel) * n_subapertures / float(tel.D)
+    turn = float(np.arctan2(linear[1, 0] - linear[0, 1], np.trace(linear)))
+    stretch = linear @ rotation(turn).T
+    size = float(np.trace(stretch)) / 2
     return Misregistration(
         shift_x_subap=-float(moved.shiftX) * per_subaperture,
         shift_y_subap=-float(moved.shiftY) * per_subaperture,
-        rotation_rad=float(np.arctan2(linear[1, 0] - linear[0, 1], np.trace(linear))),
-        magnification=float(np.sqrt(np.linalg.det(linear))),
-    )
+        rotation_rad=turn,
+        magnification=size,
+    ).stretched(stretch[0] / size - [1.0, 0.0])
 
 
 def to_oopao(alpha: Misregistration, tel: Any, wfs: Any) -> dict[str, float]:  # noqa: ANN401
     """Return a registration as OOPAO's ``MisRegistration`` takes it: metres, degrees, fractions."""
     n_subapertures = int(wfs.nSubap) / int(getattr(wfs, "binning", 1))
     subaperture_m = float(tel.D) / n_subapertures / _steps(tel)
+    # OOPAO stretches first and turns then
+    stretch = rotation(alpha.rotation_rad).T @ alpha.image
+    (tangential, radial), axes = np.linalg.eigh((stretch + stretch.T) / 2)
     return {
         "rotationAngle": float(np.rad2deg(alpha.rotation_rad)),
         "shiftX": -alpha.shift_x_subap * subaperture_m,
         "shiftY": -alpha.shift_y_subap * subaperture_m,
-        "anamorphosisAngle": 0.0,
-        "tangentialScaling": alpha.magnification - 1.0,
-        "radialScaling": alpha.magnification - 1.0,
+        "anamorphosisAngle": float(np.rad2deg(np.arctan2(-axes[1, 1], axes[0, 1]))) % 180.0,
+        "tangentialScaling": float(tangential) - 1.0,
+        "radialScaling": float(radial) - 1.0,
     }
 
 

@@ -114,15 +114,33 @@ def test_the_page_saves_what_is_looked_at():
     assert told == {owner: set(of_it) for owner, of_it in SAVED.items()}
 
 
-@pytest.mark.parametrize("size", [0.0, 0.02])
-def test_a_registration_there_and_back(size):
+@pytest.mark.parametrize("stretches", [(0.0, 0.0), (0.01, -0.004), (-0.01, 0.0)])
+def test_a_registration_there_and_back(stretches):
     tel, wfs = SimpleNamespace(D=8.0, resolution=80), SimpleNamespace(nSubap=20)
     alpha = Misregistration(
-        shift_x_subap=0.3, shift_y_subap=-0.1, rotation_rad=0.02, magnification=1.0 + size
-    )
+        shift_x_subap=0.3, shift_y_subap=-0.1, rotation_rad=0.3, magnification=1.02
+    ).stretched(np.array(stretches))
     moved = SimpleNamespace(**to_oopao(alpha, tel, wfs))
     assert moved.shiftX < 0.0 < moved.shiftY
-    np.testing.assert_allclose(registration_of(moved, tel, 20).vector, alpha.vector)
+    found = registration_of(moved, tel, 20)
+    np.testing.assert_allclose(found.vector, alpha.vector)
+    np.testing.assert_allclose(found.stretches, stretches, atol=1e-12)
+
+
+def test_oopao_scales_along_its_angle_then_turns():
+    """Its own formulas, of OOPAO 1.0.0: anamorphosis_coordinates, rotate_coordinates."""
+    moved = SimpleNamespace(
+        **{"anamorphosisAngle": 20.0, "radialScaling": 0.03, "tangentialScaling": -0.01},
+        **{"rotationAngle": 12.0, "shiftX": 0.0, "shiftY": 0.0},
+    )
+    angle, turn, (x, y) = np.deg2rad(20.0), np.deg2rad(12.0), (0.7, -1.3)
+    radial, tangential = 1.03, 0.99
+    mixed = (tangential - radial) * np.sin(2 * angle) / 2
+    u = x * (radial * np.cos(angle) ** 2 + tangential * np.sin(angle) ** 2) + y * mixed
+    v = y * (radial * np.sin(angle) ** 2 + tangential * np.cos(angle) ** 2) + x * mixed
+    there = [u * np.cos(turn) - v * np.sin(turn), v * np.cos(turn) + u * np.sin(turn)]
+    alpha = registration_of(moved, SimpleNamespace(D=8.0, resolution=80), 20)
+    np.testing.assert_allclose(alpha.image @ [x, y], there)
 
 
 def test_a_square_matrix_is_taken_as_it_is_and_it_is_said():

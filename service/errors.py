@@ -60,6 +60,11 @@ class PyrcalError(Exception):
 class ConfigurationError(PyrcalError):
     """A settings or instrument file cannot be used; the message names the file and the key."""
 
+    def __init__(self, message: str, problems: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.problems = problems or (message,)
+        """Everything that is wrong, one line each."""
+
 
 class ModelError(PyrcalError):
     """The optical model was given numbers it cannot work with."""

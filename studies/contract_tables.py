@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
 import re
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from typing import Any, Final
 
 from msgspec import inspect as types
 
+from service.config.schema_texts import described
 from service.wire import (
     ATTACHMENT_LIMIT,
     BATCH_LIMIT,
@@ -150,28 +147,6 @@ def _rows(name: str, record: type) -> Iterator[Row]:
             nil,
             texts[key].replace("None", "nil").replace("``", "`"),
         )
-
-
-def described(kind: type) -> dict[str, str]:
-    """Return the names in the body of a class with the text that follows each in its source."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
-    (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
-    texts: dict[str, str] = {}
-    for statement, after in pairwise([*body, ast.Pass()]):
-        match statement, after:
-            case (
-                ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)),
-                ast.Expr(value=ast.Constant(value=str(text))),
-            ):
-                texts[name] = " ".join(text.split())
-            case (
-                ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)),
-                _,
-            ):
-                texts[name] = ""
-            case _:
-                pass
-    return texts
 
 
 def _info(record: type) -> tuple[Any, ...]:

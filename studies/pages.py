@@ -12,6 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import get_args
 
+from service.config.schema_texts import described
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
 from service.tracking.interlocks import ALLOWS
@@ -21,7 +22,7 @@ from service.tracking.products import MatrixState
 from service.tracking.registration import Validity
 from service.tracking.state import Mode
 from studies import dispatch, reference
-from studies.contract_tables import described, with_tables
+from studies.contract_tables import with_tables
 from studies.openapi import document
 
 ROOT = Path(__file__).parents[1]

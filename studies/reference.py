@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from itertools import chain
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import OTHER_PROGRAMS, command_line
 from pyrcal.offline.system_file import SystemFile
 from service.config.instrument_schema import whole_of
+from service.config.schema_texts import KeyText, tables_of
 from service.config.settings import Settings
 from service.config.sources import Table
 from service.model.sensors.kind import SensorKind
@@ -20,11 +21,8 @@ from service.model.sensors.registry import KINDS
 from service.tracking.alarms import ALARMS
 from service.wire import Keys
 from service.wire.access import Rights, rights_of
-from studies.contract_tables import described
 
 Schema = Mapping[str, Any]
-
-_LIMITS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 
 _COMMON = "Commands that ask a running service"
 
@@ -92,40 +90,12 @@ def _sensor_table(kind: SensorKind) -> list[str]:
 
 def _tables(whole: type[Table]) -> Iterator[str]:
     """Yield the sections of a file, each with its keys."""
-    schema = whole.model_json_schema()
-    kinds: dict[str, Schema] = schema["$defs"]
-    for section, place in schema["properties"].items():
-        of_each = place.get("items", place)
-        kind = kinds[of_each["$ref"].rpartition("/")[2]]
-        yield f"## [{section}]" if of_each is place else f"## [[{section}]]"
-        record = whole.model_fields[section].annotation
-        yield from _keys(kind, record, kinds)
-        for key, field in kind["properties"].items():
-            inner = field.get("items", {}).get("$ref")
-            if inner is not None:
-                yield f"## [[{section}.{key}]]"
-                (each, _) = get_args(get_type_hints(record)[key])
-                yield from _keys(kinds[inner.rpartition("/")[2]], each, kinds)
-            for of_key in (field, *field.get("anyOf", ())):
-                table = kinds.get(of_key.get("$ref", "").rpartition("/")[2], {})
-                if _text(table).startswith(f"`[{section}.{key}]"):
-                    yield f"## [{section}.{key}]"
-                    yield from _keys(table, None, kinds)
-
-
-def _keys(kind: Schema, record: object, kinds: Mapping[str, Schema]) -> Iterator[str]:
-    """Yield what a table is about, and its keys."""
-    about = _text(kind).partition(": ")[2]
-    yield about[:1].upper() + about[1:]
-    needed = kind.get("required", ())
-    texts = _field_texts(record) if isinstance(record, type) and is_dataclass(record) else {}
-    yield listed(
-        (
-            f"`{key}` ({_type(field, kinds)}{_default(field, needed=key in needed)})",
-            _text({"description": texts.get(key, "")} | field),
+    for table in tables_of(whole):
+        yield f"## {table.header}"
+        yield table.about
+        yield listed(
+            (f"`{key.name}` ({key.type}{_default(key)})", key.meaning) for key in table.keys
         )
-        for key, field in kind["properties"].items()
-    )
 
 
 def access() -> str:
@@ -155,49 +125,16 @@ def _below(keys: Keys, expressions: Iterable[str]) -> str:
     return ", ".join(f"`{each.removeprefix(keys.root + '/')}`" for each in expressions)
 
 
-def _field_texts(record: type) -> dict[str, str]:
-    """Return the docstring under each field of a record, inherited ones included."""
-    bases = [described(base) for base in reversed(record.__mro__[:-1])]
-    return {key: text for texts in bases for key, text in texts.items() if text}
-
-
-def _type(field: Schema, kinds: Mapping[str, Schema]) -> str:
-    if "$ref" in field:
-        return _type(kinds[field["$ref"].rpartition("/")[2]], kinds)
-    for word in ("anyOf", "prefixItems"):
-        if word in field:
-            several = [_type(each, kinds) for each in field[word] if each.get("type") != "null"]
-            return (" or " if word == "anyOf" else ", ").join(dict.fromkeys(several))
-    if "enum" in field:
-        return ", ".join(f"`{value}`" for value in field["enum"])
-    if "const" in field:
-        return f"`{field['const']}`"
-    if field["type"] == "array":
-        each = field.get("items", {})
-        of = "tables, below" if "$ref" in each else _type(each, kinds) if each else ""
-        return f"list of {of}" if of else "list"
-    if field["type"] == "object" and "properties" in field:
-        return "table of " + ", ".join(f"`{key}`" for key in field["properties"])
-    limits = [f"{sign} {field[limit]:g}" for limit, sign in _LIMITS.items() if limit in field]
-    return " ".join([field["type"], ", ".join(limits)]).strip()
-
-
-def _default(field: Schema, *, needed: bool) -> str:
-    value = field.get("default")
-    match value:
-        case _ if needed:
+def _default(key: KeyText) -> str:
+    match key.default:
+        case _ if key.needed:
             return "; needed"
         case None | []:
             return ""
         case bool():
-            return f"; `{str(value).lower()}`"
+            return f"; `{str(key.default).lower()}`"
         case _:
-            return f"; `{value}`"
-
-
-def _text(field: Schema) -> str:
-    text = " ".join(field.get("description", "").replace("``", "`").split())
-    return text.replace("; None:", "; left out:").replace("None:", "Left out:")
+            return f"; `{key.default}`"
 
 
 # --- the command line

@@ -16,6 +16,7 @@ from pyrcal.options import add, words
 from service.cli.program import check_settings, port, such, whole
 from service.errors import ConfigurationError
 from service.files import kind_of, numbers_in, parse_alpha, parse_modes
+from service.model.sensors.registry import KINDS
 
 if TYPE_CHECKING:
     from pyrcal.offline.light_rotation import Arms
@@ -38,6 +39,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     )
     _describe_reconstruct(
         commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
+    )
+    _describe_instrument(
+        commands.add_parser("instrument", help="write, check or draw an instrument file")
     )
     _describe_import(
         commands.add_parser("import", help="make an instrument file and a matrix of another code's")
@@ -230,6 +234,32 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),
     )
+
+
+def _describe_instrument(instrument: argparse.ArgumentParser) -> None:
+    instrument.set_defaults(module="pyrcal.offline.instruments.program")
+    instrument.description = "Write a commented instrument file, check one, or draw it."
+    instrument.epilog = (
+        "Exit status: 0 done, 1 something is wrong with the instrument file, 2 a file cannot be "
+        "written."
+    )
+    kind = words("--kind KIND", "kind of sensor", choices=tuple(KINDS), default="pyramid")
+    memory = "compute the matrix if that takes no more, default %(default)g"
+    actions = instrument.add_subparsers(dest="action", required=True)
+    for action, purpose, more in (
+        ("new", "write a file with every key", (words("file FILE.toml", type=Path), kind)),
+        (
+            "check",
+            "say everything that is wrong with it, and what it implies",
+            (_INSTRUMENT, words("--memory-gb GB", memory, type=float, default=4.0)),
+        ),
+        (
+            "show",
+            "draw pupil, subapertures, actuators",
+            (_INSTRUMENT, words("picture PICTURE.png", type=Path)),
+        ),
+    ):
+        add(actions.add_parser(action, help=purpose), *more)
 
 
 def _describe_import(bring: argparse.ArgumentParser) -> None:

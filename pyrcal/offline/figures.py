@@ -138,7 +138,7 @@ def registration(axes: Axes, fit: Fit, instrument: Instrument) -> None:
         vmin=0.0,
         vmax=1.0,
     )
-    points, style = _outline(instrument)
+    points, style = mirror_outline(instrument)
     here = landed(points, fit.alpha)
     axes.plot(here[:, 0], here[:, 1], style, color=MEASURED, markersize=3.0, linewidth=1.0)
     centre = landed(np.zeros((1, 2)), fit.alpha)[0]
@@ -178,7 +178,7 @@ def residual_by_mode(axes: Axes, fit: Fit) -> None:
     axes.set(title="left over by mode", xlabel="mode", ylabel="% of the mode's own RMS")
 
 
-def _outline(instrument: Instrument) -> tuple[Array, str]:
+def mirror_outline(instrument: Instrument) -> tuple[Array, str]:
     """Return the mirror's outline or actuators, in subapertures, and how to draw them."""
     mirror = instrument.mirror
     parity = np.array([1.0, mirror.y_sign])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from service.config import instrument_schema as schema
 from service.config.laws import LawTable, law_of
 from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.pupils import read_pupil
-from service.config.sources import read_dataset, refuse
+from service.config.sources import read_dataset, refuse, refuse_all
 from service.errors import ConfigurationError, ModelError
 from service.model.instrument import (
     Instrument,
@@ -45,28 +46,12 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
     said = schema.read_instrument_file(name_or_path)
     section, kind = said.section, said.kind
     about, wfs = section(schema.AboutTable).said, section(kind.table)
-    pupil = Pupil(about.diameter_m, about.diameter_m / wfs.said.pupil_diameter)
     told = asdict(about)
     del told["pupil"], told["pupil_pitch_m"]
-    sensor = _sensor(wfs, kind)
-    with schema.refused_at(wfs.path, wfs.name):
-        kind.check(sensor, pupil.subaperture_m)
-    mirror, about_mirror = read_mirror(section(schema.MirrorTable), pupil)
-    modes = _modes(section(KarhunenLoeve), mirror)
-    with schema.refused_at(wfs.path, wfs.name):
-        frames = kind.frames(wfs.said, wfs.given)
     instrument = Instrument(
         **told,
-        law=law_of(section(LawTable).said),
-        pupil=read_pupil(section(schema.AboutTable), pupil.subaperture_m),
-        wfs=sensor,
-        mirror=mirror,
-        modes=modes,
-        slopes=_slopes(section(schema.SlopesTable), kind, has_frames=frames is not None),
-        frames=frames,
-        loop=_loop(section(LoopFacts), modes.n_modes),
+        **_made(_parts(said)),
         unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
-        remarks=(*about_mirror, *_assumed(said, sensor, mirror)),
     )
     whole = _in_first_mode(instrument, wfs, kind)
     _, mode = and_sensor_mode(name_or_path)
@@ -74,6 +59,55 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         return whole if mode is None else whole.in_mode(mode)
     except ModelError as error:
         raise ConfigurationError(f"{wfs.path}: {error}") from error
+
+
+def _parts(said: schema.InstrumentFile) -> Mapping[str, Callable[[], Any]]:
+    """Return how each part of an instrument is made; what one needs of another is made once."""
+    section, kind = said.section, said.kind
+    about, wfs = section(schema.AboutTable), section(kind.table)
+    pupil = Pupil(about.said.diameter_m, about.said.diameter_m / wfs.said.pupil_diameter)
+    sensor = cache(lambda: _sensor(wfs, kind, pupil))
+    mirror = cache(lambda: read_mirror(section(schema.MirrorTable), pupil))
+    modes = cache(lambda: _modes(section(KarhunenLoeve), mirror()[0]))
+
+    @cache
+    def frames() -> object | None:
+        with schema.refused_at(wfs.path, wfs.name):
+            return kind.frames(wfs.said, wfs.given)
+
+    return {
+        "wfs": sensor,
+        "mirror": lambda: mirror()[0],
+        "modes": modes,
+        "frames": frames,
+        "law": lambda: law_of(section(LawTable).said),
+        "pupil": lambda: read_pupil(about, pupil.subaperture_m),
+        "slopes": lambda: _slopes(
+            section(schema.SlopesTable), kind, has_frames=frames() is not None
+        ),
+        "loop": lambda: _loop(section(LoopFacts), modes().n_modes),
+        "remarks": lambda: (*mirror()[1], *_assumed(said, sensor(), mirror()[0])),
+    }
+
+
+def _made(parts: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
+    """Return the parts made, or refuse with everything that is wrong.
+
+    Raises
+    ------
+    ConfigurationError
+        Of the first part that cannot be made; it has the others.
+    """
+    made: dict[str, Any] = {}
+    refused: dict[str, ConfigurationError] = {}
+    for name, make in parts.items():
+        try:
+            made[name] = make()
+        except ConfigurationError as error:
+            refused.setdefault(str(error), error)  # once, though another part needed this one
+    if refused:
+        refuse_all(list(refused), next(iter(refused.values())))
+    return made
 
 
 def _in_first_mode(
@@ -215,9 +249,10 @@ def _loop(file: schema.Section[LoopFacts], n_modes: int) -> LoopFacts | None:
     return table
 
 
-def _sensor(file: schema.Section[SensorTable], kind: SensorKind) -> SensorDescription:
+def _sensor(file: schema.Section[SensorTable], kind: SensorKind, pupil: Pupil) -> SensorDescription:
     with schema.refused_at(file.path, file.name):
         sensor = kind.described(file.said, file.given)
+        kind.check(sensor, pupil.subaperture_m)
     if file.said.valid_subapertures == "auto":
         return sensor
     if "flux_threshold" in file.given:

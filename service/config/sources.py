@@ -9,7 +9,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass
 from ipaddress import ip_network
 from pathlib import Path
@@ -100,8 +100,19 @@ def validated(schema: type[Schema], data: Mapping[str, Any], place: Place) -> Sc
         problems = sorted(
             error.errors(include_url=False), key=lambda problem: problem["type"] == "missing"
         )
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-        raise ConfigurationError(_line(schema, problems[0], place) + more) from error
+        refuse_all([_line(schema, problem, place) for problem in problems], error)
+
+
+def refuse_all(lines: Sequence[str], cause: Exception) -> NoReturn:
+    """Raise the error of the first line, which counts the others and has them all.
+
+    Raises
+    ------
+    ConfigurationError
+        Always.
+    """
+    more = f" (and {len(lines) - 1} more)" if len(lines) > 1 else ""
+    raise ConfigurationError(lines[0] + more, tuple(lines)) from cause
 
 
 def _in_json(value: object) -> object:

@@ -1,0 +1,1 @@
+"""``pyrcal instrument``: write, check and draw an instrument file."""

@@ -1,0 +1,59 @@
+"""A commented instrument file with every key, written from the schema that reads it."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterator, Mapping
+
+from service.config.instrument_schema import whole_of
+from service.config.schema_texts import KeyText, TableText, tables_of
+from service.model.sensors.kind import SensorKind
+
+EXAMPLES: Mapping[str, Mapping[str, object]] = {
+    "[instrument]": {"name": "bench", "diameter_m": 8.0, "stop": "telescope"},
+    "[wfs]": {"n_subapertures": 20, "wavelength_m": 750e-9, "modulation_lambda_over_d": 3.0},
+    "[mirror]": {"layout": "grid", "n_across": 21, "pitch_m": 0.4, "diameter_m": 8.6},
+}
+"""Values of the keys that a file must have, and of the one mirror that the template draws."""
+
+_WIDTH = 98
+
+_HEAD = """
+An instrument file of pyrcal: every key, what it means, and its default. A key behind # is not set:
+take the # away to set it. Files of data are named "path:/dataset", relative to this file. Then:
+pyrcal instrument check FILE, pyrcal instrument show FILE PICTURE.png
+"""
+
+
+def template(kind: SensorKind) -> str:
+    """Return an instrument file for a kind of sensor: it can be read as it stands."""
+    lines = [*_comment(_HEAD)]
+    for table in tables_of(whole_of(kind)):
+        examples = dict(EXAMPLES.get(table.header, {}))
+        if table.header == "[wfs]":
+            examples["kind"] = kind.name
+        lines += ["", *_table(table, examples)]
+    return "\n".join(lines) + "\n"
+
+
+def _table(table: TableText, examples: Mapping[str, object]) -> Iterator[str]:
+    """Yield a table; one inside another, of which there may be none, is behind # altogether."""
+    inner = "." in table.header
+    yield from _comment(table.about)
+    yield f"{'#' if inner else ''}{table.header}"
+    for key in table.keys:
+        yield from _comment(_explained(key))
+        value = examples.get(key.name, key.default)
+        unset = "#" if inner or key.name not in examples else ""
+        yield f"{unset}{key.name} = {'' if value is None else json.dumps(value)}".rstrip()
+
+
+def _explained(key: KeyText) -> str:
+    told = f"({key.type}; needed)" if key.needed else f"({key.type})"
+    return f"{key.meaning} {told}".strip()
+
+
+def _comment(text: str) -> Iterator[str]:
+    for line in textwrap.wrap(" ".join(text.replace("`", "").split()), _WIDTH - 2):
+        yield f"# {line}"

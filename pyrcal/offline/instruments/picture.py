@@ -14,7 +14,7 @@ from service.model.pupil import instrument_pupil, valid_subapertures
 _POINTS = 6
 """Of the pupil, for each subaperture."""
 
-_SEEN, _MIRROR = "tab:blue", "tab:red"
+_SENSOR, _MIRROR = "tab:blue", "tab:red"
 
 
 def write_picture(instrument: Instrument, path: Path) -> None:
@@ -39,7 +39,9 @@ def write_picture(instrument: Instrument, path: Path) -> None:
     corners = np.argwhere(valid)[:, ::-1] - len(valid) / 2
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     axes.add_collection(
-        PolyCollection(corners[:, None] + square, facecolor="none", edgecolor=_SEEN, linewidth=0.6)
+        PolyCollection(
+            corners[:, None] + square, facecolor="none", edgecolor=_SENSOR, linewidth=0.6
+        )
     )
     points, style = mirror_outline(instrument)
     here = landed(points, instrument.start)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
-import tomllib
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -18,6 +17,7 @@ from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.recorded import check_sealed
 from pyrcal.offline.report import document
 from service.config import load_instrument, packaged_instrument
+from service.config.sources import read_toml, reference_parts
 from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files import parse_alpha, parse_modes
 from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, STAGES, UPLOAD, FitRequest
@@ -28,8 +28,8 @@ MOST_FILES = 32
 
 _ZIP_BEGINS = b"PK\x03\x04"
 
-_REFERENCE = re.compile(r"(.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::.*)?|(.+):/.+", re.IGNORECASE)
-"""``file.fits``, ``file.fits:EXTNAME`` or ``file.h5:/dataset``, as an instrument file says it."""
+_DAMAGE = (zipfile.BadZipFile, zlib.error, RuntimeError, OSError, EOFError, ValueError)
+"""What a damaged or encrypted archive raises, depending on where."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +72,7 @@ def open_upload(upload: Path, folder: Path, reference: str | None, max_bytes: in
     try:
         with zipfile.ZipFile(upload) as archive:
             names = _unpack(archive, folder, max_bytes)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
+    except _DAMAGE as error:
         raise MatrixError(f"upload: damaged zip archive: {error}") from error
     for name in names:
         check_sealed(folder / name)
@@ -131,13 +131,13 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, max_bytes: int) -> list[str]
 def _referred(instrument: Path) -> Iterator[str]:
     """Yield every file that an instrument file refers to."""
     try:
-        tables = tomllib.loads(instrument.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        tables = read_toml(instrument)
+    except ConfigurationError:
         return  # whoever loads it says what is wrong
     for text in _texts(tables):
-        match = _REFERENCE.fullmatch(text)
-        if match is not None:
-            yield match[1] or match[2]
+        parts = reference_parts(text)
+        if parts is not None:
+            yield parts["path"]
 
 
 def _texts(value: object) -> Iterator[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import MatrixError
+from service.files.bounds import check_number
 from service.files.container import DATASET, Container, StoredArray, opened
 
 Array = NDArray[np.float64]
@@ -23,16 +24,18 @@ def check_sealed(path: Path) -> None:
     Raises
     ------
     MatrixError
-        If it holds a link to another file, a virtual dataset, or one whose data lie outside; or is
-        damaged.
+        If it holds a link to another file, a virtual dataset, or one whose data lie outside; is
+        damaged, or has too many things in it.
     """
     if not h5py.is_hdf5(path):
         return
     try:
         with h5py.File(path, "r", locking=False) as file:
             seen = {h5py.h5o.get_info(file.id).addr}
-            groups = [file["/"]]
+            groups, n_links = [file["/"]], 0
             while groups:
+                n_links += len(groups[-1])
+                check_number(n_links, path)
                 groups += _sealed(groups.pop(), path, seen)
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error

@@ -193,6 +193,6 @@ def data_dir(options: argparse.Namespace) -> Path:
         try:
             settings = tomllib.loads(options.config.read_text(encoding="utf-8"))
             given = settings.get("service", {}).get("data_dir")
-        except (OSError, ValueError, AttributeError) as error:
+        except (OSError, ValueError, AttributeError, RecursionError) as error:
             raise ConfigurationError(f"{options.config}: cannot be read: {error}") from error
     return Path(given or data_dir_of_the_one() or DATA_DIR)

@@ -30,6 +30,7 @@ _EXPECTED = "Input should be "
 _HDF5 = re.compile(r"(?P<path>.+):/(?P<name>.+)")
 _FITS = re.compile(r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::/?(?P<name>.+))?", re.IGNORECASE)
 _NUMPY = re.compile(r"(?P<path>.+\.npy)(?P<name>)", re.IGNORECASE)
+_FORMS = (_NUMPY, _FITS, _HDF5)
 
 
 class Table(BaseModel):
@@ -66,22 +67,52 @@ Place = Callable[[tuple[str, ...]], str]
 """Says where a value came from, given its key path."""
 
 
+MAX_TOML_BYTES = 4_000_000
+
+MAX_TOML_DEPTH = 32
+"""Tables and arrays within each other."""
+
+_DEEP_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){{{MAX_TOML_DEPTH}}}""")
+"""A dotted key that takes the parser a time that grows with the square of its length."""
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Raises
     ------
     ConfigurationError
-        If the file cannot be read or is not TOML.
+        If the file cannot be read, is not TOML, too large or too deep.
     """
+    where, at_most = str(path), f"at most {MAX_TOML_DEPTH} tables and arrays within each other"
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            written = file.read(MAX_TOML_BYTES + 1)
+        if len(written) > MAX_TOML_BYTES:
+            refuse(where, "a larger file", f"at most {MAX_TOML_BYTES / 1e6:g} MB of TOML")
+        text = written.decode()
+        if _DEEP_KEY.search(text):
+            refuse(where, "a longer dotted key", at_most)
+        tables = tomllib.loads(text)
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path}: not UTF-8 text: {error}") from error
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # of a number of 5000 digits it is not the parser's own
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError:
+        refuse(where, "more", at_most)
+    if _is_deep(tables):
+        refuse(where, "more", at_most)
+    return tables
+
+
+def _is_deep(tables: dict[str, Any]) -> bool:
+    level: list[Any] = [tables]
+    for _ in range(MAX_TOML_DEPTH):
+        values = (v for t in level for v in (t.values() if isinstance(t, dict) else t))
+        level = [value for value in values if isinstance(value, (dict, list))]
+    return bool(level)
 
 
 def validated(schema: type[Schema], data: Mapping[str, Any], place: Place) -> Schema:
@@ -137,6 +168,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f", did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
 
 
+def reference_parts(text: str) -> re.Match[str] | None:
+    """Return the ``path`` and ``name`` that a reference is made of; None: it is none."""
+    return next((found for form in _FORMS if (found := form.fullmatch(text))), None)
+
+
 def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
     """Return the numeric array behind ``reference``, in this machine's byte order.
 
@@ -157,8 +193,7 @@ def read_dataset(reference: str, folder: Path, where: str) -> NDArray[Any]:
     """
     from service.files.container import opened
 
-    forms = (_NUMPY, _FITS, _HDF5)
-    parts = next((found for form in forms if (found := form.fullmatch(reference))), None)
+    parts = reference_parts(reference)
     if parts is None:
         expected = "path:/dataset of an HDF5 file, path.fits:EXTNAME, or path.npy"
         refuse(where, repr(reference), expected)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.files import FileKind, kind_of
+from service.files.bounds import attributes, check_fits, datasets
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
 
 MAX_BYTES = 4 << 30
@@ -151,16 +152,14 @@ def _hdf5(path: Path) -> Iterator[Container]:
         except (OSError, RuntimeError, ValueError) as error:
             raise MatrixError(f"{where}: a link that leads nowhere: {error}") from error
 
-    def visit(name: str, item: object) -> None:
-        array = _dataset(item, f"{path}:/{name}")
-        if array is not None:
-            arrays[name] = array
-
     with file:
         try:
-            file.visititems(visit)
-            facts = dict(file.attrs)
-        except (OSError, RuntimeError, KeyError) as error:
+            for name, item in datasets(file, path):
+                array = _dataset(item, f"{path}:/{name}")
+                if array is not None:
+                    arrays[name] = array
+            facts = attributes(file, path)
+        except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
             raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
         yield Container(path=path, arrays=arrays, find=find, facts=facts)
 
@@ -186,6 +185,7 @@ def _fits(path: Path) -> Iterator[Container]:
         raise MatrixError(
             f"{path}: a FITS file needs astropy; expected it beside pyrcal: pip install astropy"
         ) from error
+    check_fits(path)
     with path.open("rb") as raw, warnings.catch_warnings():
         # astropy warns of a truncated file and goes on; what else it warns of does no harm
         warnings.simplefilter("ignore")

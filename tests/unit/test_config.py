@@ -2,6 +2,7 @@
 
 import re
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from service.config import Settings, load_instrument, load_settings, packaged_file
 from service.config.mirrors import coincident, grid, hexagonal, rings, typical_pitch
+from service.config.sources import read_toml
 from service.errors import ConfigurationError, ModelError
 from service.model.instrument import instrument_sha256
 from service.model.kinds import Influence, LoopFacts, Normalisation, SignalKind, SlopeOrder, Stop
@@ -46,6 +48,32 @@ def refusal(load, *args) -> str:
     message = str(caught.value)
     assert "\n" not in message
     return message
+
+
+# --- files that no parser should meet
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 100_000, "found more, expected at most 32 tables"),
+        ("a = " + "{a = " * 2000, "found more, expected at most 32 tables"),
+        ("a = " + "[" * 40 + "]" * 40, "found more, expected at most 32 tables"),
+        ("[" + "a . " * 200_000 + "a]", "found a longer dotted key, expected at most 32"),
+        ("a" + '."b"' * 200_000 + " = 1", "found a longer dotted key, expected at most 32"),
+        ("a = " + "9" * 5000, "not valid TOML"),
+        ("# no\n" * 1_000_000, "found a larger file, expected at most 4 MB"),
+    ],
+)
+def test_deep_long_and_endless_toml_is_refused_in_one_line_at_once(write, text, words):
+    began_s = time.process_time()
+    assert words in refusal(load_instrument, str(write(text)))
+    assert time.process_time() - began_s < 2.0
+
+
+def test_many_dots_that_are_no_key_are_read(write):
+    text = f'a = "{"see 1.2.3. " * 1000}" # {"www.a.b " * 100}\nb = [{"0.5, " * 10_000}]\n'
+    assert len(read_toml(write(text))["b"]) == 10_000
 
 
 # --- layouts

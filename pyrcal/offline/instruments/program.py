@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from pyrcal.offline.instruments.drawing import write_drawing
 from pyrcal.offline.instruments.implied import described, implied
-from pyrcal.offline.instruments.picture import write_picture
 from pyrcal.offline.instruments.template import template
 from pyrcal.terminal import print_lines
 from service.config import load_instrument
@@ -29,7 +29,7 @@ def main(options: argparse.Namespace) -> int:
         case "check":
             return _check(options)
         case _:
-            write_picture(load_instrument(options.instrument), options.picture)
+            write_drawing(load_instrument(options.instrument), options.picture)
             return USABLE
 
 

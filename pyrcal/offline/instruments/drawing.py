@@ -17,7 +17,7 @@ _POINTS = 6
 _SENSOR, _MIRROR = "tab:blue", "tab:red"
 
 
-def write_picture(instrument: Instrument, path: Path) -> None:
+def write_drawing(instrument: Instrument, path: Path) -> None:
     """Write the picture as an image of the kind the file's name says.
 
     Raises

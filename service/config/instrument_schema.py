@@ -84,6 +84,11 @@ class MirrorTable(kinds.InfluenceShape):
     hole_m: kinds.Positive | None = None
     """Hexagonal only: diameter of a hole in the middle, where there are no actuators."""
 
+    segments_deg: tuple[float, ...] = ()
+    """Gaussian only: where each gap between segments goes from the centre outwards, degrees from
+    +x towards +y. No function crosses one, no actuator of a grid stands on one, and KL modes leave
+    out the segments' differential pistons."""
+
     positions: str | None = None
     """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
 

@@ -14,7 +14,8 @@ from service.config.sources import refuse
 from service.errors import ConfigurationError
 from service.model.instrument import Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Influence, InfluenceShape
-from service.model.misregistration import unit_like
+from service.model.misregistration import rotation, unit_like
+from service.model.surface import segment_of
 from service.model.tabulated import (
     ENOUGH_POINTS_PER_SUBAPERTURE,
     MIN_POINTS_PER_SUBAPERTURE,
@@ -32,7 +33,8 @@ _LAYOUT_KEYS = {
 
 _CROPPED = {"influence_origin", "influence_table"}
 _MEASURED = {"modes_pitch_m"} | _CROPPED
-_ANALYTIC = set().union(*_LAYOUT_KEYS.values()) | {"influence", "coupling"}
+_GAUSSIAN = {"coupling", "segments_deg"}
+_ANALYTIC = set().union(*_LAYOUT_KEYS.values()) | {"influence"} | _GAUSSIAN
 
 _FOREIGN = {
     "layout": _MEASURED,
@@ -40,6 +42,9 @@ _FOREIGN = {
     "influence_functions": _ANALYTIC,
 }
 """Keys that mean nothing to a mirror of each kind."""
+
+_ON_A_GAP = 1e-9
+"""Of a mirror's half width, by which an actuator may lie beside a gap and yet on it."""
 
 _CHUNK = 256
 """Actuators compared with all others at once."""
@@ -76,7 +81,7 @@ def read_mirror(
     if file.said.layout is not None:
         mirror = _analytic(file)
         _check_width(file, mirror.positions_m, pupil)
-        return mirror, ()
+        return mirror, _about_segments(file, mirror)
     return _tabulated(file, pupil)
 
 
@@ -144,9 +149,21 @@ def _analytic(file: MirrorSection) -> Mirror:
         positions_m=positions,
         pitch_m=table.pitch_m or typical_pitch(positions),
         shape=InfluenceShape(influence=table.influence, coupling=table.coupling),
+        segments_deg=_segments(file, positions),
         basis=table.basis,
         mode_to_actuator=None if strokes is None else _opd(file, strokes).astype(np.float64),
         **_mount(table),
+    )
+
+
+def _about_segments(file: MirrorSection, mirror: Mirror) -> tuple[str, ...]:
+    """Return what whoever uses a segmented mirror should know of its modes."""
+    if not mirror.segments_deg or own_modes(mirror) is not None:
+        return ()
+    return (
+        f"{file.where('segments_deg')}: no mode has a mean step across any of the "
+        f"{len(mirror.segments_deg)} gaps: a pyramid hardly sees the segments' differential "
+        "pistons, which are neither fitted nor controlled",
     )
 
 
@@ -174,11 +191,27 @@ def _check_layout_keys(file: MirrorSection) -> None:
             f"{file.where(key)}: belongs to layout = {' or '.join(owners)}, "
             f'found layout = "{table.layout}"'
         )
-    if "coupling" in file.given and table.influence is not Influence.GAUSSIAN:
-        raise ConfigurationError(
-            f"{file.where('coupling')}: belongs to influence = "
-            f'"gaussian", found influence = "{table.influence}"'
+    if table.influence is not Influence.GAUSSIAN:
+        for key in sorted(_GAUSSIAN & file.given):
+            raise ConfigurationError(
+                f"{file.where(key)}: belongs to influence = "
+                f'"gaussian", found influence = "{table.influence}"'
+            )
+
+
+def _segments(file: MirrorSection, positions_m: NDArray[np.float64]) -> tuple[float, ...]:
+    """Return where the gaps between segments are, in order; refuse a segment without actuators."""
+    gaps_deg = tuple(sorted(angle % 360.0 for angle in file.said.segments_deg))
+    if not gaps_deg:
+        return ()
+    n_in_each = np.unique(segment_of(positions_m, gaps_deg), return_counts=True)[1]
+    if len(gaps_deg) < 2 or len(n_in_each) < len(gaps_deg):
+        refuse(
+            file.where("segments_deg"),
+            f"gaps at {list(file.said.segments_deg)}, actuators in {len(n_in_each)} segments",
+            "at least two gaps, each in a place of its own, and actuators between them",
         )
+    return gaps_deg
 
 
 def _rings(file: MirrorSection) -> NDArray[np.float64]:
@@ -196,16 +229,25 @@ def _rings(file: MirrorSection) -> NDArray[np.float64]:
 
 def _grid(file: MirrorSection) -> NDArray[np.float64]:
     n_across, pitch_m, diameter_m = _mandatory(file, ("n_across", "pitch_m", "diameter_m"))
-    positions = grid(n_across, pitch_m, diameter_m)
+    positions = _beside_gaps(file, grid(n_across, pitch_m, diameter_m))
     _check_number(len(positions), f"{file.path}: mirror")
     return positions
 
 
 def _hexagonal(file: MirrorSection) -> NDArray[np.float64]:
     pitch_m, diameter_m = _mandatory(file, ("pitch_m", "diameter_m"))
-    positions = hexagonal(pitch_m, diameter_m, file.said.hole_m or 0.0)
+    positions = _beside_gaps(file, hexagonal(pitch_m, diameter_m, file.said.hole_m or 0.0))
     _check_number(len(positions), f"{file.path}: mirror")
     return positions
+
+
+def _beside_gaps(file: MirrorSection, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points of a grid that are not on a gap between segments."""
+    kept = np.ones(len(positions_m), dtype=np.bool_)
+    for angle in np.deg2rad(file.said.segments_deg):
+        along, across = (positions_m @ rotation(angle)).T
+        kept &= (np.abs(across) > _ON_A_GAP * np.abs(positions_m).max()) | (along < 0.0)
+    return positions_m[kept]
 
 
 def _listed_positions(file: MirrorSection) -> NDArray[np.float64]:

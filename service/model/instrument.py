@@ -99,6 +99,10 @@ class Mirror(Mount):
     basis: BasisKind = BasisKind.KARHUNEN_LOEVE
     """Modes where ``mode_to_actuator`` is None."""
 
+    segments_deg: tuple[float, ...] = ()
+    """Where each gap between segments goes from the centre outwards, rising, degrees from +x
+    towards +y; empty: it is of one piece."""
+
     mode_to_actuator: NDArray[np.float64] | None = None
     """The user's own modes ``(n_actuators, n_modes)``: strokes in metres OPD per unit command."""
 
@@ -287,6 +291,7 @@ _LATER = frozenset(
         "pupil_shift_subap",
         "spiders_m",
         "spiders_deg",
+        "segments_deg",
         "nominal_anamorphosis",
         "laser",
     }

@@ -58,10 +58,25 @@ def karhunen_loeve(instrument: Instrument, surface: Surface) -> tuple[Array, Arr
     sectors = [scipy.sparse.eye_array(len(positions_m), format="csc")]
     if np.allclose(fine.amplitude, fine.amplitude[::-1], rtol=0.0, atol=1e-9):
         sectors = _parity_sectors(positions_m)
-    strokes, variance = _diagonalise(gram, covariance, sectors, n_modes)
+    strokes, variance = _diagonalise(
+        gram, covariance, sectors, n_modes, _left_out(instrument, surface)
+    )
     strokes = _unit_rms(strokes, _gram(surface, strokes, fine))
     strokes = _tilts_along_axes(strokes, positions_m)
     return _fix_signs(strokes, positions_m), variance
+
+
+def _left_out(instrument: Instrument, surface: Surface) -> Array:
+    """Return combinations of strokes ``(n, n_actuators)`` that are 0 in every mode.
+
+    They are the mean steps across the gaps between a mirror's segments. A pyramid hardly sees how
+    high segments stand relative to one another, least of all behind the arms of a spider: nothing
+    that is fitted or inverted has these differential pistons.
+    """
+    if not isinstance(surface, Gaussian) or not surface.segments_deg:
+        return np.empty((0, len(surface.positions)))
+    radius = instrument.wfs.pupil_diameter / 2
+    return surface.steps(radius * instrument.obscuration_ratio, radius)
 
 
 def surface_statistics(instrument: Instrument, surface: Surface) -> tuple[Array, Array]:
@@ -126,7 +141,7 @@ def _parity_sectors(positions_m: Array) -> list[Any]:
 
 
 def _diagonalise(
-    gram: Array, covariance: Array, sectors: list[Any], n_modes: int
+    gram: Array, covariance: Array, sectors: list[Any], n_modes: int, left_out: Array
 ) -> tuple[Array, Array]:
     """Return strokes and variances of the KL modes, by falling variance.
 
@@ -138,14 +153,25 @@ def _diagonalise(
         power, axes = scipy.linalg.eigh(sector.T @ gram @ sector)
         kept = power > _PISTON_RATIO * power[-1]
         whiten = sector @ (axes[:, kept] / np.sqrt(power[kept]))
-        variance, vectors = scipy.linalg.eigh(whiten.T @ covariance @ whiten)
-        strokes = whiten @ vectors
-        found += [(variance[j], parity, strokes[:, j]) for j in range(len(variance))]
+        against = scipy.linalg.orth((left_out @ whiten).T)
+        variance, vectors = scipy.linalg.eigh(_without(whiten.T @ covariance @ whiten, against))
+        n_out = against.shape[1]  # their variance is 0 now, the smallest
+        strokes = whiten @ vectors[:, n_out:]
+        found += [
+            (one, parity, mode) for one, mode in zip(variance[n_out:], strokes.T, strict=True)
+        ]
     found.sort(key=lambda mode: -mode[0])
     ordered = _even_before_odd(found)[:n_modes]
     if len(ordered) < n_modes:
         raise ModelError(f"modes: the mirror has {len(ordered)} modes, {n_modes} were asked for")
     return np.column_stack([mode[2] for mode in ordered]), np.array([mode[0] for mode in ordered])
+
+
+def _without(covariance: Array, directions: Array) -> Array:
+    """Return a covariance in which orthonormal ``directions`` ``(n, k)`` do not vary."""
+    along = covariance @ directions
+    both = directions @ (directions.T @ along) @ directions.T
+    return np.asarray(covariance - along @ directions.T - directions @ along.T + both)
 
 
 def _even_before_odd(found: list[tuple[float, int, Array]]) -> list[tuple[float, int, Array]]:

@@ -70,6 +70,9 @@ class Gaussian:
     coupling: float
     """Height at one pitch, 0..1."""
 
+    segments_deg: tuple[float, ...] = ()
+    """Gaps that no function crosses, as a ``Mirror`` has them."""
+
     @property
     def reach(self) -> float:
         """Distance at which a function is ``NOTHING`` high, in the units of ``positions``."""
@@ -100,13 +103,14 @@ class Gaussian:
     def basis(self, points: Array) -> Array:
         """Evaluate the Gaussians."""
         dx, dy = _offsets(points, self.positions)
-        return np.asarray(np.exp(np.log(self.coupling) / self.pitch**2 * (dx**2 + dy**2)))
+        heights = np.exp(np.log(self.coupling) / self.pitch**2 * (dx**2 + dy**2))
+        return np.asarray(self._within_segments(heights, points))
 
     def wider(self, points: Array) -> Array:
         """Differentiate the Gaussians by the logarithm of their width."""
         dx, dy = _offsets(points, self.positions)
         exponent = np.log(self.coupling) / self.pitch**2 * (dx**2 + dy**2)
-        return np.asarray(-2.0 * exponent * np.exp(exponent))
+        return np.asarray(self._within_segments(-2.0 * exponent * np.exp(exponent), points))
 
     def slope(self, points: Array, direction: Array) -> Array:
         """Differentiate the Gaussians along ``direction``."""
@@ -115,6 +119,35 @@ class Gaussian:
         along = dx * direction[:, :1] + dy * direction[:, 1:]
         return np.asarray(rate * along * self.basis(points))
 
+    def steps(self, inner: float, outer: float) -> Array:
+        """Return the mean step of every function across each gap ``(n_gaps, n_functions)``.
+
+        ``inner`` and ``outer`` are the distances from the centre between which it is taken.
+        """
+        radius = np.arange(inner, outer, self.pitch / _PER_PITCH)
+        found = []
+        for gap in self.segments_deg:
+            before, after = (
+                radius[:, None] * [np.cos(angle), np.sin(angle)]
+                for angle in np.deg2rad([gap - _BESIDE_DEG, gap + _BESIDE_DEG])
+            )
+            found.append((self.basis(after) - self.basis(before)).mean(axis=0))
+        return np.array(found)
+
+    def _within_segments(self, values: Array, points: Array) -> Array:
+        """Return values ``(n_points, n_functions)``, 0 across a gap."""
+        if not self.segments_deg:
+            return values
+        there = segment_of(points, self.segments_deg)
+        own = segment_of(self.positions, self.segments_deg)
+        return np.asarray(values * (there[:, None] == own))
+
+
+_PER_PITCH = 4
+"""Places along a pitch of a gap at which its step is looked at."""
+
+_BESIDE_DEG = 1e-6
+"""Beside a gap, on either side of it."""
 
 NOTHING = 1e-6
 """Height below which a local function is left out: of slopes as much, and D keeps five digits."""
@@ -130,7 +163,14 @@ def mirror_surface(mirror: Mirror, subaperture_m: float) -> Surface:
         case Influence.THIN_PLATE:
             return ThinPlate(positions)
         case Influence.GAUSSIAN:
-            return Gaussian(positions, mirror.pitch_m / subaperture_m, mirror.shape.coupling)
+            pitch = mirror.pitch_m / subaperture_m
+            return Gaussian(positions, pitch, mirror.shape.coupling, mirror.segments_deg)
+
+
+def segment_of(points: Array, gaps_deg: tuple[float, ...]) -> NDArray[np.intp]:
+    """Return the segment ``(n_points,)`` that each point lies on, counted from the first gap."""
+    angle_deg = np.rad2deg(np.arctan2(points[:, 1], points[:, 0])) % 360.0
+    return np.asarray(np.searchsorted(gaps_deg, angle_deg, side="right") % len(gaps_deg))
 
 
 def _offsets(points: Array, centres: Array) -> tuple[Array, Array]:

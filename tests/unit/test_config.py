@@ -520,8 +520,9 @@ def test_an_unknown_mode_names_those_that_are_known(write):
 
 
 def test_an_unknown_packaged_name_lists_the_known_ones():
-    assert "neither a packaged name (aof-ut4, flao-lbt, gpao-ut, soul-lbt)" in refusal(
-        load_instrument, "flao-lbtt"
+    assert (
+        "neither a packaged name (aof-ut4, flao-lbt, gpao-ut, metis-elt, micado-elt, soul-lbt)"
+        in refusal(load_instrument, "flao-lbtt")
     )
 
 

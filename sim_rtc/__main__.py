@@ -15,7 +15,7 @@ from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.files.recording import Recording, RecordingWriter
-from sim_rtc.assembly import Telescope, build_telescope
+from sim_rtc.assembly import Telescope, at_held_rate, build_telescope
 from sim_rtc.computer.feed import Ahead, message_frames
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, Pace
@@ -43,6 +43,8 @@ def _build_and_run(options: Options, stopped: threading.Event) -> int:
         return _replay(options.replay, options, stopped)
     instrument = load_instrument(options.instrument)
     _check_writable(options.truth)
+    if options.held_rate and options.plant == "linear":
+        options = at_held_rate(options, instrument)
     # Nested threading makes small products slower, and the service needs the other core.
     with threadpool_limits(1):
         telescope = build_telescope(

@@ -17,6 +17,7 @@ from service.model.kinds import KarhunenLoeve, Normalisation
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis, analytic_basis
 from service.model.pointing_law import ANGLES
+from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.slopes import Orientation
 from service.model.surface import mirror_surface
@@ -25,6 +26,7 @@ from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
+from sim_rtc.held_rate import frame_s, held_rate_hz
 from sim_rtc.options import Options
 from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.telescope.detector import Detector, PixelDetector, binned
@@ -131,6 +133,19 @@ def _binned(
     coarse = binned(instrument, options.binning)
     surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
     return basis.of_surface(surface), coarse
+
+
+def at_held_rate(options: Options, instrument: Instrument) -> Options:
+    """Return the options with the highest frame rate that this machine holds, at most theirs."""
+    instrument = in_sensor_mode(options, instrument)
+    n_modes = instrument.modes.n_modes
+    n_valid = int(rtc_valid_subapertures(instrument).sum())
+    one_frame_s = frame_s(
+        instrument.slopes.kind.n_planes * n_valid,
+        n_modes,
+        options.n_controlled(n_modes, most_of(instrument)),
+    )
+    return replace(options, frame_rate_hz=held_rate_hz(options.frame_rate_hz, one_frame_s))
 
 
 def in_sensor_mode(options: Options, instrument: Instrument) -> Instrument:

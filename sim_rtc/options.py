@@ -49,7 +49,8 @@ class Options:
     )
     alpha: Misregistration | None = several(
         "--alpha X,Y,ROT_DEG,MAG",
-        "true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%)",
+        "true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%); its anamorphosis "
+        "is the instrument file's",
         lambda *boundary: Misregistration.from_vector(np.array(boundary) / BOUNDARY_SCALE),
         limits=", subapertures, degrees and a ratio > 0",
     )
@@ -225,6 +226,11 @@ class Options:
     )
     frame_rate_hz: float = option(
         "--rate HZ", "frame rate", within(10.0, 4000.0), default=1000.0, chapter="loop"
+    )
+    held_rate: bool = option(
+        "--held-rate",
+        "run at the highest frame rate, up to --rate, that this machine holds",
+        action="store_true",
     )
     given_gain: float | None = option(
         "--gain G",

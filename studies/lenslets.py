@@ -3,7 +3,8 @@
 Each peer, in an environment of its own under ``var/peers``, measures modes by push-pull with its
 own lenslets, pixels, centroids and valid subapertures, on a pupil sampled four times as finely as
 the model's; pyrcal fits the matrix, starting from a perfect registration.
-Run: ``python -m studies.lenslets``; minutes, kept matrices at once.
+Run: ``python -m studies.lenslets``; minutes, kept matrices at once. ``--cases 24``: matrices of
+OOPAO at so many registrations drawn at random, on 20 by 20 lenslets, and how often σ holds.
 """
 
 from __future__ import annotations
@@ -52,6 +53,12 @@ TRUTHS = {
 }
 """The last one at the border of what is asked."""
 
+FEW_MODES = np.concatenate([np.arange(20), np.arange(20, 250, 10)])
+"""The same of 20 by 20 lenslets."""
+
+RANGE = np.array([1.0, 1.0, np.deg2rad(3.0), 0.03])
+"""Registrations are drawn within, uniformly: what is asked to be captured."""
+
 FILE = """
 [instrument]
 name = "lenslets"
@@ -61,7 +68,7 @@ stop = "telescope"
 
 [wfs]
 kind = "shack-hartmann"
-n_subapertures = 40
+n_subapertures = {n}
 wavelength_m = {wavelength_m}
 pixels_per_subaperture = 6
 flux_threshold = 0.5
@@ -69,14 +76,14 @@ flux_threshold = 0.5
 
 [mirror]
 layout = "grid"
-pitch_m = 0.2
-n_across = 41
-diameter_m = 8.3
+pitch_m = {pitch_m}
+n_across = {n_across}
+diameter_m = {mirror_m}
 influence = "gaussian"
 coupling = 0.35
 
 [modes]
-n_modes = 1000
+n_modes = {n_modes}
 """
 
 
@@ -89,8 +96,23 @@ class Case:
     threshold: float = 0.0
     """Of its centroids, as a share of the brightest pixel."""
 
+    drawn: Misregistration | None = None
+    """Its registration; None: that of ``truth``."""
+
+    @property
+    def alpha(self) -> Misregistration:
+        """The registration that it was measured at."""
+        return self.drawn or TRUTHS[self.truth]
+
+    @property
+    def modes(self) -> NDArray[np.intp]:
+        """Its columns."""
+        return MODES if self.n_subapertures == 40 else FEW_MODES
+
     told: bool = True
     """Whether the instrument file tells it, so that partly lit subapertures are left out."""
+
+    n_subapertures: int = 40
 
     binary: bool = False
     """Whether a cell of the peer's pupil is lit or dark, as shipped; else the share that is lit."""
@@ -114,14 +136,24 @@ def instrument(case: Case) -> Instrument:
     centroid = f'centroid = "threshold"\nthreshold = {told}' if told else ""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "lenslets.toml"
-        path.write_text(FILE.format(wavelength_m=WAVELENGTH_M, centroid=centroid), "utf-8")
+        n = case.n_subapertures
+        text = FILE.format(
+            wavelength_m=WAVELENGTH_M,
+            centroid=centroid,
+            n=n,
+            pitch_m=8.0 / n,
+            n_across=n + 1,
+            mirror_m=8.0 + 12.0 / n,
+            n_modes=25 * n if n == 40 else 300,
+        )
+        path.write_text(text, "utf-8")
         return load_instrument(path)
 
 
 @cache
-def basis() -> ModalBasis:
+def basis(n_subapertures: int = 40) -> ModalBasis:
     """Return the mirror's modes."""
-    modes = modal_basis(instrument(CASES[0]))
+    modes = modal_basis(instrument(replace(CASES[0], n_subapertures=n_subapertures)))
     if not isinstance(modes, ModalBasis):
         raise TypeError(f"found {type(modes).__name__}, expected the modes of a drawn mirror")
     return modes
@@ -130,15 +162,16 @@ def basis() -> ModalBasis:
 def measured(case: Case) -> tuple[Array, Array]:
     """Return the peer's matrix and its valid subapertures, measured now unless kept."""
     folder = KEPT / case.peer
-    kept = folder / f"lenslets-{case.truth}-{case.threshold:g}{'-binary' * case.binary}.npz"
+    size = "" if case.n_subapertures == 40 else f"{case.n_subapertures}-"
+    kept = folder / f"lenslets-{size}{case.truth}-{case.threshold:g}{'-binary' * case.binary}.npz"
     if not kept.exists():
-        about, alpha = instrument(case), TRUTHS[case.truth]
+        about, alpha = instrument(case), case.alpha
         side = SAMPLING * about.wfs.n_subapertures
         line = (np.arange(side) - (side - 1) / 2) / SAMPLING
         points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         on_mirror = (points - alpha.vector[:2]) @ rotation(alpha.rotation_rad) / alpha.magnification
         rows = np.array_split(on_mirror, 64)
-        modes = basis().subset(MODES)
+        modes = basis(case.n_subapertures).subset(case.modes)
         shapes = np.concatenate([modes.render(some).astype(np.float32) for some in rows])
         amplitude = instrument_pupil(about, SAMPLING).amplitude
         if case.binary:
@@ -173,7 +206,8 @@ def fitted(case: Case) -> Fit:
     matrix, valid = measured(case)
     about = instrument(case)
     about = replace(about, wfs=replace(about.wfs, valid_subapertures=valid))
-    return fit_matrix(about, Reference(matrix=matrix, modes=MODES), basis=basis())
+    reference = Reference(matrix=matrix, modes=case.modes)
+    return fit_matrix(about, reference, basis=basis(case.n_subapertures))
 
 
 def row(case: Case) -> str:
@@ -182,7 +216,7 @@ def row(case: Case) -> str:
     start = time.perf_counter()
     found = fitted(case)
     seconds = time.perf_counter() - start
-    error = (found.alpha.vector - TRUTHS[case.truth].vector) * BOUNDARY_SCALE
+    error = (found.alpha.vector - case.alpha.vector) * BOUNDARY_SCALE
     sigma = np.asarray(found.sigma) * BOUNDARY_SCALE
     print(case, found.verdict, *found.left_out, *found.remarks, sep="\n  ", file=sys.stderr)
     cells = " | ".join(f"{e:+.5f} ± {s:.5f}" for e, s in zip(error, sigma, strict=True))
@@ -193,8 +227,57 @@ def row(case: Case) -> str:
     )
 
 
+def drawn(n_cases: int) -> list[Case]:
+    """Return cases at random registrations, the same every time."""
+    rng = np.random.default_rng(25)
+    steps = RANGE * rng.uniform(-1.0, 1.0, (n_cases, 4))
+    nominal = Misregistration()
+    return [
+        Case(peer="oopao", truth=f"drawn-{k}", drawn=nominal.stepped(step), n_subapertures=20)
+        for k, step in enumerate(steps)
+    ]
+
+
+def coverage(n_cases: int) -> None:
+    """Print each error over its σ, and what all of them say together."""
+    print("| case | x | y | rotation | magnification | a0 | a45 | chi |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    all_errors, all_sigma = [], []
+    for case in drawn(n_cases):
+        found = fitted(case)
+        stretches = np.zeros(2) if found.anamorphosis_sigma is None else found.alpha.stretches
+        sigma_2 = np.ones(2) if found.anamorphosis_sigma is None else found.anamorphosis_sigma
+        error = np.concatenate([found.alpha.vector - case.alpha.vector, stretches])
+        sigma = np.concatenate([found.sigma, sigma_2])
+        chi = error[:4] @ np.linalg.solve(found.covariance, error[:4])
+        print(
+            f"| {case.truth} | "
+            + " | ".join(f"{v:+.2f}" for v in error / sigma)
+            + f" | {chi:.1f} |",
+            flush=True,
+        )
+        all_errors.append(error)
+        all_sigma.append(sigma)
+    scale = np.array([*BOUNDARY_SCALE, 1.0, 1.0])
+    errors, sigma = np.array(all_errors) * scale, np.array(all_sigma) * scale
+    rms, typical = np.sqrt(np.mean(errors**2, axis=0)), np.sqrt(np.mean(sigma**2, axis=0))
+    inside = np.mean(np.abs(errors) < 1.96 * sigma, axis=0)
+    for name, values in (
+        ("RMS error", rms),
+        ("mean error", errors.mean(axis=0)),
+        ("largest error", np.abs(errors).max(axis=0)),
+        ("σ", typical),
+        ("σ / RMS error", typical / rms),
+        ("inside 1.96 σ", inside),
+    ):
+        print(f"{name}: " + ", ".join(f"{value:.2g}" for value in values))
+
+
 def main() -> int:
     """Measure, fit, print the table."""
+    if sys.argv[1:2] == ["--cases"]:
+        coverage(int(sys.argv[2]))
+        return 0
     print("| peer | α | threshold | x, subap | y | rotation, deg | magnification | left over | s |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for case in CASES:

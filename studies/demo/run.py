@@ -21,8 +21,12 @@ from studies.demo.truth import TruthFile
 from studies.demo.watch import ANSWER_WITHIN_S, Promise, TelemetryObserver
 
 LOG = "service.log"
-WANTED_RATIO = 1.5
-"""Of the wavefront error before and after, where the night begins far away."""
+OWN = "flao-lbt"
+"""The instrument of the demo unless another is asked for."""
+
+WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
+"""Of the wavefront error before and after, where the night begins far away: of FLAO, and of any
+other telescope, whose modes leave what they leave."""
 
 FAR = """\
 The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it. With that matrix a
@@ -85,8 +89,15 @@ def _promise(options: argparse.Namespace) -> Promise:
         seconds=options.seconds,
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
         real_time=options.plant != "diffractive",
-        wanted_ratio=WANTED_RATIO if _is_far(options) else 1.0,
+        wanted_ratio=_wanted_ratio(options),
+        held_rate=options.instrument != OWN,
     )
+
+
+def _wanted_ratio(options: argparse.Namespace) -> float:
+    if not _is_far(options):
+        return 1.0
+    return WANTED_RATIO if options.instrument == OWN else OTHER_RATIO
 
 
 def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
@@ -149,6 +160,8 @@ def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     simulator = ["--connect", endpoint, "--seed", str(options.seed)]
     simulator += ["--instrument", options.instrument]
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
+    if options.instrument != OWN:
+        simulator.append("--held-rate")
     if _is_far(options):
         simulator.append("--far")
     for name in FORWARDED:

@@ -109,6 +109,9 @@ class Promise:
     wanted_ratio: float = 1.0
     """Wavefront error before over after."""
 
+    held_rate: bool = False
+    """The simulator runs at the highest rate that this machine holds."""
+
 
 class TelemetryObserver:
     """Looks at REST and the truth file, and prints."""
@@ -258,6 +261,9 @@ class TelemetryObserver:
         )
         if slow is not None:
             self._say_once(slow)
+        slower = rate_line(self._state) if self._promise.held_rate else None
+        if slower is not None:
+            self._say_once(slower)
         seconds = 0.0 if clock is None else clock.wall_s
         silent_s = time.monotonic() - self._answered_s
         if silent_s > FRESH_S:
@@ -273,6 +279,9 @@ class TelemetryObserver:
             self._said.add(line)
             self._say(line)
 
+
+USUAL_RATE_HZ = 1000.0
+"""Of the simulated RTC, where the machine holds it."""
 
 HEADING = (
     "   time   frames  lost |  shift x        shift y        rotation         magnification    |"
@@ -319,6 +328,17 @@ def awaited(state: dict[str, Any] | None) -> str:
     if MODEL in (waited_for := waits(state)):
         return waited_for[MODEL]
     return "the simulated telescope is being prepared"
+
+
+def rate_line(state: dict[str, Any] | None) -> str | None:
+    """Return at which rate the loop runs where this machine holds no more; None: at the usual."""
+    rtc = None if state is None else state["rtc"]
+    if rtc is None or rtc["frame_rate_hz"] >= USUAL_RATE_HZ:
+        return None
+    return (
+        f"         the loop runs at {rtc['frame_rate_hz']:g} Hz: the most that this machine holds "
+        f"of the usual {USUAL_RATE_HZ:g}"
+    )
 
 
 def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:

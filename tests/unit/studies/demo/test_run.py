@@ -28,7 +28,7 @@ def test_the_simulator_gets_what_is_meant_for_it_and_understands_it():
     assert found.alpha.shift_x_subap == -0.1
     assert (found.magnitude, found.seed, found.gain) == (7.0, 5, 0.3)
     assert [jump.time_s for jump in found.jumps] == [30.0, 60.0]
-    assert found.connect == "tcp/127.0.0.1:7500"
+    assert found.given_connect == "tcp/127.0.0.1:7500"
 
 
 def test_both_meet_at_the_same_place_and_the_service_is_never_told_the_truth(tmp_path):
@@ -55,6 +55,14 @@ def test_the_night_begins_far_away_unless_something_else_is_asked_for():
 def test_a_night_that_begins_far_away_must_end_with_much_less_wavefront_error():
     assert _promise(options()).wanted_ratio == 1.5
     assert _promise(options("--near")).wanted_ratio == 1.0
+
+
+def test_another_telescope_runs_as_fast_as_the_machine_holds_and_has_a_bar_of_its_own():
+    other, own = options("--instrument", "soul-lbt"), options()
+    assert parse_options(_commands(other)[1]).held_rate
+    assert not parse_options(_commands(own)[1]).held_rate
+    assert (_promise(other).held_rate, _promise(own).held_rate) == (True, False)
+    assert 1.0 < _promise(other).wanted_ratio < _promise(own).wanted_ratio
 
 
 def test_the_leftovers_of_an_earlier_demo_are_removed(tmp_path):

@@ -16,6 +16,7 @@ from studies.demo.watch import (
     TelemetryObserver,
     awaited,
     live_line,
+    rate_line,
     slow_line,
 )
 from tests.unit.studies.demo.test_report import TRUE, service_state, shelf, waiting
@@ -297,3 +298,12 @@ def test_while_it_prepares_the_demo_says_what_it_waits_for():
     }
     assert awaited({"waiting_for": [wait]}) == "for the worker: it is being prepared"
     assert "telescope" in awaited({"waiting_for": []})
+
+
+def test_a_loop_that_runs_slower_than_usual_is_told():
+    assert rate_line(None) is None
+    assert rate_line({"rtc": None}) is None
+    assert rate_line({"rtc": {"frame_rate_hz": 1000.0}}) is None
+    assert "runs at 500 Hz: the most that this machine holds" in rate_line(
+        {"rtc": {"frame_rate_hz": 500.0}}
+    )

@@ -1,0 +1,46 @@
+"""The highest frame rate that this machine holds, from the products that a frame takes."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from sim_rtc.computer.feed import BATCH_FRAMES
+
+RATES_HZ = (1000.0, 800.0, 500.0, 400.0, 250.0, 200.0, 100.0, 50.0, 20.0, 10.0)
+"""Those that are tried, below the one that is asked for."""
+
+SHARE = 0.4
+"""Of the wall clock that a frame's products may take: the turbulence takes as much again, and the
+service beside needs the rest of what this machine has free."""
+
+MEASURED_S = 0.5
+
+
+def frame_s(n_slopes: int, n_modes: int, n_controlled: int) -> float:
+    """Return how long the products of one frame of a linear plant take now, seconds.
+
+    By the wall clock: whatever else this machine does counts. Slopes of many frames together, the
+    modes they show, and the mirror's part in these two frames at a time, as the loop has it.
+    """
+    rng = np.random.default_rng(1)
+    response = rng.standard_normal((n_slopes, n_modes), dtype=np.float32)
+    reconstructor = rng.standard_normal((n_slopes, n_controlled), dtype=np.float32)
+    modal = rng.standard_normal((n_modes, n_controlled), dtype=np.float32)
+    commands = rng.standard_normal((BATCH_FRAMES, n_modes), dtype=np.float32)
+    begun_s, n_frames = time.perf_counter(), 0
+    while n_frames == 0 or time.perf_counter() - begun_s < MEASURED_S:
+        slopes = commands @ response.T
+        slopes @ reconstructor
+        for first in range(0, BATCH_FRAMES, 2):
+            commands[first : first + 2] @ modal
+        n_frames += BATCH_FRAMES
+    return (time.perf_counter() - begun_s) / n_frames
+
+
+def held_rate_hz(asked_hz: float, one_frame_s: float) -> float:
+    """Return the highest rate, at most ``asked_hz``, at which frames leave enough of the clock."""
+    slower = (rate_hz for rate_hz in RATES_HZ if rate_hz < asked_hz)
+    held = (rate_hz for rate_hz in (asked_hz, *slower) if rate_hz * one_frame_s <= SHARE)
+    return next(held, RATES_HZ[-1])

@@ -90,9 +90,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
             tracking.flexure_magnification_per_degree,
         ),
         slew_limit_deg=tracking.slew_limit_deg,
-        stale_sigma=_vector(
-            tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification
-        ),
+        stale_sigma=_stale_sigma(settings, instrument),
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,
@@ -120,6 +118,16 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         sensor_modes={} if instrument is None else _sensor_modes(instrument),
         law=None if instrument is None else instrument.law,
     )
+
+
+def _stale_sigma(settings: Settings, instrument: Instrument | None) -> NDArray[np.float64]:
+    """Return from which σ on α is stale: no window mends what a coarse mirror adds to the floor."""
+    tracking = settings.tracking
+    limit = _vector(
+        tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification
+    )
+    usual, floor = (floor_of(settings, about) / BOUNDARY_SCALE for about in (None, instrument))
+    return np.where(floor > usual, np.sqrt(limit**2 + floor**2 - usual**2), limit)
 
 
 def _sensor_modes(instrument: Instrument) -> dict[str, SensorModePolicy]:

@@ -75,6 +75,17 @@ def test_the_floor_of_a_coarse_mirror_is_as_much_larger(name, coarser):
     assert floor_of(given, load_instrument(name))[2] == 0.01
 
 
+def test_a_coarse_mirror_does_not_make_alpha_stale_for_good():
+    """What its floor has more than usual is beside the limit, not in it."""
+    settings = load_settings(None, {})
+    usual, coarse = policy_of(settings), policy_of(settings, load_instrument(LENSLETS))
+    assert coarse.stale_sigma[3] > 1.2 * coarse.floor[3]
+    left = coarse.stale_sigma**2 - coarse.floor**2
+    np.testing.assert_allclose(left, usual.stale_sigma**2 - usual.floor**2)
+    fine = policy_of(settings, load_instrument("flao-lbt"))
+    np.testing.assert_array_equal(fine.stale_sigma, usual.stale_sigma)
+
+
 def test_a_floor_that_is_given_overrules_the_measured_one():
     settings = load_settings(None, {"PYRCAL_TRACKING__FLOOR_ROTATION_DEG": "0"})
     np.testing.assert_array_equal(floor_of(settings), [FLAT[0], FLAT[0], 0.0, FLAT[2]])

@@ -280,9 +280,9 @@ class InteractionModel:
             self._moved(alpha, lambda at: -at / alpha.magnification),
         ]
         if self.instrument.stop is Stop.MIRROR:
-            matrix, *turned = self._seen_together(alpha, shapes)
-            shifted = self._at(self._image_shift(alpha)).shift_rates(rendered)
-            return [matrix, *shifted, *turned]
+            turned = self._seen_together(alpha, shapes[1:])
+            shifted = self._at(self._image_shift(alpha)).with_shift_rates(rendered)
+            return [*shifted, *turned]
         step_x, step_y = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
         shapes[1:1] = [
             self._moved(alpha, lambda at: np.broadcast_to(step_x, at.shape)),

@@ -63,8 +63,8 @@ class Response(Protocol):
         right of a product like any others.
         """
 
-    def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
-        """Return how they change when the image moves along x, and along y, per subaperture."""
+    def with_shift_rates(self, shapes: Shapes) -> tuple[Array, Array, Array]:
+        """Return what ``apply`` does, and its change per subaperture along x, and along y."""
 
 
 class Sensor(Protocol):

@@ -184,10 +184,7 @@ class PyramidOptics:
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
-        factors = self._row_factors(
-            row, columns, rows.fields, rows.roof_y, rows.along_y, rows.modulated_x
-        )
-        return rows.finish(*factors)
+        return rows.finish(*self._row_factors(row, columns, rows))
 
     @property
     def n_pairs(self) -> int:
@@ -271,20 +268,13 @@ class PyramidOptics:
         return np.asarray(images / (2.0 * self._source()[2].sum()))
 
     def _modulated_x(self, roof_x: _Roof, along_x: Array) -> Array:
-        """Return the weighted x factors ``(M/2, 2, n, 2 of the pair * n_nodes, N)``."""
+        """Return the weighted x factors ``(2, M/2, n, 2 of the pair * n_nodes * Re | Im, N)``."""
         weighted = roof_x.kernel * roof_x.weights[:, None].astype(self.dtype)
-        product = weighted[None, :, :, None] * along_x[:, None, None, :, None]
-        return np.asarray(product.reshape(*product.shape[:3], -1, product.shape[-1]))
+        product = weighted[:, None, :, None] * along_x[None, :, None, :, None]
+        parts = np.stack([product.real, product.imag], axis=-2)
+        return parts.reshape(*parts.shape[:3], -1, parts.shape[-1])
 
-    def _row_factors(
-        self,
-        row: int,
-        columns: Array,
-        fields: Array,
-        roof_y: _Roof,
-        along_y: Array,
-        modulated_x: Array,
-    ) -> tuple[Array, Array]:
+    def _row_factors(self, row: int, columns: Array, rows: PreparedRows) -> tuple[Array, Array]:
         """Return factors ``(n_terms, N)`` along y, ``(n_terms, n_lines, N)`` along x of one row.
 
         The sum of their products over the terms, times the amplitude, is the gradient of each line:
@@ -292,28 +282,31 @@ class PyramidOptics:
         else their sum. Modulation, nodes and images along y are terms; only the imaginary part is
         needed: Re | Im of one factor stand against Im | Re of the other.
         """
-        weights = roof_y.weights[:, None].astype(self.dtype)
-        factor_y = (along_y[:, None, None] * roof_y.kernel[:, row] * weights).reshape(
-            -1, along_y.shape[-1]
-        )
-        # (M/2, image side y, node y, pair, image side x, column, node x)
-        conjugate = fields[:, :, row][:, :, :, :, :, columns].conj()
-        left = conjugate.transpose(0, 4, 5, 1, 2, 3, 6).reshape(
-            len(along_y), 2, len(columns), 2 * len(weights), -1
-        )
-        by_image_x = np.matmul(left, modulated_x[:, :, columns])
-        # (image side x, M/2, image side y, node y, column, N)
-        seen = by_image_x.reshape(len(along_y), 2, len(columns), 2, len(weights), -1).transpose(
-            1, 0, 3, 4, 2, 5
-        )
-        factor_x = np.stack([self._lines(seen.imag), self._lines(seen.real)])
+        weights = rows.roof_y.weights[:, None].astype(self.dtype)
+        along_y = rows.along_y[:, None, None] * rows.roof_y.kernel[:, row] * weights
+        factor_y = np.stack([along_y.real, along_y.imag], axis=1)
+        # (image side x, M/2, column, image side y, node y, pair, node x)
+        here = rows.fields[:, :, row][..., columns, :].transpose(4, 0, 5, 1, 2, 3, 6)
+        imaginary = np.stack([-here.imag, here.real], axis=-1)
+        real = np.stack([here.real, here.imag], axis=-1)
+        left = np.stack([imaginary, real], axis=3)
+        left = left.reshape(*left.shape[:3], 4 * len(weights), -1)
+        span = slice(columns[0], columns[-1] + 1)  # a slice is not copied, a list of columns is
+        without_gap = len(columns) == span.stop - span.start
+        right = rows.modulated_x[:, :, span if without_gap else columns]
+        seen = np.empty((*left.shape[:2], left.shape[3], len(columns), right.shape[-1]), self.dtype)
+        np.matmul(left, right, out=seen.swapaxes(2, 3))
+        lines = self._lines(seen.reshape(2, *factor_y.shape[:-1], *seen.shape[3:]))
         return (
-            np.concatenate([factor_y.real, factor_y.imag]),
-            factor_x.reshape(-1, *factor_x.shape[-2:]),
+            factor_y.reshape(-1, factor_y.shape[-1]),
+            lines.reshape(-1, *lines.shape[-2:]),
         )
 
     def _lines(self, seen: Array) -> Array:
-        """Return what images ``(2, M/2, 2, n_nodes, n_columns, N)`` add to every line of a row."""
+        """Return what images ``(2, M/2, 2, 2, n_nodes, n_columns, N)`` add to every line of a row.
+
+        Image side along x, source, Im | Re, image side along y, node along y.
+        """
         n = seen.shape[-2]
         local = self.recipe.normalisation is Normalisation.LOCAL
         n_signals = self.recipe.kind.n_planes * n
@@ -323,10 +316,11 @@ class PyramidOptics:
         total = seen[0] + seen[1]
         if self.recipe.kind is SignalKind.INTENSITY:
             for plane, (side, along_x) in enumerate(itertools.product((0, 1), repeat=2)):
-                out[:, side, :, plane * n : (plane + 1) * n] = seen[along_x][:, side]
+                out[:, :, side, :, plane * n : (plane + 1) * n] = seen[along_x][:, :, side]
         else:
+            signs = _SIGNS[:, None, None, None].astype(self.dtype)
             np.subtract(seen[0], seen[1], out=out[..., :n, :])
-            np.multiply(total, _SIGNS[:, None, None, None], out=out[..., n : 2 * n, :])
+            np.multiply(total, signs, out=out[..., n : 2 * n, :])
         out[..., n_signals:, :] = total if local else total.sum(axis=-2, keepdims=True)
         return out
 
@@ -349,7 +343,8 @@ class PyramidOptics:
         lit = self.pupil.lit
         product = along_y.T @ along_x.reshape(n_terms, -1)
         gradient = product.reshape(n_u, n_lines, n_u).transpose(1, 0, 2)[:, lit]
-        return np.asarray(gradient * self._scale[lit])
+        gradient *= self._scale[lit]
+        return np.asarray(gradient)
 
     def _tile_by_tile(self, shapes: LocalShapes) -> Callable[[Array, Array], Array]:
         """Return what makes of a row's factors the response to local shapes."""

@@ -149,14 +149,15 @@ class PyramidResponse:
         light = self._to(shapes)
         return self._per_metre(normalised_jacobian(light, self.sensor.valid, out=light.gradient))
 
-    def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
-        """Return how they change when the images move along x, and along y, per subaperture."""
+    def with_shift_rates(self, shapes: Shapes) -> tuple[Array, Array, Array]:
+        """Return the signals, and their change when the images move along x, and along y."""
         at_rest, valid = self._to(shapes), self.sensor.valid
         along_x, along_y = (
             self._per_metre(normalised_derivative(at_rest, self._to(shapes, **edges), valid))
             for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()})
         )
-        return along_x, along_y
+        signals = normalised_jacobian(at_rest, valid, out=at_rest.gradient)
+        return self._per_metre(signals), along_x, along_y
 
     @cached_property
     def _gradient(self) -> LightGradient:

@@ -223,10 +223,10 @@ class ShackHartmannResponse:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts, metres."""
         return np.asarray(self._matrix @ shapes)
 
-    def shift_rates(self, shapes: Shapes) -> tuple[Array, Array]:
-        """Return how they change when the image moves along x, and along y, per subaperture."""
+    def with_shift_rates(self, shapes: Shapes) -> tuple[Array, Array, Array]:
+        """Return the signals, and their change when the image moves along x, and along y."""
         along_x, along_y = self._rates
-        return np.asarray(along_x @ shapes), np.asarray(along_y @ shapes)
+        return self.apply(shapes), np.asarray(along_x @ shapes), np.asarray(along_y @ shapes)
 
     def jacobian(self) -> Array:
         """Return K whole, ``(n_signals, n_points)`` per metre."""

@@ -56,7 +56,9 @@ def test_shift_rates_are_those_of_the_response(order, normalisation):
     pupil = instrument_pupil(instrument, 2)
     sensor = kind_of(instrument).sensor(instrument, pupil, Fineness(n_nodes=6, dtype=np.float64))
     shapes, step = small_basis().render(pupil.points)[:, :5], 1e-3
-    for axis, rate in enumerate(sensor.at(SHIFT).shift_rates(shapes)):
+    signals, *rates = sensor.at(SHIFT).with_shift_rates(shapes)
+    np.testing.assert_array_equal(signals, sensor.at(SHIFT).apply(shapes))
+    for axis, rate in enumerate(rates):
         before, after = (
             sensor.at(tuple(SHIFT + side * step * np.eye(2)[axis])).apply(shapes)
             for side in (-1.0, 1.0)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.methods import Settled, spread
-from pyrcal.offline.models import BETTER, CHEAP, FitModels, Optic, Other
+from pyrcal.offline.methods import Settled
+from pyrcal.offline.models import BETTER, FitModels, Optic, Other
 from pyrcal.offline.pupil_checks import Few, other_pupils
 from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import Uncertainty
@@ -115,14 +115,13 @@ class AsTold:
     """``(4,)`` by how much its registration is another, numeric units."""
 
 
-def rivals(settled: Settled) -> tuple[Rival, ...]:
+def rivals(settled: Settled, few: Few) -> tuple[Rival, ...]:
     """Return other instruments, the one that explains the matrix best first.
 
     Each is allowed its own registration, coupling and sensor, to first order about those found;
     where the matrix cannot tell, it is fitted as well.
     """
-    few, solution = Few(settled), settled.solution
-    own = few.left(few.matrix(settled.models))
+    solution, own = settled.solution, few.left(few.own)
     found = [
         Rival(change=change, share=share, moved=moved) for change, share, moved in other_pupils(few)
     ]
@@ -135,27 +134,19 @@ def rivals(settled: Settled) -> tuple[Rival, ...]:
     return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
 
 
-def doubt_of_width(settled: Settled) -> Array:
+def doubt_of_width(settled: Settled, few: Few) -> Array:
     """Return how far a width of the influence functions that cannot be fitted moves α, ``(4,)``.
 
     Those of a table, or of a thin plate, have no coupling. What others would explain is not
     followed: on the diffractive telescope, whose mirror is of another kind, that was no nearer to
     the truth. It tells how sure the registration is.
     """
-    models, solution, target = settled.models, settled.solution, settled.target
-    if Optic.WIDTH in models.optics:
+    if Optic.WIDTH in settled.models.optics:
         return np.zeros(4)
-    modes = spread(target.n_modes)
-    few = target.column_subset(modes)
-    subset = models.model(CHEAP, models.basis.subset(modes))
-    models.counter.n += 1
-    wider = subset.width_derivative(solution.alpha)
-    known = np.concatenate([solution.derivatives, solution.nuisance_derivatives])[:, :, modes]
-    steps = [
-        few.project(solution.matrix[:, modes], derivatives).best_step[:4]
-        for derivatives in (known, np.concatenate([known, wider[None]]))
-    ]
-    return steps[1] - steps[0]
+    settled.models.counter.n += 1
+    wider = few.model.width_derivative(few.here)
+    fine = settled.solution.matrix[:, few.modes]
+    return few.step(fine, wider)[:4] - few.step(fine)[:4]
 
 
 def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple[FoundOptic, ...]:

@@ -356,11 +356,12 @@ def _answer(
     values = np.concatenate([np.zeros(4), nuisances.from_prior(solution.nuisances)])
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
-    others = rivals(settled)
+    few = Few(settled)
+    others = rivals(settled, few)
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = structure(seen.residual, power, noise)
-    by_light = residual_fraction**2 * (1.0 - left_by_light(Few(settled)))
+    by_light = residual_fraction**2 * (1.0 - left_by_light(few))
     sure = uncertainty(
         seen,
         values,
@@ -372,7 +373,7 @@ def _answer(
         if slopes.normalisation is Normalisation.LOCAL
         else MAGNIFICATION_FLOOR,
         residual_fraction=residual_fraction,
-        doubt=np.array([doubt_of_width(settled), *(rival.moved for rival in others)]),
+        doubt=np.array([doubt_of_width(settled, few), *(rival.moved for rival in others)]),
     )
     optics = found_optics(as_in_file, settled, sure)
     findings = FitFindings(

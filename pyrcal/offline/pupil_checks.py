@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from pyrcal.offline.methods import Settled, spread
 from pyrcal.offline.models import BETTER, CHEAP, FAR_BETTER, FitModels, Other
 from pyrcal.offline.solver import nuisances_of
 from service.model.instrument import Instrument
+from service.model.interaction import InteractionModel
 
 Array = NDArray[np.float64]
 
@@ -57,7 +59,7 @@ class PupilNumber:
 
     def found(self, few: Few) -> tuple[float, Array]:
         """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
-        light, matrix = self.reported**self.power, few.matrix(few.models)
+        light, matrix = self.reported**self.power, few.own
         low, high = (limit**self.power for limit in self.range)
         for _ in range(_STEPS):
             there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
@@ -106,15 +108,23 @@ class Few:
         self.derivatives = np.asarray(known[:, :, self.modes], dtype=np.float64)
         """Of the instrument as it is: they hardly depend on the hypothesis."""
 
+    @cached_property
+    def model(self) -> InteractionModel:
+        """Of the instrument as it is, these modes only."""
+        return self.models.model(CHEAP, self.models.basis.subset(self.modes))
+
+    @cached_property
+    def own(self) -> Array:
+        """D of the instrument as it is, ``(n_slopes, n_few)``."""
+        return self._at_solution(self.model)
+
     def of(self, about: Instrument) -> FitModels:
         """Return the models of another instrument with the same modes."""
         return replace(self.models, instrument=about)
 
     def matrix(self, tried: FitModels) -> Array:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
-        self.models.counter.n += 1
-        model = tried.model(CHEAP, tried.basis.subset(self.modes))
-        return np.asarray(model.interaction_matrix(self.here), dtype=np.float64)
+        return self._at_solution(tried.model(CHEAP, tried.basis.subset(self.modes)))
 
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, those given by a derivative included."""
@@ -128,6 +138,10 @@ class Few:
         """Return the best step of all of them."""
         return self.target.project(matrix, self._with(more)).best_step
 
+    def _at_solution(self, model: InteractionModel) -> Array:
+        self.models.counter.n += 1
+        return np.asarray(model.interaction_matrix(self.here), dtype=np.float64)
+
     def _with(self, more: tuple[Array, ...]) -> Array:
         return np.concatenate([self.derivatives, np.array(more)]) if more else self.derivatives
 
@@ -138,19 +152,20 @@ def other_pupils(few: Few) -> Iterator[tuple[Other, float, Array]]:
     Each with what to write into the file, χ² that is left over what the file's leaves, and by how
     much α would be another ``(4,)``.
     """
-    own = few.matrix(few.models)
+    if few.residual_fraction < LEAST_EXPLAINED:
+        return  # less is left than a pupil would have to explain
     for number in _numbers(few.models.instrument):
         value, matrix = number.found(few)
-        share = few.left(matrix) / few.left(own)
+        share = few.left(matrix) / few.left(few.own)
         explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
         notable = abs(value - number.reported) >= number.notable and explained >= LEAST_EXPLAINED
         if notable and share < BETTER:
             other = Other(words=f"{number.key} = {value:.3g}", believed=FAR_BETTER)
-            yield other, share, few.step(matrix)[:4] - few.step(own)[:4]
+            yield other, share, few.step(matrix)[:4] - few.step(few.own)[:4]
 
 
 def left_by_light(few: Few) -> float:
     """Return χ² that a smooth gain over the pupil, common to all modes, leaves, over what is."""
-    kind, own = few.models.instrument.slopes.kind, few.matrix(few.models)
+    kind, own = few.models.instrument.slopes.kind, few.own
     maps = nuisances_of(few.target.valid, kind, gain_map=True).maps
     return few.left(own, *(pattern[:, None] * own for pattern in maps)) / few.left(own)

@@ -145,8 +145,8 @@ def doubt_of_width(settled: Settled, few: Few) -> Array:
         return np.zeros(4)
     settled.models.counter.n += 1
     wider = few.model.width_derivative(few.here)
-    fine = settled.solution.matrix[:, few.modes]
-    return few.step(fine, wider)[:4] - few.step(fine)[:4]
+    fine = settled.solution.matrix[:, few.modes].astype(np.float64)
+    return np.asarray(few.step(fine, wider)[:4] - few.step(fine)[:4])
 
 
 def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tuple[FoundOptic, ...]:

@@ -179,6 +179,9 @@ PIPE_BYTES: Final = 1 << 20
 
 READ_EVERY_S: Final = 0.2
 
+TELLING: Final = (b"unauthorized", b"intercepted", b"zenoh_link_tls", b"UsrPwd")
+"""Most of what zenoh logs is what it lets through, hundreds of lines a second: not read."""
+
 _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 _THREAD: Final = re.compile(r"ThreadId\(\d+\)")
 _UNAUTHORIZED: Final = re.compile(
@@ -249,6 +252,8 @@ def _read_all(
     with os.fdopen(reading, "rb", buffering=0) as pipe:
         while not is_over:
             is_over = over.wait(READ_EVERY_S)
-            *lines, rest = (rest + (pipe.read(PIPE_BYTES) or b"")).split(b"\n")
-            for line in lines:
-                log.read(line.decode(errors="replace"))
+            data = rest + (pipe.read(PIPE_BYTES) or b"")
+            whole, _, rest = data.rpartition(b"\n")
+            if any(word in whole for word in TELLING):
+                for line in whole.split(b"\n"):
+                    log.read(line.decode(errors="replace"))

@@ -9,6 +9,7 @@ import pytest
 from service.errors import WireError
 from service.wire import FrameHeader, Keys, Role, decode, encode
 from service.wire.signing import Signatures, Window
+from tests.unit.test_house import ROOT
 
 SECRET = b"the same on both sides, 32 bytes"
 KEYS = Keys("bench")
@@ -45,6 +46,12 @@ def test_a_signature_as_the_page_says_it_by_hand():
     assert (said["signer"], said["signed_n"], said["signed_for"]) == (7, 0, 0)
     text = b"rtc\0ao/v1/bench/tel/status\0" + signed[:-32]
     assert said["mac"] == hmac.new(SECRET, text, hashlib.sha256).digest() == signed[-32:]
+
+
+def test_the_mac_that_the_page_gives_to_test_against_is_right():
+    page = (ROOT / "docs" / "rtc.md").read_text(encoding="utf-8")
+    signed = rtc(start=7, secret=b"0123456789abcdef" * 2).sign(KEYS.status, STATUS)
+    assert f"`{signed[-32:].hex()}`" in page
 
 
 def test_what_is_signed_is_still_the_message():

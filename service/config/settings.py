@@ -279,7 +279,7 @@ class ComputeTable(Table):
     detector_nodes: int = Field(default=3, ge=1, le=16)
     """Quadrature nodes per detector pixel and axis (nd of the model)."""
 
-    memory_gb: Positive = 4.0
+    memory_gb: Positive = 6.0
     """Memory that modes, D and its derivatives may take, GB: an instrument that needs more is
     refused before it is begun. A sensor keeps its own gradient within a quarter of it."""
 

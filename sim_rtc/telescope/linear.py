@@ -1,7 +1,7 @@
 """A linear telescope: slopes are ``K_eff turbulence + D G command``.
 
-It differs from the service's model by its grid (q = 4), its quadrature and source points, by
-everything in ``Imperfections``, and by an optical gain for every mode.
+It differs from the service's model by its grid (q = 4, of an ELT 2), its quadrature and source
+points, by everything in ``Imperfections``, and by an optical gain for every mode.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing_extensions import override
 from service.model.instrument import Instrument, Mirror
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
-from service.model.pupil import instrument_pupil
+from service.model.pupil import instrument_pupil, valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
 from sim_rtc.telescope.atmosphere import PhaseResponse
@@ -27,7 +27,11 @@ from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registra
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
-_SAMPLING = 4
+_SAMPLINGS = (4, 2)
+"""Points a subaperture: the first of which K is no larger than this, or the last."""
+
+_LARGEST_BYTES = 1e9
+
 _NODES = 4
 _SOURCE_POINTS = 32
 
@@ -78,7 +82,7 @@ class LinearPlant(Plant):
     def __init__(
         self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
     ) -> None:
-        sampling, n_nodes = _SAMPLING * instrument.binning, _NODES * instrument.binning
+        sampling, n_nodes = _sampling(instrument), _NODES * instrument.binning
         super().__init__(instrument, basis, instrument_pupil(instrument, sampling), made)
         self._sensor = kind_of(instrument).sensor(
             replace(instrument, wfs=self._wfs),
@@ -115,6 +119,17 @@ class LinearPlant(Plant):
     @override
     def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[DrawnSurface, Array]:
         return DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m), strokes
+
+
+def _sampling(instrument: Instrument) -> int:
+    """Return points along a subaperture, of which K ``(n_slopes, n_points)`` has a size to keep."""
+    n_valid = int(valid_subapertures(instrument).sum())
+    n_slopes = instrument.slopes.kind.n_planes * n_valid
+    for sampling in _SAMPLINGS:
+        finest = sampling * instrument.binning
+        if 4.0 * n_slopes * n_valid * finest**2 <= _LARGEST_BYTES:
+            return finest
+    return finest
 
 
 def optical_gain(n_modes: int, imperfections: Imperfections) -> Array32:

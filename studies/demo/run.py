@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shutil
 import socket
 import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NamedTuple
 
 import httpx
 
-from service.config.instrument_schema import read_instrument_file
+from service.config.instrument_schema import InstrumentFile, SlopesTable, read_instrument_file
 from service.errors import ConfigurationError, shown
+from service.model.kinds import KarhunenLoeve, LoopFacts
 from studies.demo.arguments import FORWARDED, REPEATED
 from studies.demo.children import children, interrupted_by_any_end
 from studies.demo.report import table
 from studies.demo.truth import TruthFile
-from studies.demo.watch import ANSWER_WITHIN_S, Promise, TelemetryObserver
+from studies.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, TelemetryObserver
 
 LOG = "service.log"
 OWN = "flao-lbt"
@@ -28,10 +31,26 @@ WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
 """Of the wavefront error before and after, where the night begins far away: of FLAO, and of any
 other telescope, whose modes leave what they leave."""
 
-FAR = """\
-The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it. With that matrix a
+PLACE = """\
+The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
+FAR = f"""\
+{PLACE} With that matrix a
 loop of 400 modes diverges, so the RTC begins with 120. WFE is what the simulator knows to be left.
 """
+LARGE = """\
+This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs at
+the rate that this machine holds, and the table says which. Until all is ready takes minutes: modes
+(kept on the disk afterwards), D and its derivatives, and the simulator's own matrices, some 8 GB of
+them beside 4 of the service's.
+"""
+LARGE_FAR = f"""\
+{PLACE} The RTC begins
+with 120 modes. WFE is what the simulator knows to be left.
+"""
+
+HELD_GFLOP_S = 30.0
+"""Of products of a matrix with few frames, what half a processor of two cores does."""
+
 CHECK_WITHIN_S = 60.0
 
 
@@ -50,8 +69,11 @@ def run_demo(options: argparse.Namespace) -> int:
     _say(f"service    pyrcal {' '.join(service_words)}")
     _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
     _say(f"REST       {url}/v1/state   logs and truth: {options.dir}\n")
+    large = _too_large(options)
+    if large is not None:
+        _say(LARGE.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
     if _is_far(options):
-        _say(FAR)
+        _say(FAR if large is None else LARGE_FAR)
     commands = {
         "service": ["-m", "service", *service_words],
         "simulator": ["-m", "sim_rtc", *sim_words],
@@ -84,18 +106,53 @@ def _is_far(options: argparse.Namespace) -> bool:
     return not (told or options.near)
 
 
+class _Large(NamedTuple):
+    """A linear plant that no ordinary machine runs in real time."""
+
+    rate_hz: float
+    """Of its frames."""
+
+    gflop_s: float
+    """Of the products of its slopes and modes, by which it was judged."""
+
+
+def _too_large(options: argparse.Namespace) -> _Large | None:
+    """Return what it takes where that is more than a machine has; None: it keeps real time.
+
+    Each frame is multiplied by R and by D. How fast is in its file; who does not say is small.
+    """
+    if options.plant == "diffractive":
+        return None
+    said = read_instrument_file(options.instrument)
+    rate_hz = said.section(LoopFacts).said.frame_rate_hz
+    if rate_hz is None:
+        return None
+    gflop_s = 4e-9 * rate_hz * _n_slopes(said) * said.section(KarhunenLoeve).said.n_modes
+    return _Large(rate_hz, gflop_s) if gflop_s > HELD_GFLOP_S else None
+
+
+def _n_slopes(said: InstrumentFile) -> float:
+    """Return about how many slopes a file's sensor has."""
+    across = said.section(said.kind.table).said.pupil_diameter
+    kind = said.section(SlopesTable).said.kind
+    return float(kind.n_planes * math.pi / 4 * across**2)
+
+
 def _promise(options: argparse.Namespace) -> Promise:
+    large = _too_large(options)
     return Promise(
         seconds=options.seconds,
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
         real_time=options.plant != "diffractive",
         wanted_ratio=_wanted_ratio(options),
         held_rate=options.instrument != OWN,
+        large=large is not None,
+        asked_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
     )
 
 
 def _wanted_ratio(options: argparse.Namespace) -> float:
-    if not _is_far(options):
+    if not _is_far(options) or _too_large(options) is not None:
         return 1.0
     return WANTED_RATIO if options.instrument == OWN else OTHER_RATIO
 
@@ -162,6 +219,9 @@ def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
     if options.instrument != OWN:
         simulator.append("--held-rate")
+    large = _too_large(options)
+    if large is not None:
+        simulator.append(f"--rate={large.rate_hz:g}")
     if _is_far(options):
         simulator.append("--far")
     for name in FORWARDED:

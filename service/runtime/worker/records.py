@@ -72,7 +72,7 @@ class Compute:
     """Address of a Dask scheduler whose workers help with rows; None: nobody does."""
 
     nice: int = 10
-    memory_gb: float = 4.0
+    memory_gb: float = 6.0
     """That modes, D and its derivatives may take; a quarter of it for what a sensor keeps."""
 
     sampling: Sampling = field(default_factory=Sampling)

@@ -7,7 +7,7 @@ from service.errors import ConfigurationError
 from sim_rtc.options import parse_options
 from studies.demo.__main__ import main
 from studies.demo.arguments import demo_parser
-from studies.demo.run import _commands, _emptied, _promise, _say
+from studies.demo.run import _commands, _emptied, _promise, _say, _too_large
 
 ROOT = Path(__file__).parents[4]
 
@@ -63,6 +63,23 @@ def test_another_telescope_runs_as_fast_as_the_machine_holds_and_has_a_bar_of_it
     assert not parse_options(_commands(own)[1]).held_rate
     assert (_promise(other).held_rate, _promise(own).held_rate) == (True, False)
     assert 1.0 < _promise(other).wanted_ratio < _promise(own).wanted_ratio
+
+
+def test_a_telescope_too_large_for_real_time_is_asked_for_its_own_rate_and_given_time():
+    """METIS: 4 x 500 Hz x 12,723 slopes x 4300 modes are 109 GFLOP/s; SOUL's are 10 of 30."""
+    large = options("--instrument", "metis-elt")
+    found = parse_options(_commands(large)[1])
+    assert (found.frame_rate_hz, found.held_rate) == (500.0, True)
+    assert _too_large(large).gflop_s == pytest.approx(109, abs=1)
+    promise = _promise(large)
+    assert (promise.asked_rate_hz, promise.large, promise.wanted_ratio) == (500.0, True, 1.0)
+
+
+@pytest.mark.parametrize("name", ["flao-lbt", "soul-lbt", "gpao-ut", "aof-ut4"])
+def test_others_are_asked_for_the_usual_rate(name):
+    found = options("--instrument", name)
+    assert parse_options(_commands(found)[1]).frame_rate_hz == 1000.0
+    assert not _promise(found).large
 
 
 def test_the_leftovers_of_an_earlier_demo_are_removed(tmp_path):

@@ -304,6 +304,6 @@ def test_a_loop_that_runs_slower_than_usual_is_told():
     assert rate_line(None) is None
     assert rate_line({"rtc": None}) is None
     assert rate_line({"rtc": {"frame_rate_hz": 1000.0}}) is None
-    assert "runs at 500 Hz: the most that this machine holds" in rate_line(
-        {"rtc": {"frame_rate_hz": 500.0}}
-    )
+    slower = {"rtc": {"frame_rate_hz": 100.0}}
+    assert "simulated at 100 Hz of 1000: what this machine holds" in rate_line(slower)
+    assert "simulated at 100 Hz of 500: what this machine holds" in rate_line(slower, 500.0)

@@ -33,6 +33,7 @@ from service.errors import ModelError
 from service.estimation import loopcheck
 from service.estimation.lockin import LockIn, LockInPlan
 from service.estimation.loopcheck import LoopCheck
+from service.estimation.passive import PASSIVE_MEMORY_S, Passive, accumulate
 from service.estimation.windows import ClosedLoop
 from service.files.disk_cache import DiskCache
 from service.model.instrument import Instrument, Mirror
@@ -93,8 +94,26 @@ def _cached(folder: Path) -> Notes:
 
 
 def _matrix(folder: Path) -> Notes:
-    model = _model(folder)
-    yield "D of 4300 modes", lambda: model.interaction_matrix(HERE)
+    model, spent = _model(folder), []
+
+    def matrix() -> None:
+        begun_s = time.process_time()
+        model.interaction_matrix(HERE)
+        spent.append(time.process_time() - begun_s)
+
+    yield "D of 4300 modes", matrix
+    flop, gflops = flop_of_matrix(model), _gflops()
+    over = spent[0] / (flop / (1e9 * gflops))
+    yield (
+        f"({flop / 1e12:.2f} TFLOP of products at {gflops:.0f} GFLOPS: {over:.1f} x)",
+        lambda: None,
+    )
+
+
+def flop_of_matrix(model: InteractionModel) -> float:
+    """Return what the products of one D take: the sensor's, tiles times functions, times modes."""
+    one = work_of(model.instrument, model.sensor, model.pupil, n_matrices=1)
+    return one.flop
 
 
 def _linearise(folder: Path) -> Notes:
@@ -194,9 +213,17 @@ def _telemetry(folder: Path) -> Notes:
         for block in blocks:
             state = loopcheck.observe(state, block, law)
 
+    def passive() -> None:
+        state = Passive(n_modes=N_MODES, memory_frames=PASSIVE_MEMORY_S * RATE_HZ)
+        for block in blocks:
+            state = accumulate(state, block)
+        if not state.sums:
+            raise SystemExit("passive sums: nothing was summed")
+
     seconds = n_frames / RATE_HZ
     yield f"lock-in of four lines, {seconds:g} s of telemetry", lock_in
     yield f"control law, {seconds:g} s of telemetry", check
+    yield f"passive sums, {seconds:g} s of telemetry", passive
 
 
 def _refused(folder: Path) -> Notes:

@@ -26,7 +26,7 @@ from service.errors import ModelError
 from service.estimation.estimate import PassiveEstimate
 from service.estimation.estimator import FrameContext, LoopContext
 from service.estimation.frames import FrameBlock, joined_frames
-from service.estimation.passive_sums import MIN_FRAMES_PER_MODE, PassiveSums
+from service.estimation.passive_sums import MIN_FRAMES_PER_MODE, PASSIVE_INTERVAL_S, PassiveSums
 from service.estimation.solver import Columns
 from service.estimation.windows import CHUNK_FRAMES
 from service.model.interaction import Linearisation
@@ -167,8 +167,8 @@ class Passive(PassiveSums):
     """Of the loop; with less than two nothing is summed."""
 
     sums: tuple[NDArray[np.float32], ...] = ()
-    """Of s z^T ``(n_slopes, n_modes)``, metres, of c z^T and z z^T ``(n_modes, n_modes)``, metres²;
-    z are the filtered commands. Empty: of no frame."""
+    """Of s z^T ``(n_slopes, n_instruments)``, metres, of c z^T ``(n_modes, n_instruments)`` and of
+    z z^T, metres²; z are the filtered commands of the instruments. Empty: of no frame."""
 
     samples: tuple[tuple[Array, Array], ...] = ()
     """Filtered slopes ``(n_slopes,)`` and commands ``(n_modes,)`` of single frames."""
@@ -227,15 +227,28 @@ class Passive(PassiveSums):
                 f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "
                 f"{MIN_DELAY_FRAMES} are needed to tell the mirror's response from noise"
             )
-        least = MIN_FRAMES_PER_MODE * self.n_modes
-        if self.memory_frames + CHUNK_FRAMES < least:
-            # they would never be fitted, and cost two cores at the size of the ELT
-            return (
-                f"no passive estimate: {least} frames are needed for {self.n_modes} modes, and its "
-                f"memory of {PASSIVE_MEMORY_S:g} s has {self.memory_frames:.0f}; only a dither "
-                "tells α"
-            )
         return None
+
+    @property
+    def instruments(self) -> NDArray[np.intp]:
+        """Modes whose filtered commands are summed with everything, ``(n_instruments,)``, rising.
+
+        All, unless no memory could tell that many. Then as many as have twice the frames that are
+        needed at every look, evenly spread: thousands would cost two cores and say nothing, and
+        low modes alone know little of a shift.
+        """
+        every = np.arange(self.n_modes)
+        if self.memory_frames + CHUNK_FRAMES >= MIN_FRAMES_PER_MODE * self.n_modes:
+            return every
+        n_look = self.memory_frames * PASSIVE_INTERVAL_S / PASSIVE_MEMORY_S
+        n_kept = max(int(n_look / (2 * MIN_FRAMES_PER_MODE)), 1)
+        return every[np.arange(n_kept) * self.n_modes // n_kept]
+
+    @property
+    @override
+    def n_instruments(self) -> int:
+        """Modes whose commands are the instruments of the regression."""
+        return len(self.instruments)
 
 
 def accumulate(state: Passive, block: FrameBlock) -> Passive:
@@ -276,6 +289,12 @@ def _with_dither_beside(state: Passive, block: FrameBlock) -> FrameBlock:
     if not 0 < len(moved) <= MAX_OTHER_MODES:
         return block
     return replace(block, commands_m=np.hstack([block.commands_m, dither[:, moved]]))
+
+
+def _of(commands: Array, modes: NDArray[np.intp]) -> Array:
+    """Return the last axis of these modes: of the first ones, as usual, without a copy."""
+    n = len(modes)
+    return commands[..., :n] if n and modes[-1] == n - 1 else commands[..., modes]
 
 
 def _follows(block: FrameBlock, tail: FrameBlock) -> bool:
@@ -319,7 +338,7 @@ def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     # those that the filter reaches both ends of
     now = slice(chosen.behind, frames.n_frames - chosen.ahead)
     before = slice(now.start - 1, now.stop - 1)
-    filtered, n = chosen(commands[:, : state.n_modes]), frames.n_frames - _REACH
+    filtered, n = chosen(_of(commands, state.instruments)), frames.n_frames - _REACH
     others = _others(state, frames)
     if len(others):
         moving = np.hstack([commands[now][:, others], commands[before][:, others]])
@@ -347,21 +366,27 @@ class PassiveMatrix:
     """The interaction matrix that ordinary telemetry shows."""
 
     matrix: NDArray[np.float64]
-    """``(n_slopes, n_modes)`` of the controlled modes, slope per metre OPD."""
+    """``(n_slopes, n_instruments)``, slope per metre OPD: the columns of the instruments and, where
+    not all modes are, what moves with them of the others."""
 
     shape: NDArray[np.float64]
-    """``(n_modes, n_modes)`` covariance of the columns' errors, for slopes with noise of 1."""
+    """Covariance of the columns' errors, square, for slopes with noise of 1."""
+
+    carried: NDArray[np.float64]
+    """``(n_others, n_instruments)`` how far modes that are no instruments move with each."""
 
 
 def passive_matrix(state: Passive) -> PassiveMatrix | None:
     """Return the noisy interaction matrix, or None when the telemetry is too young.
 
     ``D = (sum s z^T) (sum c z^T)^-1``, as z is independent of the noise of its frame. The errors of
-    its columns go as ``X^-T (sum z z^T) X^-1`` with ``X = sum c z^T``.
+    its columns go as ``X^-T (sum z z^T) X^-1`` with ``X = sum c z^T``. Where some modes alone are
+    instruments, the columns are ``D_z + D_o (sum o z^T) X^-1``, with o the commands of the others.
     """
-    if not state.sums or state.n_effective < MIN_FRAMES_PER_MODE * state.n_modes:
+    if not state.sums or state.n_effective < MIN_FRAMES_PER_MODE * state.n_instruments:
         return None
     cross, moved, power = (part.astype(np.float64) for part in state.sums)
+    others, moved = np.delete(moved, state.instruments, axis=0), _of(moved.T, state.instruments).T
     own = np.diag(power)
     if not own.any():
         return None
@@ -372,6 +397,7 @@ def passive_matrix(state: Passive) -> PassiveMatrix | None:
     return PassiveMatrix(
         matrix=cross @ inverse,
         shape=inverse.T @ power @ inverse,
+        carried=others @ inverse,
     )
 
 
@@ -386,14 +412,33 @@ def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
     found = passive_matrix(state)
     if found is None:
         return None
-    modes = slice(0, state.n_modes)
+    some, carried = state.instruments, found.carried
     estimate = fit_matrix(
         found,
-        linearisation.matrix[:, modes],
-        linearisation.derivatives[:, :, modes],
+        _seen_by(linearisation.matrix, some, carried),
+        _seen_by(linearisation.derivatives, some, carried),
         linearisation.alpha,
     )
-    return replace(estimate, misfit=estimate.misfit / _slope_variance(state, found.matrix))
+    whole = found.matrix
+    if len(carried):
+        # of one frame the others are not what they are in the mean: the model says what they do
+        gain = float(np.mean(estimate.optical_gain))
+        whole = gain * linearisation.matrix[:, : state.n_modes].astype(np.float64)
+        whole[:, some] = found.matrix - np.delete(whole, some, axis=1) @ carried
+        estimate = replace(estimate, optical_gain=np.full(state.n_modes, gain))
+    return replace(estimate, misfit=estimate.misfit / _slope_variance(state, whole))
+
+
+def _seen_by(matrix: Array, some: NDArray[np.intp], carried: Array) -> Array:
+    """Return columns of instruments ``(..., n_instruments)`` with what moves with them."""
+    own = _of(matrix, some)
+    if not len(carried):
+        return own
+    if matrix.ndim == 3:
+        return np.stack([_seen_by(one, some, carried) for one in matrix])
+    n_modes = len(some) + len(carried)
+    others = np.delete(matrix[:, :n_modes], some, axis=1)
+    return np.asarray(own + others @ carried.astype(matrix.dtype))
 
 
 def fit_matrix(

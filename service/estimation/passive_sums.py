@@ -60,6 +60,11 @@ class PassiveSums(Estimator):
         return None
 
     @property
+    def n_instruments(self) -> int:
+        """Modes whose commands are the instruments of the regression: all, or some of too many."""
+        return self.n_modes
+
+    @property
     def n_waiting(self) -> int:
         """Frames that have come and are not summed yet."""
         return 0
@@ -123,12 +128,12 @@ class PassiveSums(Estimator):
             return f"no passive estimate: {why_open(loop.rtc)}"
         if self.why_unusable is not None:
             return self.why_unusable
-        least = MIN_FRAMES_PER_MODE * self.n_modes
+        least = MIN_FRAMES_PER_MODE * self.n_instruments
         if self.n_effective >= least:
             return None
         return (
             f"no passive estimate yet: {self.n_effective:.0f} frames in runs without gaps, "
-            f"{least} are needed for {self.n_modes} modes"
+            f"{least} are needed for {self.n_instruments} modes"
         )
 
     def _awake(self, now_ns: int) -> Self:

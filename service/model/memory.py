@@ -23,10 +23,13 @@ _OF_STATISTICS = 7.5
 """Squares of the actuators, float64, while KL modes are made of functions known tile by tile."""
 
 
-def work_of(instrument: Instrument, sensor: Sensor, pupil: PupilGrid) -> Work:
+def work_of(
+    instrument: Instrument, sensor: Sensor, pupil: PupilGrid, *, n_matrices: int = _N_MATRICES
+) -> Work:
     """Return what the modes, and then D with its four derivatives, take at their largest.
 
-    All in one thread, the program included; its libraries may keep a little more.
+    All in one thread, the program included; its libraries may keep a little more. ``n_matrices`` is
+    1 where D is wanted alone.
     """
     n_points, n_modes = float(pupil.lit.sum()), instrument.modes.n_modes
     kept, making = _of_modes(instrument)
@@ -34,17 +37,17 @@ def work_of(instrument: Instrument, sensor: Sensor, pupil: PupilGrid) -> Work:
     n_functions = _n_functions(instrument)
     by_tiles = n_points * near + float(n_functions * n_modes)
     product = 2.0 * sensor.n_signals * min(by_tiles, n_points * n_modes)
-    together = 1 if sensor.keeps_gradient else _N_MATRICES
+    together = 1 if sensor.keeps_gradient else n_matrices
     if by_tiles < n_points * n_modes:
         shapes = 4.0 * n_functions * n_modes + 12.0 * together * n_points * near
     else:
         shapes = 20.0 * n_points * n_modes
-    results = _N_MATRICES * 4.0 * sensor.n_signals * n_modes
+    results = n_matrices * 4.0 * sensor.n_signals * n_modes
     response = sensor.work(0)
     linearising = kept + results + max(response.memory_bytes + shapes, results)
     return Work(
         memory_bytes=PROGRAM_BYTES + max(making, linearising),
-        flop=response.flop + _N_MATRICES * product,
+        flop=response.flop + n_matrices * product,
     )
 
 

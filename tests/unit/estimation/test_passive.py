@@ -72,6 +72,31 @@ def test_a_noise_free_sensor_gives_back_its_own_matrix():
     assert np.linalg.norm(found - expected) < 1e-4 * np.linalg.norm(expected)
 
 
+@pytest.fixture
+def every_third(monkeypatch):
+    """Of the controlled modes each third alone is an instrument."""
+    some = property(lambda state: np.arange(0, state.n_modes, 3))
+    monkeypatch.setattr(Passive, "instruments", some)
+
+
+def test_some_modes_tell_the_registration_though_all_of_them_move(every_third):
+    """As the whole does, to 1e-5: what moves with the instruments is in the model, too."""
+    state = fed(quiet_block(2000))
+    assert [part.shape[1] for part in state.sums] == [(N_CONTROLLED + 2) // 3] * 3
+    found = settled(state)
+    np.testing.assert_allclose(found.alpha.vector, SOMEWHERE.vector, atol=1e-5)
+    np.testing.assert_allclose(found.optical_gain, np.full(N_CONTROLLED, 0.6), rtol=1e-3)
+
+
+def test_in_a_closed_loop_some_modes_tell_it_with_a_misfit_of_one(every_third):
+    """Four of its own sigma: the turbulence here has no bias at the filter's frequencies."""
+    near = small_model().linearise(SOMEWHERE)
+    found = fit(fed(night()), near)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(found.alpha.vector - SOMEWHERE.vector) < 4 * sigma)
+    assert found.misfit == pytest.approx(1, abs=0.2)
+
+
 def test_a_noise_free_sensor_gives_its_registration_and_gains():
     """1e-5: single precision and a ridge of 1e-6."""
     found = settled(fed(quiet_block(2000)))

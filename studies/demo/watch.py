@@ -345,9 +345,9 @@ def awaited(state: dict[str, Any] | None) -> str:
 def rate_line(state: dict[str, Any] | None, asked_hz: float = USUAL_RATE_HZ) -> str | None:
     """Return at which rate the loop runs where this machine holds no more; None: as asked for."""
     rtc = None if state is None else state["rtc"]
-    if rtc is None or rtc["frame_rate_hz"] >= asked_hz:
+    if rtc is None or (held_hz := rtc["frame_rate_hz"]) >= asked_hz:
         return None
-    return f"         simulated at {rtc['frame_rate_hz']:g} Hz of {asked_hz:g}: what this machine holds"
+    return f"         simulated at {held_hz:g} Hz of {asked_hz:g}: what this machine holds"
 
 
 def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:

@@ -271,9 +271,48 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
     bring.epilog = "Exit status: 0 written, 2 input that cannot be used."
     folder = words("--output DIR", "folder of both files, made", type=Path, required=True)
     saved = words("file FILE.npz", "np.savez of what docs/integrate/oopao.md lists", type=Path)
+    known = "files, known by what is in them"
+    roles = "a file with arrays of known names, or ROLE=FILE: matrix, valid, modes, positions, "
+    roles += "mode_to_actuator"
+    own = words("files FILE", known, type=_role_and_path, nargs="+")
+    named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
+    unit = words("--unit UNIT", "of the commands, OPD; default: unknown", choices=("m", "um", "nm"))
     sources = bring.add_subparsers(dest="source", required=True)
-    for source, purpose, more in (("oopao", "from objects that were saved", (saved,)),):
+    for source, purpose, more in (
+        ("oopao", "from objects that were saved", (saved,)),
+        ("specula", "from Intmat, PupData or SubapData, IFunc, M2C", (own, *_TOLD)),
+        ("synim", "the same, of SynIM", (own, *_TOLD)),
+        (
+            "cacao",
+            "from modesWFS, modesDM, wfsmask, dmmask",
+            (words("folder CONF", type=Path), *_TOLD),
+        ),
+        ("pyrtc", "from calibrations of pyRTC 2, or bare arrays", (named, unit, *_TOLD)),
+        ("npz", "from NumPy, FITS or HDF5 files", (named, unit, *_TOLD)),
+    ):
         add(sources.add_parser(source, help=purpose), *more, folder)
+
+
+_TOLD = (
+    words("--diameter-m D", "of the pupil", type=float, required=True),
+    words("--sensor KIND", "default %(default)s", choices=tuple(KINDS), default=next(iter(KINDS))),
+    words(
+        "--stop STOP",
+        "what limits the beam, default %(default)s",
+        choices=("telescope", "mirror"),
+        default="telescope",
+    ),
+    words("--obscuration RATIO", "linear, default none", type=float, default=0.0),
+    words("--wavelength-m W", "default: unknown", type=float),
+    words("--modulation RADIUS", "of a pyramid, λ/D; default: unknown", type=float),
+)
+"""What no file says."""
+
+
+def _role_and_path(text: str) -> tuple[str | None, Path]:
+    """Return what a file is for, where that is told, and the file."""
+    role, told, path = text.partition("=")
+    return (role, Path(path)) if told else (None, Path(text))
 
 
 def parse_arms(text: str) -> Arms:

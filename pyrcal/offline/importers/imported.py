@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +17,8 @@ from service.archive.store import write_whole
 from service.config.instrument import load_instrument
 from service.errors import MatrixError, StorageError
 from service.files.container import DATASET
+from service.model.instrument import Instrument
+from service.model.pupil import rtc_valid_subapertures
 
 Array = NDArray[Any]
 Tables = Mapping[str, Mapping[str, Any]]
@@ -75,8 +77,25 @@ class Imported:
             saved.instrument.write_text(self.instrument_text(), encoding="utf-8")
         except OSError as error:
             raise StorageError(f"{place}: cannot be written: {error}") from error
-        load_instrument(saved.instrument)
+        self._check(load_instrument(saved.instrument))
         return saved
+
+    def _check(self, instrument: Instrument) -> None:
+        """Refuse a matrix that is not of the instrument."""
+        matrix = self.arrays.get(DATASET)
+        if matrix is None:
+            return
+        n_slopes = instrument.slopes.order.kind.n_planes * rtc_valid_subapertures(instrument).sum()
+        n_modes = len(self.arrays.get("modes", range(instrument.modes.n_modes)))
+        if matrix.shape != (n_slopes, n_modes):
+            raise MatrixError(
+                f"{DATASET}: found shape {matrix.shape}, expected (n_slopes, n_modes) = "
+                f"({n_slopes}, {n_modes})"
+            )
+
+    def noted(self, *notes: str) -> Imported:
+        """Return it with further notes."""
+        return replace(self, notes=(*self.notes, *notes))
 
     def instrument_text(self) -> str:
         """Return the instrument file, its notes first."""

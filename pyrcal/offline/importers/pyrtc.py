@@ -1,0 +1,42 @@
+"""From pyRTC's calibration files: ``.npz`` with a record since 2.0, bare ``.npy`` before.
+
+A bare array says nothing of itself: what it is for is told. Even subapertures of a Shack-Hartmann
+had their reference half a pixel off before 2.0; a matrix is a difference, which that leaves alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+
+from pyrcal.offline.importers.imported import Array
+from service.errors import MatrixError
+
+RECORD, DATA, FORMAT = "pyrtc_calibration", "data", 2
+KINDS = {"interaction_matrix": "matrix", "valid_sub_aps": "valid"}
+"""What pyRTC's record calls them, and their roles."""
+
+
+def calibration_of(arrays: Mapping[str, Array], where: str) -> tuple[str, Array]:
+    """Return what a calibration file of pyRTC 2 is for, and its array.
+
+    Raises
+    ------
+    MatrixError
+        If it has no record, or one that is newer or of another calibration.
+    """
+    try:
+        record = json.loads(str(np.asarray(arrays[RECORD])[()]))
+        kind, version, values = record["kind"], int(record["format"]), arrays[DATA]
+    except (KeyError, TypeError, ValueError) as error:
+        raise MatrixError(
+            f"{where}: found no record of pyRTC 2 ({RECORD}), expected one, or ROLE=FILE"
+        ) from error
+    if version > FORMAT or kind not in KINDS:
+        raise MatrixError(
+            f"{where}: found {kind} of format {version}, expected {' or '.join(KINDS)} of format "
+            f"{FORMAT}"
+        )
+    return KINDS[kind], values

@@ -1,0 +1,137 @@
+"""From SPECULA's own FITS files, and SynIM's, which are SPECULA's: known by what is in them.
+
+Nothing of either is imported. How they list things was read from SPECULA 1.1.0 and SynIM 2.0.0:
+
+- ``Intmat`` is ``[slopes, modes]``, once ``[modes, slopes]``: told by the number of subapertures.
+  Slopes are all x, then all y, unless the file says ``INTRLVD``.
+- Subapertures stand in the order of ``PupData.ind_pup`` or ``SubapData.idxs``, which need not be
+  that of the mask's rows.
+- Commands are nanometres, and ``sign = -1`` of its mirrors is one sign of all slopes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.importers.files import Told, from_arrays
+from pyrcal.offline.importers.imported import Array, Imported, oriented
+from service.errors import MatrixError
+from service.files.container import Container, opened
+
+UNIT = "nm"
+"""Of SPECULA's commands."""
+
+
+class Subapertures(NamedTuple):
+    """Where the subapertures lie, as they are listed."""
+
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """``(n, n)``: the smallest square that holds them, in its middle."""
+        n = int(max(np.ptp(self.rows), np.ptp(self.columns))) + 1
+        mask = np.zeros((n, n), dtype=bool)
+        row, column = ((n - 1 - np.ptp(each)) // 2 for each in (self.rows, self.columns))
+        mask[self.rows - self.rows.min() + row, self.columns - self.columns.min() + column] = True
+        return mask
+
+    @property
+    def by_rows(self) -> NDArray[np.intp]:
+        """Order in which they stand row by row."""
+        return np.lexsort((self.columns, self.rows))
+
+
+def from_specula(paths: Sequence[Path], told: Told, source: str = "SPECULA") -> Imported:
+    """Return what SPECULA saved: an ``Intmat``, its ``PupData`` or ``SubapData``, an ``IFunc``.
+
+    An ``M2C`` beside them makes modes of the influence functions.
+
+    Raises
+    ------
+    MatrixError
+        If one of them is missing, twice there, or something else.
+    """
+    found: dict[str, Array] = {}
+    places: Subapertures | None = None
+    interleaved = False
+    for path in paths:
+        with opened(path) as container:
+            if "fsizex" in container.facts or "np_sub" in container.facts:
+                places = _subapertures(container)
+                continue
+            role, values = _role_of(container)
+            if role in found:
+                raise MatrixError(f"{path}: found a second {role}, expected one")
+            found[role] = values
+            interleaved |= bool(container.facts.get("intrlvd", False))
+    if places is None or "matrix" not in found:
+        missing = "PupData or SubapData" if places is None else "Intmat"
+        raise MatrixError(f"{source}: found no {missing}, expected one among the files")
+    matrix, notes = oriented(
+        found["matrix"], 2 * len(places.rows), None, "Intmat", "(n_slopes, n_modes)"
+    )
+    components = matrix.reshape(-1, 2, matrix.shape[1]) if interleaved else None
+    both = (
+        np.moveaxis(components, 1, 0) if components is not None else np.stack(np.split(matrix, 2))
+    )
+    found["matrix"] = both[:, places.by_rows].reshape(matrix.shape)
+    found["valid"] = places.mask
+    imported = from_arrays(source, found, told)
+    moved = not np.array_equal(places.by_rows, np.arange(len(places.rows)))
+    ordered = ("subapertures were not listed row by row: sorted",) if moved else ()
+    return imported.noted(*notes, *ordered)
+
+
+def _role_of(container: Container) -> tuple[str, Array]:
+    """Return what the arrays of a file are for, and them as numbers."""
+    matrix, functions = container.find("INTMAT"), container.find("INFLUENCE_FUNCTION")
+    if matrix is not None:
+        return "matrix", matrix.numbers()
+    if functions is not None:
+        return "modes", _cube(container, functions.numbers())
+    arrays = [stored for stored in container.arrays.values() if len(stored.shape) == 2]
+    if len(arrays) != 1:
+        raise MatrixError(
+            f"{container.path}: found {container.listing()}, expected SPECULA's Intmat, PupData, "
+            "SubapData, IFunc or M2C"
+        )
+    return "mode_to_actuator", arrays[0].numbers()
+
+
+def _cube(container: Container, functions: Array) -> Array:
+    """Return an ``IFunc`` as maps, unknown outside its mask: it holds the points inside alone."""
+    stored = container.find("MASK_INF_FUNC")
+    if stored is None:
+        raise MatrixError(f"{container.path}: found no MASK_INF_FUNC beside INFLUENCE_FUNCTION")
+    inside = stored.numbers() > 0.0
+    values, _ = oriented(
+        functions, int(inside.sum()), None, "INFLUENCE_FUNCTION", "(n_points, n_functions)"
+    )
+    cube = np.full((values.shape[1], *inside.shape), np.nan, dtype=np.float32)
+    cube[:, inside] = values.T
+    return cube
+
+
+def _subapertures(container: Container) -> Subapertures:
+    """Return where a ``PupData``'s first image or a ``SubapData``'s lenslets are."""
+    first = container.find("1")
+    if first is None:
+        raise MatrixError(f"{container.path}: found no indices of pixels, expected them first")
+    indices = first.numbers().astype(np.intp)
+    if "np_sub" in container.facts:  # stored as (pixels, subapertures); its map says which lenslet
+        shown = container.find("2")
+        listed = indices.T if shown is None else shown.numbers().astype(np.intp)
+        n = int(container.facts["nx"])
+        lenslet = np.asarray(listed).reshape(-1)
+        return Subapertures(lenslet // n, lenslet % n)
+    image = indices[:, 0] if indices.shape[1] == 4 else indices[0]
+    image = image[image >= 0]
+    n_columns = int(container.facts["fsizey"])
+    return Subapertures(image // n_columns, image % n_columns)

@@ -1,0 +1,250 @@
+"""Files of SPECULA, pyRTC, cacao and arrays by name become an instrument and its matrix.
+
+``tests/data/imported`` holds what SPECULA 1.1.0 saved of a pyramid of 14 subapertures whose images
+it has moved by 0.25 of one, 20 Zernike modes, and what pyRTC 2.1 saved of random numbers.
+"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+import pyrcal
+import pyrcal.offline.recorded
+from pyrcal.__main__ import main
+from pyrcal.offline.importers.cacao import from_cacao
+from pyrcal.offline.importers.files import Told, by_role, cube_of, from_arrays, maps_of, mask_of
+from pyrcal.offline.importers.saved import read_npz
+from pyrcal.offline.importers.specula import from_specula
+from service.errors import MatrixError
+from tests.unit.test_house import ROOT
+
+DATA = ROOT / "tests" / "data" / "imported"
+SPECULA = [DATA / f"specula-{name}.fits" for name in ("im", "pup", "ifunc")]
+TOLD = Told(diameter_m=2.0, sensor="pyramid", stop="mirror", obscuration_ratio=0.2, unit="nm")
+
+N = 6
+_ROWS, _COLUMNS = np.mgrid[:N, :N] - (N - 1) / 2
+VALID = np.hypot(_COLUMNS, _ROWS) <= N / 2
+MATRIX = np.random.default_rng(1).normal(size=(2 * VALID.sum(), 5))
+CUBE = np.random.default_rng(2).normal(size=(5, 12, 12)).astype(np.float32)
+MAPS = np.zeros((2, N, N, 5))
+MAPS[:, VALID] = MATRIX.reshape(2, -1, 5)
+
+
+def arrays(**other):
+    return {"matrix": MATRIX, "valid": VALID, "modes": CUBE, **other}
+
+
+def test_what_specula_saved_is_imported_and_fitted_with_an_unknown_sensor(tmp_path, capsys):
+    folder = tmp_path / "bench"
+    told = ["--diameter-m", "2", "--stop", "mirror", "--obscuration", "0.2"]
+    words = ["import", "specula", *map(str, SPECULA), *told, "--output", str(folder)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "note: wavelength_m is unknown" in said
+    assert "note: modulation_lambda_over_d is unknown" in said
+    instrument = pyrcal.load_instrument(folder / "instrument.toml")
+    fit = pyrcal.fit_file(instrument, folder / "matrix.h5", pyrcal.FitOptions()).fit
+    assert fit.accepted, fit.verdict
+    assert np.all(np.abs(fit.alpha.vector - [0.25, 0.0, 0.0, 1.0]) < 3 * fit.sigma)
+    found = {one.key: one.found for one in fit.optics}
+    assert found["modulation_lambda_over_d"] == pytest.approx(3.0, abs=0.03)
+    assert any("wavelength_m = 7.5e-07 was found" in remark for remark in fit.remarks)
+
+
+def changed(path, to, change):
+    """Write a file of SPECULA's with its arrays changed."""
+    with fits.open(path) as file:
+        change(file)
+        file.writeto(to, overwrite=True)
+    return to
+
+
+def test_an_old_intmat_and_one_that_is_interleaved_are_the_same_matrix(tmp_path):
+    as_it_is = from_specula(SPECULA, TOLD)
+    matrix = as_it_is.arrays["interaction_matrix"]
+
+    def old(file):
+        file[1].data = file[1].data.T.copy()
+
+    def interleaved(file):
+        both = np.split(file[1].data, 2)
+        file[1].data = np.stack(both, axis=1).reshape(file[1].data.shape)
+        file[0].header["INTRLVD"] = True
+
+    for change in (old, interleaved):
+        im = changed(SPECULA[0], tmp_path / "im.fits", change)
+        found = from_specula([im, *SPECULA[1:]], TOLD)
+        np.testing.assert_allclose(found.arrays["interaction_matrix"], matrix)
+    assert (
+        "the other way round"
+        in from_specula([changed(SPECULA[0], tmp_path / "im.fits", old), *SPECULA[1:]], TOLD).notes[
+            -1
+        ]
+    )
+
+
+def test_subapertures_in_another_order_are_sorted(tmp_path):
+    as_it_is = from_specula(SPECULA, TOLD)
+    order = np.random.default_rng(3).permutation(len(fits.getdata(SPECULA[1], 1)))
+
+    def shuffled(file):
+        file[1].data = file[1].data[order]
+
+    def matrix_too(file):
+        both = np.stack(np.split(file[1].data, 2))
+        file[1].data = both[:, order].reshape(file[1].data.shape)
+
+    pup = changed(SPECULA[1], tmp_path / "pup.fits", shuffled)
+    im = changed(SPECULA[0], tmp_path / "im.fits", matrix_too)
+    found = from_specula([im, pup, SPECULA[2]], TOLD)
+    np.testing.assert_array_equal(
+        found.arrays["interaction_matrix"], as_it_is.arrays["interaction_matrix"]
+    )
+    np.testing.assert_array_equal(
+        found.arrays["valid_subapertures"], as_it_is.arrays["valid_subapertures"]
+    )
+    assert any("row by row" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("files", "says"),
+    [
+        (SPECULA[:1] + SPECULA[2:], "found no PupData or SubapData"),
+        (SPECULA[1:], "found no Intmat"),
+        (SPECULA[:2], "neither modes nor positions"),
+        ([*SPECULA, SPECULA[0]], "found a second matrix"),
+    ],
+)
+def test_a_file_that_is_missing_or_twice_there_is_named(files, says):
+    with pytest.raises(MatrixError, match=says):
+        from_specula(files, TOLD)
+
+
+def test_calibrations_of_pyrtc_are_known_by_their_record(tmp_path):
+    np.save(tmp_path / "modes.npy", CUBE)
+    calibrations = [str(DATA / f"pyrtc-{name}.npz") for name in ("im", "valid")]
+    words = ["import", "pyrtc", *calibrations, f"modes={tmp_path / 'modes.npy'}"]
+    folder = tmp_path / "bench"
+    assert main([*words, "--diameter-m", "2", "--output", str(folder)]) == 0
+    text = (folder / "instrument.toml").read_text("utf-8")
+    assert 'stroke = "unknown"' in text
+    assert "listed twice, for x and y" in text
+    recorded = read_npz(DATA / "pyrtc-im.npz")["data"]
+    with pyrcal.offline.recorded.opened(folder / "matrix.h5") as file:
+        np.testing.assert_array_equal(file.find("interaction_matrix").read(), recorded)
+
+
+def test_a_bare_array_has_no_record_and_is_refused_without_its_role(tmp_path, capsys):
+    np.save(tmp_path / "im.npy", MATRIX)
+    words = ["import", "pyrtc", str(tmp_path / "im.npy"), "--diameter-m", "2"]
+    assert main([*words, "--output", str(tmp_path / "bench")]) == 2
+    assert "no record of pyRTC 2" in capsys.readouterr().err
+
+
+def test_arrays_are_known_by_their_names(tmp_path):
+    np.savez(tmp_path / "bench.npz", D=MATRIX, valid=VALID, modes=CUBE)
+    folder = tmp_path / "bench"
+    words = ["import", "npz", str(tmp_path / "bench.npz"), "--diameter-m", "2", "--unit", "um"]
+    assert main([*words, "--output", str(folder)]) == 0
+    with pyrcal.offline.recorded.opened(folder / "matrix.h5") as file:
+        np.testing.assert_allclose(file.find("interaction_matrix").read(), MATRIX * 1e6)
+    with pytest.raises(MatrixError, match="found im and D, expected one matrix"):
+        by_role({"D": MATRIX, "im": MATRIX}, "it")
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        MATRIX.T,
+        MAPS,
+        np.moveaxis(MAPS, -1, 0),
+        np.moveaxis(np.concatenate(MAPS, axis=1), -1, 0),
+        np.concatenate(MAPS, axis=0),
+    ],
+)
+@pytest.mark.parametrize("masked", [True, False])
+def test_a_matrix_is_the_same_in_every_layout(listed, masked):
+    given = arrays(matrix=listed)
+    if listed.ndim > 2 and not masked:
+        del given["valid"]
+    found = from_arrays("it", given, TOLD)
+    np.testing.assert_allclose(found.arrays["interaction_matrix"], MATRIX * 1e9)
+    np.testing.assert_array_equal(found.arrays["valid_subapertures"], VALID)
+    assert found.notes
+
+
+def test_a_cube_with_its_modes_last_is_turned():
+    notes = []
+    np.testing.assert_array_equal(cube_of(np.moveaxis(CUBE, 0, -1), notes), CUBE)
+    assert notes
+
+
+def test_fewer_columns_than_modes_are_the_first_ones(tmp_path):
+    found = from_arrays("it", arrays(matrix=MATRIX[:, :3]), TOLD)
+    assert found.arrays["modes"].tolist() == [0, 1, 2]
+    found.save(tmp_path / "bench")
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ({"matrix": MATRIX[1:]}, "found shape (63, 5)"),
+        ({"matrix": np.zeros((3, 4, 5))}, "it fits none of them"),
+        ({"matrix": np.zeros((2, 5, 6, 2))}, "expected maps of slopes"),
+        ({"valid": np.ones((5, 6))}, "expected a mask (n, n) of 0 and 1"),
+        ({"valid": np.zeros((6, 6))}, "found no valid subaperture"),
+        ({"valid": 0.5 * VALID}, "expected a mask (n, n) of 0 and 1"),
+        ({"modes": np.zeros((12, 12, 12))}, "n_modes other than n"),
+        ({"modes": np.zeros((3, 4, 5))}, "n_modes other than n"),
+        ({"modes": np.zeros((12, 12))}, "expected numbers (n_modes, n, n)"),
+        ({"mode_to_actuator": np.zeros((7, 5))}, "found 7 modes of 5 actuators"),
+    ],
+)
+def test_what_fits_no_layout_or_several_is_refused(other, says):
+    with pytest.raises(MatrixError, match=re.escape(says)):
+        from_arrays("it", arrays(**other), TOLD)
+
+
+def test_maps_that_fit_two_layouts_are_refused():
+    with pytest.raises(MatrixError, match="it fits"):
+        maps_of(np.zeros((6, 12, 6)), None, [])
+
+
+def test_a_mask_that_differs_for_x_and_y_is_refused():
+    with pytest.raises(MatrixError, match="expected a mask"):
+        mask_of(np.hstack([VALID, np.ones_like(VALID)]), [])
+
+
+def test_a_matrix_of_another_instrument_is_not_saved(tmp_path):
+    found = from_arrays("it", arrays(), TOLD)
+    wrong = replace(found, arrays={**found.arrays, "interaction_matrix": MATRIX[2:]})
+    with pytest.raises(MatrixError, match=r"found shape \(62, 5\), expected \(n_slopes"):
+        wrong.save(tmp_path / "bench")
+
+
+def test_a_loop_of_cacao_has_modes_of_actuators_without_a_unit(tmp_path):
+    actuators = np.ones((7, 7), np.float32)
+    actuators[0, 0] = 0.0
+    modes = np.random.default_rng(4).normal(size=(5, 7, 7)).astype(np.float32)
+    maps = np.moveaxis(np.concatenate(MAPS, axis=1), -1, 0).astype(np.float32)
+    for name, values in (
+        ("CMmodesWFS", maps),
+        ("CMmodesDM", modes),
+        ("wfsmask", np.hstack([VALID, VALID]).astype(np.float32)),
+        ("dmmask", actuators[None]),
+    ):
+        fits.writeto(tmp_path / f"aol1_{name}.fits", values)
+    found = from_cacao(tmp_path, replace(TOLD, unit=None))
+    assert found.tables["mirror"]["stroke"] == "unknown"
+    assert found.arrays["positions"].shape == (48, 2)
+    np.testing.assert_allclose(found.arrays["positions"][0], [-2 / 3, -1.0])
+    np.testing.assert_array_equal(found.arrays["mode_to_actuator"][0], modes[:, 0, 1])
+    np.testing.assert_allclose(found.arrays["interaction_matrix"], MATRIX, rtol=1e-6)
+    found.save(tmp_path / "bench")
+    (tmp_path / "aol1_dmmask.fits").unlink()
+    with pytest.raises(MatrixError, match=r"found 0 files \*dmmask\*\.fits"):
+        from_cacao(tmp_path, TOLD)

@@ -280,20 +280,20 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
     sources = bring.add_subparsers(dest="source", required=True)
     for source, purpose, more in (
         ("oopao", "from objects that were saved", (saved,)),
-        ("specula", "from Intmat, PupData or SubapData, IFunc, M2C", (own, *_TOLD)),
-        ("synim", "the same, of SynIM", (own, *_TOLD)),
+        ("specula", "from Intmat, PupData or SubapData, IFunc, M2C", (own, *_REPORTED)),
+        ("synim", "the same, of SynIM", (own, *_REPORTED)),
         (
             "cacao",
             "from modesWFS, modesDM, wfsmask, dmmask",
-            (words("folder CONF", type=Path), *_TOLD),
+            (words("folder CONF", type=Path), *_REPORTED),
         ),
-        ("pyrtc", "from calibrations of pyRTC 2, or bare arrays", (named, unit, *_TOLD)),
-        ("npz", "from NumPy, FITS or HDF5 files", (named, unit, *_TOLD)),
+        ("pyrtc", "from calibrations of pyRTC 2, or bare arrays", (named, unit, *_REPORTED)),
+        ("npz", "from NumPy, FITS or HDF5 files", (named, unit, *_REPORTED)),
     ):
         add(sources.add_parser(source, help=purpose), *more, folder)
 
 
-_TOLD = (
+_REPORTED = (
     words("--diameter-m D", "of the pupil", type=float, required=True),
     words("--sensor KIND", "default %(default)s", choices=tuple(KINDS), default=next(iter(KINDS))),
     words(
@@ -310,9 +310,9 @@ _TOLD = (
 
 
 def _role_and_path(text: str) -> tuple[str | None, Path]:
-    """Return what a file is for, where that is told, and the file."""
-    role, told, path = text.partition("=")
-    return (role, Path(path)) if told else (None, Path(text))
+    """Return what a file is for, where that is said, and the file."""
+    role, sign, path = text.partition("=")
+    return (role, Path(path)) if sign else (None, Path(text))
 
 
 def parse_arms(text: str) -> Arms:

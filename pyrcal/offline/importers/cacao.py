@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pyrcal.offline.importers.files import Told, from_arrays
+from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
 from service.errors import MatrixError
 from service.files.container import opened
@@ -18,7 +18,7 @@ NAMES = {"modesWFS": "matrix", "modesDM": "modes", "wfsmask": "valid", "dmmask":
 """What the names of its files contain, and what those are for."""
 
 
-def from_cacao(folder: Path, told: Told) -> Imported:
+def from_cacao(folder: Path, reported: Reported) -> Imported:
     """Return the modes and the response of a folder ``conf`` of cacao's.
 
     Raises
@@ -37,11 +37,11 @@ def from_cacao(folder: Path, told: Told) -> Imported:
         )
     row, column = np.nonzero(actuators)
     across = max(actuators.shape)
-    pitch_m = told.diameter_m / (across - 1)
+    pitch_m = reported.diameter_m / (across - 1)
     middle = (np.array(actuators.shape[::-1]) - 1) / 2
     found["positions"] = (np.column_stack([column, row]) - middle) * pitch_m
     found["mode_to_actuator"] = modes[:, actuators].T
-    return from_arrays(f"cacao, {folder}", found, told).noted(
+    return from_arrays(f"cacao, {folder}", found, reported).noted(
         f"the pitch of the actuators is unknown: {pitch_m:.4g} m, so that {across} of them span "
         "diameter_m; the magnification that a fit finds tells"
     )

@@ -37,7 +37,7 @@ ROLES = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
+class Reported:
     """What no array says."""
 
     diameter_m: float
@@ -62,7 +62,7 @@ class Told:
     """Of the commands, OPD; None: unknown, so that only shapes are compared."""
 
 
-def from_arrays(source: str, arrays: Mapping[str, Array], told: Told) -> Imported:
+def from_arrays(source: str, arrays: Mapping[str, Array], reported: Reported) -> Imported:
     """Return an instrument and its matrix from arrays by role.
 
     Raises
@@ -85,34 +85,34 @@ def from_arrays(source: str, arrays: Mapping[str, Array], told: Told) -> Importe
         found = maps[:, valid].reshape(-1, maps.shape[-1])
     if valid is None:
         raise MatrixError(f"{source}: found no valid subapertures, expected a mask (n, n)")
-    mirror, kept, n_modes = _mirror(source, arrays, told, notes)
+    mirror, kept, n_modes = _mirror(source, arrays, reported, notes)
     matrix, turned = matrix_of(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
     notes += turned
     if n_modes > matrix.shape[1]:
         notes.append(f"the matrix is of the first {matrix.shape[1]} of {n_modes} modes")
         kept["modes"] = np.arange(matrix.shape[1])
-    if told.unit is None:
+    if reported.unit is None:
         mirror["stroke"] = UNKNOWN
         notes.append("the unit of the commands is unknown: only shapes are compared")
     else:
-        matrix = matrix / UNITS_M[told.unit]
+        matrix = matrix / UNITS_M[reported.unit]
     sensor: dict[str, Any] = {
-        "kind": told.sensor,
+        "kind": reported.sensor,
         "n_subapertures": len(valid),
-        "wavelength_m": told.wavelength_m or UNKNOWN,
+        "wavelength_m": reported.wavelength_m or UNKNOWN,
         "valid_subapertures": Dataset("valid_subapertures"),
     }
-    if told.sensor == "pyramid":
-        modulation = told.modulation_lambda_over_d
+    if reported.sensor == "pyramid":
+        modulation = reported.modulation_lambda_over_d
         sensor["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
     return Imported(
         source=source,
         tables={
             "instrument": {
                 "name": "bench",
-                "diameter_m": told.diameter_m,
-                "obscuration_ratio": told.obscuration_ratio,
-                "stop": told.stop,
+                "diameter_m": reported.diameter_m,
+                "obscuration_ratio": reported.obscuration_ratio,
+                "stop": reported.stop,
             },
             "wfs": sensor,
             "mirror": mirror,
@@ -137,7 +137,7 @@ def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
 
 
 def _mirror(
-    source: str, arrays: Mapping[str, Array], told: Told, notes: list[str]
+    source: str, arrays: Mapping[str, Array], reported: Reported, notes: list[str]
 ) -> tuple[dict[str, Any], dict[str, Array], int]:
     """Return ``[mirror]``, its arrays, and how many modes it has."""
     strokes = arrays.get("mode_to_actuator")
@@ -161,7 +161,7 @@ def _mirror(
             f"{source}: found neither modes nor positions of actuators, expected one of the two"
         )
     cube = cube_of(arrays["modes"], notes)
-    pitch = {"modes_pitch_m": told.diameter_m / cube.shape[1]}
+    pitch = {"modes_pitch_m": reported.diameter_m / cube.shape[1]}
     if strokes is None:
         return {"modes": Dataset("mode_shapes"), **pitch}, {"mode_shapes": cube}, len(cube)
     n_modes, table, kept = _of_actuators(len(cube), strokes, notes)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pyrcal.offline.importers import oopao
 from pyrcal.offline.importers.cacao import from_cacao
-from pyrcal.offline.importers.files import Told, by_role, from_arrays
+from pyrcal.offline.importers.files import Reported, by_role, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
 from pyrcal.offline.importers.pyrtc import RECORD, calibration_of
 from pyrcal.offline.importers.saved import read_npz
@@ -23,12 +23,12 @@ def _oopao(options: argparse.Namespace) -> Imported:
 
 
 def _specula(options: argparse.Namespace) -> Imported:
-    told, source = _told(options), options.source
-    return from_specula([path for _, path in options.files], told, source)
+    reported, source = _reported(options), options.source
+    return from_specula([path for _, path in options.files], reported, source)
 
 
 def _arrays(options: argparse.Namespace) -> Imported:
-    """Import arrays by their names, or by the roles that are told."""
+    """Import arrays by their names, or by the roles that are reported."""
     found: dict[str, Array] = {}
     for role, path in options.files:
         arrays = _read(path)
@@ -42,7 +42,7 @@ def _arrays(options: argparse.Namespace) -> Imported:
         if twice:
             raise MatrixError(f"{path}: found a second {min(twice)}, expected one")
         found |= arrays
-    return from_arrays(" ".join(str(path) for _, path in options.files), found, _told(options))
+    return from_arrays(" ".join(str(path) for _, path in options.files), found, _reported(options))
 
 
 def _read(path: Path) -> dict[str, Array]:
@@ -62,11 +62,11 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
 
 
 def _cacao(options: argparse.Namespace) -> Imported:
-    return from_cacao(options.folder, _told(options))
+    return from_cacao(options.folder, _reported(options))
 
 
-def _told(options: argparse.Namespace) -> Told:
-    return Told(
+def _reported(options: argparse.Namespace) -> Reported:
+    return Reported(
         diameter_m=options.diameter_m,
         sensor=options.sensor,
         stop=options.stop,

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.importers.files import Told, from_arrays
+from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported, oriented
 from service.errors import MatrixError
 from service.files.container import Container, opened
@@ -48,7 +48,7 @@ class Subapertures(NamedTuple):
         return np.lexsort((self.columns, self.rows))
 
 
-def from_specula(paths: Sequence[Path], told: Told, source: str = "SPECULA") -> Imported:
+def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECULA") -> Imported:
     """Return what SPECULA saved: an ``Intmat``, its ``PupData`` or ``SubapData``, an ``IFunc``.
 
     An ``M2C`` beside them makes modes of the influence functions.
@@ -83,7 +83,7 @@ def from_specula(paths: Sequence[Path], told: Told, source: str = "SPECULA") -> 
     )
     found["matrix"] = both[:, places.by_rows].reshape(matrix.shape)
     found["valid"] = places.mask
-    imported = from_arrays(source, found, told)
+    imported = from_arrays(source, found, reported)
     moved = not np.array_equal(places.by_rows, np.arange(len(places.rows)))
     ordered = ("subapertures were not listed row by row: sorted",) if moved else ()
     return imported.noted(*notes, *ordered)

@@ -15,7 +15,14 @@ import pyrcal
 import pyrcal.offline.recorded
 from pyrcal.__main__ import main
 from pyrcal.offline.importers.cacao import from_cacao
-from pyrcal.offline.importers.files import Told, by_role, cube_of, from_arrays, maps_of, mask_of
+from pyrcal.offline.importers.files import (
+    Reported,
+    by_role,
+    cube_of,
+    from_arrays,
+    maps_of,
+    mask_of,
+)
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.importers.specula import from_specula
 from service.errors import MatrixError
@@ -23,7 +30,9 @@ from tests.unit.test_house import ROOT
 
 DATA = ROOT / "tests" / "data" / "imported"
 SPECULA = [DATA / f"specula-{name}.fits" for name in ("im", "pup", "ifunc")]
-TOLD = Told(diameter_m=2.0, sensor="pyramid", stop="mirror", obscuration_ratio=0.2, unit="nm")
+REPORTED = Reported(
+    diameter_m=2.0, sensor="pyramid", stop="mirror", obscuration_ratio=0.2, unit="nm"
+)
 
 N = 6
 _ROWS, _COLUMNS = np.mgrid[:N, :N] - (N - 1) / 2
@@ -40,8 +49,8 @@ def arrays(**other):
 
 def test_what_specula_saved_is_imported_and_fitted_with_an_unknown_sensor(tmp_path, capsys):
     folder = tmp_path / "bench"
-    told = ["--diameter-m", "2", "--stop", "mirror", "--obscuration", "0.2"]
-    words = ["import", "specula", *map(str, SPECULA), *told, "--output", str(folder)]
+    reported = ["--diameter-m", "2", "--stop", "mirror", "--obscuration", "0.2"]
+    words = ["import", "specula", *map(str, SPECULA), *reported, "--output", str(folder)]
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "note: wavelength_m is unknown" in said
@@ -64,7 +73,7 @@ def changed(path, to, change):
 
 
 def test_an_old_intmat_and_one_that_is_interleaved_are_the_same_matrix(tmp_path):
-    as_it_is = from_specula(SPECULA, TOLD)
+    as_it_is = from_specula(SPECULA, REPORTED)
     matrix = as_it_is.arrays["interaction_matrix"]
 
     def old(file):
@@ -77,18 +86,18 @@ def test_an_old_intmat_and_one_that_is_interleaved_are_the_same_matrix(tmp_path)
 
     for change in (old, interleaved):
         im = changed(SPECULA[0], tmp_path / "im.fits", change)
-        found = from_specula([im, *SPECULA[1:]], TOLD)
+        found = from_specula([im, *SPECULA[1:]], REPORTED)
         np.testing.assert_allclose(found.arrays["interaction_matrix"], matrix)
     assert (
         "the other way round"
-        in from_specula([changed(SPECULA[0], tmp_path / "im.fits", old), *SPECULA[1:]], TOLD).notes[
-            -1
-        ]
+        in from_specula(
+            [changed(SPECULA[0], tmp_path / "im.fits", old), *SPECULA[1:]], REPORTED
+        ).notes[-1]
     )
 
 
 def test_subapertures_in_another_order_are_sorted(tmp_path):
-    as_it_is = from_specula(SPECULA, TOLD)
+    as_it_is = from_specula(SPECULA, REPORTED)
     order = np.random.default_rng(3).permutation(len(fits.getdata(SPECULA[1], 1)))
 
     def shuffled(file):
@@ -100,7 +109,7 @@ def test_subapertures_in_another_order_are_sorted(tmp_path):
 
     pup = changed(SPECULA[1], tmp_path / "pup.fits", shuffled)
     im = changed(SPECULA[0], tmp_path / "im.fits", matrix_too)
-    found = from_specula([im, pup, SPECULA[2]], TOLD)
+    found = from_specula([im, pup, SPECULA[2]], REPORTED)
     np.testing.assert_array_equal(
         found.arrays["interaction_matrix"], as_it_is.arrays["interaction_matrix"]
     )
@@ -121,7 +130,7 @@ def test_subapertures_in_another_order_are_sorted(tmp_path):
 )
 def test_a_file_that_is_missing_or_twice_there_is_named(files, says):
     with pytest.raises(MatrixError, match=says):
-        from_specula(files, TOLD)
+        from_specula(files, REPORTED)
 
 
 def test_calibrations_of_pyrtc_are_known_by_their_record(tmp_path):
@@ -171,7 +180,7 @@ def test_a_matrix_is_the_same_in_every_layout(listed, masked):
     given = arrays(matrix=listed)
     if listed.ndim > 2 and not masked:
         del given["valid"]
-    found = from_arrays("it", given, TOLD)
+    found = from_arrays("it", given, REPORTED)
     np.testing.assert_allclose(found.arrays["interaction_matrix"], MATRIX * 1e9)
     np.testing.assert_array_equal(found.arrays["valid_subapertures"], VALID)
     assert found.notes
@@ -184,7 +193,7 @@ def test_a_cube_with_its_modes_last_is_turned():
 
 
 def test_fewer_columns_than_modes_are_the_first_ones(tmp_path):
-    found = from_arrays("it", arrays(matrix=MATRIX[:, :3]), TOLD)
+    found = from_arrays("it", arrays(matrix=MATRIX[:, :3]), REPORTED)
     assert found.arrays["modes"].tolist() == [0, 1, 2]
     found.save(tmp_path / "bench")
 
@@ -206,7 +215,7 @@ def test_fewer_columns_than_modes_are_the_first_ones(tmp_path):
 )
 def test_what_fits_no_layout_or_several_is_refused(other, says):
     with pytest.raises(MatrixError, match=re.escape(says)):
-        from_arrays("it", arrays(**other), TOLD)
+        from_arrays("it", arrays(**other), REPORTED)
 
 
 def test_maps_that_fit_two_layouts_are_refused():
@@ -220,7 +229,7 @@ def test_a_mask_that_differs_for_x_and_y_is_refused():
 
 
 def test_a_matrix_of_another_instrument_is_not_saved(tmp_path):
-    found = from_arrays("it", arrays(), TOLD)
+    found = from_arrays("it", arrays(), REPORTED)
     wrong = replace(found, arrays={**found.arrays, "interaction_matrix": MATRIX[2:]})
     with pytest.raises(MatrixError, match=r"found shape \(62, 5\), expected \(n_slopes"):
         wrong.save(tmp_path / "bench")
@@ -238,7 +247,7 @@ def test_a_loop_of_cacao_has_modes_of_actuators_without_a_unit(tmp_path):
         ("dmmask", actuators[None]),
     ):
         fits.writeto(tmp_path / f"aol1_{name}.fits", values)
-    found = from_cacao(tmp_path, replace(TOLD, unit=None))
+    found = from_cacao(tmp_path, replace(REPORTED, unit=None))
     assert found.tables["mirror"]["stroke"] == "unknown"
     assert found.arrays["positions"].shape == (48, 2)
     np.testing.assert_allclose(found.arrays["positions"][0], [-2 / 3, -1.0])
@@ -247,4 +256,4 @@ def test_a_loop_of_cacao_has_modes_of_actuators_without_a_unit(tmp_path):
     found.save(tmp_path / "bench")
     (tmp_path / "aol1_dmmask.fits").unlink()
     with pytest.raises(MatrixError, match=r"found 0 files \*dmmask\*\.fits"):
-        from_cacao(tmp_path, TOLD)
+        from_cacao(tmp_path, REPORTED)

@@ -141,10 +141,10 @@ class TrackingTable(Table):
     """1 σ model error of each shift, subapertures. None: as measured."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
-    """Of the rotation, degrees."""
+    """Of the rotation, degrees. None: as measured, or more of a coarse mirror."""
 
     floor_magnification: float | None = Field(default=None, ge=0.0)
-    """Of the magnification."""
+    """Of the magnification. None: as measured, or more of a coarse mirror."""
 
     anamorphosis: bool = False
     """Follow the stretch of the mirror's image, too; else it is as the instrument file says. The

@@ -71,7 +71,7 @@ export class Glance {
   async #readGains() {
     const { optical_gain: gains, measured } = await this.#service.get("v1/gains");
     const at = new Map(measured.map((one) => [one.mode, one.gain]));
-    this.lines.gains.show({ x: gains.map((_, mode) => mode), label: "Optical gain of each mode",
+    this.lines.gains.show({ x: gains.map((_, mode) => mode), label: "Gain of the sensor for each mode",
       lines: [{ name: "expected", values: gains }, { name: "measured", values: gains.map((_, mode) => at.get(mode) ?? null), dots: true }] });
     this.root.querySelector(".gains-said").replaceChildren(keyOf(measured.length ? ["between", "measured"] : ["expected; none measured"]));
   }

@@ -85,7 +85,8 @@ def _sensor_table(kind: SensorKind) -> list[str]:
     """Return ``[wfs]`` of one kind of sensor: the other tables are alike."""
     parts = list(_tables(whole_of(kind)))
     start = parts.index("## [wfs]") + 1
-    return [f'## [wfs] with kind = "{kind.name}"', *parts[start : start + 2]]
+    after = next(k for k, part in enumerate(parts) if k > start and part == "## [mirror]")
+    return [f'## [wfs] with kind = "{kind.name}"', *parts[start:after]]
 
 
 def _tables(whole: type[Table]) -> Iterator[str]:

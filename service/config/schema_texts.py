@@ -66,7 +66,14 @@ def tables_of(whole: type[Table]) -> Iterator[TableText]:
             for of_key in (field, *field.get("anyOf", ())):
                 table = kinds.get(of_key.get("$ref", "").rpartition("/")[2], {})
                 if _text(table).startswith(f"`[{section}.{key}]"):
-                    yield _table(f"[{section}.{key}]", table, None, kinds)
+                    inside = _inside(record, key)
+                    yield _table(f"[{section}.{key}]", table, inside, kinds)
+
+
+def _inside(record: object, key: str) -> object:
+    """Return the record of a table within another, which may be left out; None: no dataclass."""
+    told = get_type_hints(record)[key] if is_dataclass(record) else None
+    return next((one for one in get_args(told) if is_dataclass(one)), None)
 
 
 def _table(header: str, kind: Schema, record: object, kinds: Mapping[str, Schema]) -> TableText:

@@ -33,7 +33,7 @@ class PartlyLit(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LaserStar(Read):
-    """Star of a laser: light of a layer of sodium, seen aslant, an elongated spot."""
+    """``[wfs.laser]``: a laser's star: a layer of sodium, of which each lenslet sees a streak."""
 
     height_m: Annotated[float, Ge(1e3), Le(1e6)]
     """Distance of the middle of the layer along the line of sight."""

@@ -25,8 +25,16 @@ ROOT = Path(__file__).resolve().parent.parent
 KEPT = ROOT / "var" / "peers"
 PAGE = KEPT / "peers.md"
 
-REQUIREMENTS = {"oopao": "OOPAO==1.0.0", "hcipy": "hcipy==0.7.1", "specula": "specula==1.1.0"}
+REQUIREMENTS = {
+    "oopao": "OOPAO==1.0.0",
+    "hcipy": "hcipy==0.7.1",
+    "specula": "specula==1.1.0",
+    "synim": "synim==2.0.0",
+}
 """What is installed for each peer."""
+
+FITTED = ("oopao", "hcipy", "specula")
+"""Peers whose matrices of FLAO are fitted here."""
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -72,7 +80,7 @@ def measured(case: Case) -> Path:
 def main() -> int:
     """Measure, fit, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--peers", nargs="+", choices=list(REQUIREMENTS), default=None)
+    parser.add_argument("--peers", nargs="+", choices=FITTED, default=None)
     parser.add_argument("--page", type=Path, default=PAGE)
     parser.add_argument(
         "--page-only", action="store_true", help="fit nothing: the page of the last run's answers"
@@ -80,7 +88,7 @@ def main() -> int:
     given = parser.parse_args()
     matrices: list[tuple[Case, Measured]] = []
     answers: list[Answer] = []
-    for case in (case for peer in given.peers or REQUIREMENTS for case in cases(peer)):
+    for case in (case for peer in given.peers or FITTED for case in cases(peer)):
         matrix, beside = read_product(measured(case))
         matrices.append((case, matrix))
         folder = KEPT / "files" / case.name

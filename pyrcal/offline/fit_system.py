@@ -67,8 +67,7 @@ def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> S
     pairs are fitted again with the pupil there.
     """
     fits = {pair: fit(pair, system.instrument(pair)) for pair in system.pairs}
-    at_rest = [one.fit.converged for one in fits.values()]
-    found = _found(system, fits, np.array(at_rest))
+    found = _found(system, fits, _telling(fits))
     for number, sensor in enumerate(system.sensors):
         if found is None or sensor.instrument.stop is Stop.MIRROR:
             break
@@ -81,6 +80,20 @@ def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> S
     accepted = np.array([one.fit.accepted for one in fits.values()])
     found = _found(system, fits, accepted)
     return SystemReport(system=system, fits=tuple(fits.values()), found=found)
+
+
+def _telling(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:
+    """Return which pairs tell where the pupil lies: accepted ones, or what a sensor has instead.
+
+    A pupil that is taken to lie elsewhere may be all that a fit is refused for.
+    """
+    trusted = {pair.sensor for pair, one in fits.items() if one.fit.accepted}
+    return np.array(
+        [
+            one.fit.accepted or (one.fit.converged and pair.sensor not in trusted)
+            for pair, one in fits.items()
+        ]
+    )
 
 
 def _found(

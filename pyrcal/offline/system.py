@@ -240,14 +240,15 @@ class System:
     def basis(self, pair: Pair) -> Basis:
         """Return the mirror's modes as this sensor sees them; strokes are the same for all."""
         about = self.instrument(pair)
-        own = self._bases[pair.mirror]
+        own = self.bases[pair.mirror]
         if not isinstance(own, ModalBasis):
             return modal_basis(about)
         seen = mirror_surface(about.analytic_mirror, about.subaperture_m)
         return replace(own.of_surface(seen), y_sign=about.mirror.y_sign)
 
     @cached_property
-    def _bases(self) -> tuple[Basis, ...]:
+    def bases(self) -> tuple[Basis, ...]:
+        """The modes of each mirror, as its own instrument file has them."""
         return tuple(modal_basis(mirror.instrument) for mirror in self.mirrors)
 
     def lit(self, pair: Pair) -> NDArray[np.intp] | None:

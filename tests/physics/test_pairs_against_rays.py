@@ -17,14 +17,14 @@ from service.model.modes import modal_basis
 from tests.physics.fft_spots import pushed
 from tests.unit.offline import systems
 
-ACTUATORS = np.array([29, 40, 41, 51])
+ACTUATORS = np.array([29, 41])
 """Near the middle of either mirror."""
 
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory):
     text = systems.SYSTEM.replace('ground.toml"', 'ground.toml"\nstars = "direction and height"', 1)
-    return systems.written(tmp_path_factory.mktemp("system"), text)
+    return systems.written(tmp_path_factory.mktemp("system"), text, n_subapertures=8)
 
 
 def numbers(system, values, owner):
@@ -53,9 +53,7 @@ def back(points, place, shift):
     return np.linalg.solve(turn, (points - shift).T).T
 
 
-@pytest.mark.parametrize(
-    ("pair", "seed"), [(Pair(0, 0), 1), (Pair(0, 1), 2), (Pair(1, 1), 3), (Pair(2, 1), 4)]
-)
+@pytest.mark.parametrize(("pair", "seed"), [(Pair(0, 0), 1), (Pair(0, 1), 2), (Pair(2, 1), 3)])
 def test_the_matrix_of_a_pair_is_that_of_rays(system, pair, seed):
     """0.14 % is what spots on pixels leave of full lenslets; a shift of 0.02 leaves 2 %."""
     values = systems.moved(system, np.random.default_rng(seed), 0.15)

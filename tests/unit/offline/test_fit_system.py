@@ -192,12 +192,14 @@ def test_pairs_that_disagree_are_refused_and_the_worst_is_named(folder):
 
 def test_a_refused_pair_is_left_out_and_named(folder):
     system = load_system(folder / "system.toml")
-    fit = told_by(system, system.nominal, [])
+    asked_for = []
+    fit = told_by(system, system.nominal, asked_for)
 
     def one_refused(pair, about):
         report = fit(pair, about)
         if pair == system.pairs[1]:
             refused = {"accepted": False, "verdict": "refused: too much noise"}
+            refused["alpha"] = Misregistration(shift_x_subap=0.8)
             report = replace(report, fit=replace(report.fit, **refused))
         return report
 
@@ -205,3 +207,4 @@ def test_a_refused_pair_is_left_out_and_named(folder):
     assert report.verdict == "refused: 1 of 4 pairs: lgs1 x dm2: too much noise"
     assert np.isnan(report.found.misfit[1]).all()
     assert "  refused" in table(report)
+    assert len(asked_for) == 4  # nor does it say where the pupil lies

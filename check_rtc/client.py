@@ -124,7 +124,7 @@ def _questions(client: RtcClient, status: Status) -> list[_Question]:
     dithering = CommandKind.DITHER
     without = {key: value for key, value in told.items() if key != "modes"}
     return [
-        _Question(dithering, b"\xc1", "bytes of no message", ("range",)),
+        _Question(dithering, b"\xc1", "bytes of no message", ("range", "signature")),
         _Question(
             dithering,
             msgpack.packb({**without, "id": new("missing")}),
@@ -172,7 +172,7 @@ def replies(client: RtcClient, status: Status) -> Checked:
         problems += _wrong_reply(answer, question, took_s)
         first = answer if question is questions[3] else first
     again, _ = client.connection.ask(questions[3].kind, questions[3].payload)
-    if first and again != first:
+    if first and (again is None or decode(Reply, again) != decode(Reply, first)):
         problems.append("the same id got another answer when asked again")
     if problems:
         return wrong("replies", "; ".join(problems))
@@ -193,6 +193,35 @@ def _wrong_reply(answer: bytes, question: _Question, took_s: float) -> list[str]
         wanted = " or ".join(question.words)
         return [f"{question.what} was refused with {reply.reason!r:.60}, expected {wanted}: ..."]
     return [f"the reply to {question.what} took {took_s:.1f} s"] if took_s > REPLY_S else []
+
+
+def signatures(client: RtcClient, status: Status) -> Checked:
+    """Send an order that changes nothing: without its signature, with it, again, and changed."""
+    connection, kind = client.connection, CommandKind.LOOP
+    if not connection.signs:
+        return skipped("signatures", "no secret is shared: [zenoh.signing] in --config")
+    plain = encode(LoopRequest(id=connection.new_id("signed"), leak=status.leak))
+    signed = connection.signed(kind, plain)
+    changed = signed[:-1] + bytes([signed[-1] ^ 1])
+    problems = []
+    for what, payload, expected in (
+        ("what is not signed", plain, False),
+        ("what was changed on its way", changed, False),
+        ("what is signed", signed, True),
+        ("what was sent before", signed, False),
+    ):
+        answer, _ = connection.ask(kind, payload, as_it_is=True)
+        reply = None if answer is None else decode(Reply, answer)
+        if reply is None:
+            problems.append(f"no answer to {what}")
+        elif reply.accepted is not expected:
+            problems.append(f"{what} was {'accepted' if reply.accepted else reply.reason}")
+        elif not expected and not reply.reason.startswith("signature"):
+            found = f"{what} was refused with {reply.reason!r:.60}"
+            problems.append(f"{found}, expected signature: ...")
+    if problems:
+        return wrong("signatures", "; ".join(problems))
+    return fine("signatures", "refused: not signed, changed on its way, sent before")
 
 
 # --- the dither

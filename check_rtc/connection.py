@@ -184,8 +184,21 @@ class RtcConnection:
         except WireError as error:
             raise LinkError(f"the reply is unusable: {error}") from error
 
-    def ask(self, kind: CommandKind, payload: bytes) -> tuple[bytes | None, float]:
+    @property
+    def signs(self) -> bool:
+        """Whether RTC and checker share a secret."""
+        return self._endpoint.security.secret is not None
+
+    def signed(self, kind: CommandKind, payload: bytes) -> bytes:
+        """Return a request with its signature."""
+        return self._signatures.sign(self.keys.command(kind), payload)
+
+    def ask(
+        self, kind: CommandKind, payload: bytes, *, as_it_is: bool = False
+    ) -> tuple[bytes | None, float]:
         """Return the reply to these bytes and its delay; None: there is none.
+
+        They are signed where a secret is shared, unless they are to be sent ``as_it_is``.
 
         Raises
         ------
@@ -194,7 +207,7 @@ class RtcConnection:
         """
         began_s = time.monotonic()
         selector = self.keys.command(kind)
-        signed = self._signatures.sign(selector, payload)
+        signed = payload if as_it_is else self.signed(kind, payload)
         answer = link.ask(self._opened, selector, ANSWER_S, signed, Encodings.COMMAND)
         return answer, time.monotonic() - began_s
 

@@ -9,7 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.client import TOTAL_M, RtcClient, dither, dithered_modes, replies
+from check_rtc.client import (
+    TOTAL_M,
+    RtcClient,
+    dither,
+    dithered_modes,
+    replies,
+    signatures,
+)
 from check_rtc.moving import (
     OPEN_S,
     STROKE_M,
@@ -183,8 +190,7 @@ def moved_by(names: list[str], status: Status) -> tuple[str, ...]:
 
 def _asking(client: RtcClient, examination: Examination, status: Status) -> Iterator[Checked]:
     """Make the checks that ask, those that move least first."""
-    if examination.wants("replies"):
-        yield replies(client, status)
+    yield from _asking_words(client, examination, status)
     if examination.wants("dither") or examination.wants("columns"):
         yield from dither(client, status, client.watch.loop.matrix)
     if any(examination.wants(name) for name in _SWAPS):
@@ -199,6 +205,13 @@ def _asking(client: RtcClient, examination: Examination, status: Status) -> Iter
         yield found if in_use is None else measure(client, client.watch.status or status, in_use)
     if examination.wants("offload"):
         yield offload(client, client.watch.loop.matrix, examination.registered)
+
+
+def _asking_words(client: RtcClient, examination: Examination, status: Status) -> Iterator[Checked]:
+    if examination.wants("replies"):
+        yield replies(client, status)
+    if "signatures" in examination.only or client.connection.signs:
+        yield signatures(client, status)
 
 
 def _swapping(client: RtcClient, examination: Examination) -> Iterator[Checked]:

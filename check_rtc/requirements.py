@@ -98,6 +98,11 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         "commands",
         Moves.WORDS,
     ),
+    "signatures": Requirement(
+        "with a shared secret, what is not signed, changed or sent before is refused",
+        "signatures",
+        Moves.WORDS,
+    ),
     "dither": Requirement(
         "a dither begins at start_seq as asked for, is in the status, and stops on request",
         "dither",

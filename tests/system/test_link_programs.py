@@ -1,6 +1,7 @@
 """The programs of pyrcal on a secured link: service, simulator, checker, examples."""
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -9,9 +10,13 @@ import msgpack
 import pytest
 import zenoh
 
+from service.config.link_tables import read_link_tables
 from tests.system.cable import free_port
+from tests.system.fake_rtc import FakeRtc
 from tests.system.night import INSTRUMENT, ROOT, a_night, wait_for
 from tests.system.pace import patience
+
+TLS = "transport/link/tls"
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(150)]
 
@@ -44,7 +49,7 @@ def test_the_checker_finds_the_simulator_through_certificates(folder, signed):
     try:
         checked = pyrcal(
             *("check-rtc", *where, "--config", folder / "service.toml", "--seconds", "4"),
-            *("--only", "frames,status,delivery,dither,matrix,commit,late-join", "--yes"),
+            *("--only", "frames,status,dither,matrix,commit,rejection,replies,signatures", "--yes"),
             stdout=subprocess.PIPE,
         )
         found, _ = checked.communicate(timeout=patience(90.0))
@@ -53,6 +58,28 @@ def test_the_checker_finds_the_simulator_through_certificates(folder, signed):
         rtc.wait(patience(10.0))
     assert checked.returncode == 0, found
     assert "0 wrong" in found
+    assert ("refused: not signed, changed on its way, sent before" in found) is signed
+    assert ("no secret is shared" in found) is not signed
+
+
+def test_the_checker_names_an_rtc_that_believes_what_nobody_has_signed(folder):
+    """Its own messages are signed, and it takes anybody's."""
+    sign(folder, "service")
+    where = read_link_tables(folder / "rtc.toml").connect[0]
+    secret = (folder / "signing.key").read_bytes().split()[0]
+    tls = json.loads(zenoh.Config.from_file(str(folder / "rtc.json5")).get_json(TLS))
+    words = ("--config", folder / "service.toml", "--system", "bench", "--instrument", INSTRUMENT)
+    only = ("--only", "signatures", "--yes", "--seconds", "1")
+    checker = pyrcal("check-rtc", *words, *only, stdout=subprocess.PIPE)
+    patient = {"connect/timeout_ms": -1, TLS: tls}
+    with FakeRtc(where, secret=secret, **patient) as rtc:
+        rtc.signatures.check = lambda *_: None
+        while checker.poll() is None:
+            rtc.send_status()
+            time.sleep(0.2)
+    found, _ = checker.communicate()
+    assert checker.returncode == 1, found
+    assert "what is not signed was accepted; what was changed on its way was accepted" in found
 
 
 @pytest.fixture
@@ -117,6 +144,9 @@ def test_what_strangers_tried_is_logged_with_who_and_seen_on_the_page(night, fol
         ("viewer", "Put", f"{ROOT_KEY}/tel/status"),
         ("viewer", "Declare", f"{ROOT_KEY}/cm/*"),
     }, "a token that nobody is said to watch does not even leave the stranger's own zenoh"
+    ending = wait_for(lambda: night.alarms.get("certificate-ending"), 10.0)
+    for name in ("service", "rtc", "viewer"):
+        assert re.search(rf"the certificate of {name} \(.*?\) ends in 36[45] days", ending)
     assert "viewer: " in wait_for(lambda: night.alarms.get("link-refused"), 10.0)
     assert night.rtc_says("gains") == gain
     night.no_frame_is_lost()

@@ -40,6 +40,9 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     _describe_reconstruct(
         commands.add_parser("reconstruct", help="compute a reconstructor for a registration")
     )
+    _describe_conventions(
+        commands.add_parser("conventions", help="hold a measured matrix against the conventions")
+    )
     _describe_instrument(
         commands.add_parser("instrument", help="write, check or draw an instrument file")
     )
@@ -233,6 +236,21 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         words("--no-gains", gains),
         words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),
+    )
+
+
+def _describe_conventions(hold: argparse.ArgumentParser) -> None:
+    hold.set_defaults(module="pyrcal.conventions")
+    hold.description = (
+        "Hold a measured matrix, and the modes of its instrument file, against the numbered rules "
+        "of docs/understand/conventions.md; say which are broken, and by how much."
+    )
+    hold.epilog = "Exit status: 0 all are kept, 1 some are broken, 2 input that cannot be used."
+    add(
+        hold,
+        _INSTRUMENT,
+        words("reference REFERENCE", "HDF5, FITS or NumPy file", type=Path),
+        words("--dataset NAME", "dataset of the matrix, default interaction_matrix"),
     )
 
 

@@ -58,6 +58,9 @@ class Reported:
     modulation_lambda_over_d: float | None = None
     """None: unknown; of a pyramid only."""
 
+    order: str = "xy"
+    """Of the slopes, as its user would list them; the fit finds another."""
+
     unit: str | None = None
     """Of the commands, OPD; None: unknown, so that only shapes are compared."""
 
@@ -116,7 +119,7 @@ def from_arrays(source: str, arrays: Mapping[str, Array], reported: Reported) ->
             },
             "wfs": sensor,
             "mirror": mirror,
-            "slopes": {"order": "xy", "orientation": "auto"},
+            "slopes": {"order": reported.order, "orientation": "auto"},
         },
         arrays={
             "interaction_matrix": matrix,

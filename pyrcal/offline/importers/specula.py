@@ -12,6 +12,7 @@ Nothing of either is imported. How they list things was read from SPECULA 1.1.0 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,7 +84,9 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     )
     found["matrix"] = both[:, places.by_rows].reshape(matrix.shape)
     found["valid"] = places.mask
-    imported = from_arrays(source, found, reported)
+    # what its pyramid calls x runs along the rows of its mask
+    order = "yx" if reported.sensor == "pyramid" else "xy"
+    imported = from_arrays(source, found, replace(reported, order=order))
     moved = not np.array_equal(places.by_rows, np.arange(len(places.rows)))
     ordered = ("subapertures were not listed row by row: sorted",) if moved else ()
     return imported.noted(*notes, *ordered)

@@ -68,7 +68,7 @@ MAX_LAW_RESIDUAL = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Finding:
+class RuleCheck:
     """One rule, and how far from it something is."""
 
     rule: int
@@ -133,7 +133,7 @@ def check(
     *,
     columns: Array | None = None,
     stream: Stream | None = None,
-) -> tuple[Finding, ...]:
+) -> tuple[RuleCheck, ...]:
     """Return every rule that could be measured; those that are broken are not ``kept``.
 
     Parameters
@@ -158,7 +158,7 @@ def check(
 # --- modes
 
 
-def _basis(instrument: Instrument) -> Iterator[Finding]:
+def _basis(instrument: Instrument) -> Iterator[RuleCheck]:
     """Yield what the shapes of the modes are like over the pupil, the lowest ones alone."""
     if not instrument.mirror.stroke_known:
         return
@@ -169,7 +169,7 @@ def _basis(instrument: Instrument) -> Iterator[Finding]:
     mean = pupil.weights @ shapes
     peak = float(np.median(np.abs(shapes - mean).max(axis=0)))
     decades = _decades_outside(peak, HEIGHTS_M)
-    yield Finding(
+    yield RuleCheck(
         rule=MODES,
         deviation=decades,
         limit=0.0,
@@ -188,10 +188,10 @@ def _decades_outside(value: float, limits: tuple[float, float]) -> float:
 # --- a matrix
 
 
-def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Iterator[Finding]:
+def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Iterator[RuleCheck]:
     n_planes = instrument.slopes.kind.n_planes
     n_slopes = n_planes * int(rtc_valid_subapertures(instrument).sum())
-    shape = Finding(
+    shape = RuleCheck(
         rule=MATRIX,
         deviation=abs(matrix.shape[0] - n_slopes) if matrix.ndim == 2 else np.inf,
         limit=0.0,
@@ -210,12 +210,12 @@ def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Ite
         with threadpool_limits(1):
             fit = fit_matrix(free, reference)
     except (MatrixError, ModelError) as error:
-        yield Finding(rule=MATRIX, deviation=np.inf, limit=0.0, text=str(error))
+        yield RuleCheck(rule=MATRIX, deviation=np.inf, limit=0.0, text=str(error))
         return
     yield from _axes(instrument, fit)
     yield from _gains(instrument, fit)
     yield from _columns(fit)
-    yield Finding(
+    yield RuleCheck(
         rule=ORDER,
         deviation=fit.residual_fraction,
         limit=MAX_RESIDUAL,
@@ -224,10 +224,10 @@ def _matrix(instrument: Instrument, matrix: Array, columns: Array | None) -> Ite
     )
 
 
-def _axes(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
+def _axes(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
     """Yield how slopes are listed, against what is stated."""
     stated, found = instrument.slopes.orientation, fit.orientation
-    yield Finding(
+    yield RuleCheck(
         rule=ORDER,
         deviation=float(fit.order is not instrument.slopes.order),
         limit=0.0,
@@ -235,14 +235,14 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
     )
     if stated is not None:
         flips = sum(getattr(stated, one) is not getattr(found, one) for one in FLIPS)
-        yield Finding(
+        yield RuleCheck(
             rule=AXES,
             deviation=float(flips),
             limit=0.0,
             text=f"axes {found}; stated {stated}",
         )
         signs = abs(stated.sign_x - found.sign_x) + abs(stated.sign_y - found.sign_y)
-        yield Finding(
+        yield RuleCheck(
             rule=SIGN,
             deviation=signs / 2,
             limit=0.0,
@@ -252,7 +252,7 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
     nominal = instrument.mirror.nominal_rotation_rad
     if nominal is not None:
         away = float(np.rad2deg(abs(wrapped(fit.alpha.rotation_rad - nominal))))
-        yield Finding(
+        yield RuleCheck(
             rule=ROTATION,
             deviation=away,
             limit=MAX_ROTATION_DEG,
@@ -260,14 +260,14 @@ def _axes(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
         )
 
 
-def _gains(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
+def _gains(instrument: Instrument, fit: Fit) -> Iterator[RuleCheck]:
     """Yield the sizes of columns against the model's."""
     if not instrument.mirror.stroke_known or "wfs.wavelength_m" in instrument.unknown:
         return
     median = float(np.median(fit.gains))
     factor = abs(np.log2(max(median, 1e-300)))  # of two, either way: a pass, or a surface for OPD
     twice = abs(factor - 1.0) < _A_PASS
-    yield Finding(
+    yield RuleCheck(
         rule=PASSES if twice else MATRIX,
         deviation=abs(median - 1.0),
         limit=MAX_GAIN_CHANGE,
@@ -275,7 +275,7 @@ def _gains(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
         + (", passes divided out" if twice else ""),
     )
     apart = float(np.abs(fit.gains / median - 1.0).max())
-    yield Finding(
+    yield RuleCheck(
         rule=MODES,
         deviation=apart,
         limit=MAX_MODE_CHANGE,
@@ -283,12 +283,12 @@ def _gains(instrument: Instrument, fit: Fit) -> Iterator[Finding]:
     )
 
 
-def _columns(fit: Fit) -> Iterator[Finding]:
+def _columns(fit: Fit) -> Iterator[RuleCheck]:
     """Yield how little the column that is least alike resembles its own mode's."""
     measured, model = _unit(fit.measured), _unit(fit.synthetic)
     alike = np.einsum("ij,ij->j", measured, model)
     worst = int(np.argmin(alike))
-    yield Finding(
+    yield RuleCheck(
         rule=MODES,
         deviation=float(MIN_LIKENESS - alike[worst]),
         limit=0.0,
@@ -305,13 +305,13 @@ def _unit(columns: Array) -> Array:
 # --- a stream
 
 
-def _stream(instrument: Instrument, stream: Stream) -> Iterator[Finding]:
+def _stream(instrument: Instrument, stream: Stream) -> Iterator[RuleCheck]:
     n_frames, n_modes = len(stream.t_ns_utc), len(stream.reconstructor)
     n_slopes = stream.reconstructor.shape[1]
     expected = instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum())
     shapes = (stream.slopes.shape, stream.commands.shape, n_slopes)
     right = ((n_frames, n_slopes), (n_frames, n_modes), expected)
-    yield Finding(
+    yield RuleCheck(
         rule=MATRIX,
         deviation=float(shapes != right),
         limit=0.0,
@@ -321,14 +321,14 @@ def _stream(instrument: Instrument, stream: Stream) -> Iterator[Finding]:
     if shapes != right:
         return
     size = float(np.sqrt(np.mean(np.square(stream.commands))))
-    yield Finding(
+    yield RuleCheck(
         rule=OPD,
         deviation=_decades_outside(size, COMMANDS_M),
         limit=0.0,
         text=f"commands of {size:.3g} RMS; expected metres of OPD",
     )
     light = float(np.sqrt(np.mean(np.square(stream.slopes))))
-    yield Finding(
+    yield RuleCheck(
         rule=ORDER,
         deviation=light,
         limit=MAX_SLOPE,
@@ -337,11 +337,11 @@ def _stream(instrument: Instrument, stream: Stream) -> Iterator[Finding]:
     yield from _law(stream)
 
 
-def _times(stream: Stream) -> Iterator[Finding]:
+def _times(stream: Stream) -> Iterator[RuleCheck]:
     times = np.asarray(stream.t_ns_utc)
     first, last = (float(t) for t in (times[0], times[-1]))
     in_range = times.dtype.kind in "iu" and YEARS_NS[0] < first <= last < YEARS_NS[1]
-    yield Finding(
+    yield RuleCheck(
         rule=TIME,
         deviation=float(not in_range),
         limit=0.0,
@@ -349,7 +349,7 @@ def _times(stream: Stream) -> Iterator[Finding]:
     )
     steps = np.diff(times.astype(np.float64)) * stream.frame_rate_hz * 1e-9
     late = float(abs(np.median(steps) - 1.0))
-    yield Finding(
+    yield RuleCheck(
         rule=TIME,
         deviation=late if (steps > 0.0).all() else np.inf,
         limit=0.2,
@@ -358,7 +358,7 @@ def _times(stream: Stream) -> Iterator[Finding]:
     )
 
 
-def _law(stream: Stream) -> Iterator[Finding]:
+def _law(stream: Stream) -> Iterator[RuleCheck]:
     """Yield whether ``c[k+d] - c[k+d-1] = -gain R s[k]`` with one gain above 0."""
     d = stream.delay_frames
     steps = np.diff(stream.commands, axis=0)[d - 1 :]
@@ -369,13 +369,13 @@ def _law(stream: Stream) -> Iterator[Finding]:
     left = steps - gain * asked
     size = float(np.sqrt(np.mean(np.square(steps))))
     share = float(np.sqrt(np.mean(np.square(left)))) / size if size else np.inf
-    yield Finding(
+    yield RuleCheck(
         rule=LAW,
         deviation=max(-gain, 0.0) if gain <= 0.0 else 0.0,
         limit=0.0,
         text=f"commands step by {gain:+.3g} times -R s; expected a gain above 0: R = +pinv(D)",
     )
-    yield Finding(
+    yield RuleCheck(
         rule=LAW,
         deviation=share,
         limit=MAX_LAW_RESIDUAL,

@@ -21,6 +21,9 @@ from service.model.sensors.registry import KINDS
 if TYPE_CHECKING:
     from pyrcal.offline.light_rotation import Arms
 
+_memory_gb = such(float, lambda gb: gb > 0.0, "GB above 0")
+_MEMORY = "refuse what takes more, before it is begun; default %(default)g"
+
 _count = such(whole, lambda n: n > 0, "a whole number above 0")
 seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 3600")
 
@@ -233,6 +236,7 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         words("--method", methods, choices=("svd", "map"), default="svd"),
         condition,
         words("--slope-noise RMS", noise, type=float, default=0.05),
+        words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
         words("--no-gains", gains),
         words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.instrument_checks import COUPLING_KEY
 from pyrcal.offline.light import read_light
+from pyrcal.offline.memory import check_reconstruction
 from pyrcal.offline.recorded import file_sha256
 from pyrcal.offline.report import (
     KnownFit,
@@ -60,6 +61,7 @@ def main(options: argparse.Namespace) -> int:
     if fit.instrument_sha256 not in {None, found}:
         say(f"note: {options.instrument} has changed since {fit.origin} was fitted with it")
     instrument = _with_sensor(_oriented(described, fit), fit)
+    check_reconstruction(instrument, options.modes, SAMPLING, options.memory_gb)
     light = None if options.flux_map is None else read_light(options.flux_map, instrument)
     with threadpool_limits(1), ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         model = RtcInteractionModel(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from pyrcal.offline.importers import oopao
+from pyrcal.offline.importers.aot import from_aot
 from pyrcal.offline.importers.cacao import from_cacao
 from pyrcal.offline.importers.files import Reported, by_role, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
@@ -65,6 +66,10 @@ def _cacao(options: argparse.Namespace) -> Imported:
     return from_cacao(options.folder, _reported(options))
 
 
+def _aot(options: argparse.Namespace) -> Imported:
+    return from_aot(options.file, _reported(options))
+
+
 def _reported(options: argparse.Namespace) -> Reported:
     return Reported(
         diameter_m=options.diameter_m,
@@ -83,6 +88,7 @@ IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
     "synim": _specula,
     "cacao": _cacao,
     "pyrtc": _arrays,
+    "aot": _aot,
     "npz": _arrays,
 }
 """By the word that names them."""

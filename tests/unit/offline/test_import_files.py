@@ -5,6 +5,7 @@ it has moved by 0.25 of one, 20 Zernike modes, and what pyRTC 2.1 saved of rando
 """
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from astropy.io import fits
 import pyrcal
 import pyrcal.offline.recorded
 from pyrcal.__main__ import main
+from pyrcal.offline.importers.aot import from_aot
 from pyrcal.offline.importers.cacao import from_cacao
 from pyrcal.offline.importers.files import (
     Reported,
@@ -257,3 +259,61 @@ def test_a_loop_of_cacao_has_modes_of_actuators_without_a_unit(tmp_path):
     (tmp_path / "aol1_dmmask.fits").unlink()
     with pytest.raises(MatrixError, match=r"found 0 files \*dmmask\*\.fits"):
         from_cacao(tmp_path, REPORTED)
+
+
+def aot_file(path, **loop):
+    aotpy = pytest.importorskip("aotpy")
+    places = np.full(VALID.shape, -1, dtype=np.int32)
+    places[VALID] = np.arange(VALID.sum())
+    sensor = aotpy.Pyramid(
+        uid="sensor",
+        n_sides=4,
+        source=aotpy.NaturalGuideStar(uid="star"),
+        n_valid_subapertures=int(VALID.sum()),
+        subaperture_mask=aotpy.Image("mask", places),
+        wavelength=750e-9,
+    )
+    telescope = aotpy.MainTelescope(uid="t", enclosing_diameter=2.0, obstruction_diameter=0.4)
+    mirror = aotpy.DeformableMirror(
+        uid="dm",
+        telescope=telescope,
+        n_valid_actuators=5,
+        influence_function=aotpy.Image("functions", CUBE),
+    )
+    matrices = {name: aotpy.Image(name, values) for name, values in loop.items()}
+    control = aotpy.ControlLoop(
+        uid="loop", input_sensor=sensor, commanded_corrector=mirror, **matrices
+    )
+    system = aotpy.AOSystem(
+        ao_mode="SCAO",
+        name="it",
+        main_telescope=telescope,
+        sources=[sensor.source],
+        wavefront_sensors=[sensor],
+        wavefront_correctors=[mirror],
+        loops=[control],
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system.write_to_file(path, "fits")
+
+
+@pytest.mark.parametrize("listed", [MATRIX, MATRIX.reshape(2, -1, 5)])
+def test_an_aot_file_says_telescope_and_wavelength_itself(listed, tmp_path):
+    aot_file(tmp_path / "it.fits", interaction_matrix=listed)
+    words = ["import", "aot", str(tmp_path / "it.fits"), "--diameter-m", "99"]
+    assert main([*words, "--output", str(tmp_path / "bench")]) == 0
+    instrument = pyrcal.load_instrument(tmp_path / "bench" / "instrument.toml")
+    assert (instrument.diameter_m, instrument.obscuration_ratio) == (2.0, 0.2)
+    assert instrument.wfs.wavelength_m == 750e-9
+    assert not instrument.mirror.stroke_known
+    with pyrcal.offline.recorded.opened(tmp_path / "bench" / "matrix.h5") as file:
+        np.testing.assert_array_equal(file.find("interaction_matrix").read(), MATRIX)
+
+
+def test_an_aot_file_without_a_matrix_and_what_is_none_are_refused(tmp_path):
+    aot_file(tmp_path / "it.fits")
+    with pytest.raises(MatrixError, match="found 0 loops with an interaction matrix"):
+        from_aot(tmp_path / "it.fits", REPORTED)
+    with pytest.raises(MatrixError, match="expected an AOT file"):
+        from_aot(SPECULA[0], REPORTED)

@@ -40,7 +40,7 @@ def from_aot(path: Path, reported: Reported) -> Imported:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # aotpy warns of whatever a file leaves empty
             system = aotpy.AOSystem.read_from_file(path)
-    except Exception as error:  # noqa: BLE001 - aotpy's own class is not exported
+    except Exception as error:  # aotpy does not export its own class
         raise MatrixError(f"{path}: found {error}, expected an AOT file") from error
     loops = [loop for loop in system.loops if getattr(loop, "interaction_matrix", None)]
     if len(loops) != 1:

@@ -1,9 +1,9 @@
 """pyrcal beside OOPAO, HCIPy and SPECULA: the same work, alternating, in one run.
 
-Run: ``make bench``, or ``python -m benchmarks.bench [--rounds 5] [--page FILE.md]``. Each peer
-comes from its package into an environment of its own under ``var/peers`` and works in a process of
-its own; all have one thread, and processor time is counted: a machine that others use is slower
-for all. Writes the page of results and its plot.
+Run: ``make bench``, or ``python -m benchmarks.bench [--rounds 5] [--elt] [--page FILE.md]``. Each
+peer comes from its package into an environment of its own under ``var/peers`` and works in a
+process of its own; all have one thread, and processor time is counted: a machine that others use is
+slower for all. Writes the page of results and its plot.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks import plant
+from benchmarks.bench_alone import alone_rows, elt_section, peak_mb
 from benchmarks.bench_page import Row, page, plot
 from benchmarks.peer_rounds import cpu_s
 from pyrcal.offline.fit_file import fit_file
@@ -55,6 +56,7 @@ FAR = (
     (0.3, 0.15, 0.5, 1.005),
     (0.7, 0.4, 1.0, 1.01),
     (1.3, 0.8, 2.0, 1.02),
+    (2.5, 1.5, 3.0, 1.03),
 )
 """Registrations that SPRINT and the fit are asked for: subapertures, degrees, ratio."""
 
@@ -85,6 +87,11 @@ class PeerProcess:
             text=True,
         )
         self.version: str = self._answer()["version"]
+
+    @property
+    def peak_mb(self) -> float:
+        """Most memory that the process has had."""
+        return peak_mb(self._process.pid)
 
     def __enter__(self) -> PeerProcess:
         return self
@@ -145,6 +152,7 @@ def play(n_rounds: int, peers: Sequence[PeerProcess]) -> tuple[Rounds, dict[str,
     for k in range(n_rounds):
         step = 0.01 * (k + 1)
         few, every = models[N_MODES], models[N_ALL]
+        every.interaction_matrix(Misregistration())  # only the shift is new for the next one
         jobs: dict[str, Callable[[], object]] = {
             "first594": partial(_first, whole, bases[N_ALL], _shifted(step)),
             "shift400": partial(few.interaction_matrix, _shifted(step)),
@@ -286,7 +294,8 @@ def facts(rounds: Rounds, peers: Sequence[PeerProcess]) -> list[str]:
         f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; one "
         f"thread each; a product of {PRODUCT} x {PRODUCT} float32 at {np.median(gflops):.0f} "
         f"GFLOPS ({gflops.min():.0f} to {gflops.max():.0f} over the rounds)",
-        f"{len(gflops)} rounds; processor time",
+        f"{len(gflops)} rounds; processor time; load of {os.getloadavg()[2]:.1f} over the last "
+        "quarter of an hour",
     ]
 
 
@@ -294,6 +303,7 @@ def main() -> int:
     """Measure, write the page and the plot, print the page."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bench")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--elt", action="store_true", help="the steps of studies.elt as well")
     parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args()
     with ExitStack() as stack, threadpool_limits(1):
@@ -303,7 +313,15 @@ def main() -> int:
         rows = [*matrix_rows(rounds, seen, folder), *registrations(peers[0], folder)]
         rows.append(frame_row(rounds))
         told = facts(rounds, peers)
-    given.page.write_text(page(rows, told), encoding="utf-8")
+        alone = alone_rows(
+            float(np.median(rounds.gflops)),
+            {n: float(np.median(rounds.own_s[f"shift{n}"])) for n in (N_MODES, N_ALL)},
+            {peer.peer: peer.peak_mb for peer in peers},
+        )
+    text = page(rows, alone, told)
+    if given.elt:
+        text += elt_section()
+    given.page.write_text(text, encoding="utf-8")
     plot(given.page.with_suffix(".png"), rows)
     print(given.page.read_text(encoding="utf-8"))
     return 0

@@ -31,7 +31,16 @@ class Row:
         return float(np.median(ratios)), float(ratios.min()), float(ratios.max())
 
 
-def page(rows: Sequence[Row], facts: Sequence[str]) -> str:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alone:
+    """One figure of pyrcal's that no peer has."""
+
+    what: str
+    found: str
+    asked: str
+
+
+def page(rows: Sequence[Row], alone: Sequence[Alone], facts: Sequence[str]) -> str:
     """Return the page in Markdown."""
     head = (
         "# pyrcal beside other codes\n\n"
@@ -52,6 +61,8 @@ def page(rows: Sequence[Row], facts: Sequence[str]) -> str:
             f"| {row.what} | {own} | {row.peer} | {peer} | **{_figure(middle)}**{spread} "
             f"| {row.remark} |"
         )
+    lines += ["", "| pyrcal alone | found | asked |", "| --- | --- | --- |"]
+    lines += [f"| {one.what} | {one.found} | {one.asked} |" for one in alone]
     told = "\n".join(f"- {fact}" for fact in facts)
     return f"{head}\n![ratios](bench.png)\n\n" + "\n".join(lines) + f"\n\n{told}\n"
 

@@ -4,8 +4,8 @@
 
 Six laser stars on a ring of 45 arcseconds and mirrors at 600, 6500 and 17500 m are those of
 SynIM's own tutorial (docs/tutorials/registration_morfeo_tutorial.rst). Sensors of 16 x 16
-subapertures, 10 x 10 under noise, and actuators on square grids are ours. SynIM is asked in an
-environment of its own, made at the first call under ``var/peers``.
+subapertures, 8 x 8 and two of them under noise, and actuators on square grids are ours. SynIM is
+asked in an environment of its own, made at the first call under ``var/peers``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -284,10 +283,10 @@ def _in_waves(system: System, pair: Pair, matrix: Array) -> Array:
     return np.asarray(matrix * (ours / np.linalg.norm(matrix)))
 
 
-def noise(share: float = 0.1, n_seeds: int = 24) -> Iterator[str]:
-    """Yield errors over σ of three stars and mirrors, found from noisy matrices of the model."""
+def noise(share: float = 0.3, n_seeds: int = 20) -> Iterator[str]:
+    """Yield errors over σ of two stars, three mirrors, from noisy matrices of the model, finer."""
     with tempfile.TemporaryDirectory() as name:
-        system = morfeo(Path(name), every=2, n_subapertures=10)
+        system = morfeo(Path(name), every=3, n_subapertures=8)
         free = np.array([one.free for one in system.parameters])
         unit = np.array([one.subap for one in system.parameters])[free]
         pulls, errors, left, local, accepted = [], [], [], [], 0
@@ -343,7 +342,6 @@ STEPS: dict[str, Callable[[], Iterator[str]]] = {
     "geometry": geometry,
     "matrices": matrices,
     "noise": noise,
-    "strong-noise": partial(noise, 0.5),
 }
 
 

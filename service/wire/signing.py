@@ -24,6 +24,10 @@ from service.wire.keys import Role
 KEYS: Final = ("signer", "signed_n", "signed_for", "mac")
 """Last in a signed message, in this order."""
 
+_FIRST_KEY: Final[bytes] = msgpack.packb(KEYS[0])
+_FOUR_KEYS: Final = bytes([0x80 + len(KEYS)])
+"""The head of a map of so many."""
+
 MAC_BYTES: Final = 32
 
 REMEMBERED: Final[dict[Role, int]] = {Role.RTC: 4096, Role.SERVICE: 8}
@@ -156,16 +160,16 @@ def _opened(data: bytes) -> tuple[int, bytes]:
 
 
 def _signature(data: bytes) -> dict[str, Any]:
-    """Return the keys of a message's signature."""
+    """Return the keys of a message's signature; the rest is read by whoever uses it."""
+    begin = data.rfind(_FIRST_KEY)
     try:
-        said = msgpack.unpackb(data)
+        said = msgpack.unpackb(_FOUR_KEYS + data[begin:]) if begin >= 0 else None
     except (ValueError, msgpack.exceptions.UnpackException):
         said = None
-    if not isinstance(said, dict) or not set(KEYS) <= said.keys():
+    if not isinstance(said, dict) or tuple(said) != KEYS:
         raise WireError("signature: none, and one is asked for")
-    signature = {key: said[key] for key in KEYS}
-    *numbers, mac = signature.values()
+    *numbers, mac = said.values()
     is_whole = all(type(number) is int and 0 <= number < 2**63 for number in numbers)
     if not is_whole or not isinstance(mac, bytes) or data[-MAC_BYTES:] != mac:
         raise WireError("signature: not of the form that docs/rtc.md has")
-    return signature
+    return said

@@ -61,7 +61,7 @@ def elt_section() -> str:
     """Return what ``studies.elt`` says: it takes five minutes of processor time, and 4 GB."""
     command = [sys.executable, "-m", "studies.elt"]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return f"\n## A telescope of 39 m\n\n```\n{said.strip()}\n```\n"
+    return f"\n## A telescope of 39 m\n\n{said.strip()}\n"
 
 
 def peak_mb(pid: int | str) -> float:

@@ -102,18 +102,13 @@ def _matrix(folder: Path) -> Notes:
         spent.append(time.process_time() - begun_s)
 
     yield "D of 4300 modes", matrix
-    flop, gflops = flop_of_matrix(model), _gflops()
+    flop = work_of(model.instrument, model.sensor, model.pupil, n_matrices=1).flop
+    gflops = _gflops()
     over = spent[0] / (flop / (1e9 * gflops))
     yield (
         f"({flop / 1e12:.2f} TFLOP of products at {gflops:.0f} GFLOPS: {over:.1f} x)",
         lambda: None,
     )
-
-
-def flop_of_matrix(model: InteractionModel) -> float:
-    """Return what the products of one D take: the sensor's, tiles times functions, times modes."""
-    one = work_of(model.instrument, model.sensor, model.pupil, n_matrices=1)
-    return one.flop
 
 
 def _linearise(folder: Path) -> Notes:

@@ -33,7 +33,7 @@ def read_npz(path: Path) -> dict[str, Array]:
             return {name: arrays[name] for name in arrays.files}
     except OSError as error:
         raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except (ValueError, RuntimeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise MatrixError(
             f"{path}: found {error}, expected arrays that np.savez wrote, and no Python objects"
         ) from error

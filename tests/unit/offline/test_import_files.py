@@ -4,6 +4,7 @@
 it has moved by 0.25 of one, 20 Zernike modes, and what pyRTC 2.1 saved of random numbers.
 """
 
+import contextlib
 import re
 import warnings
 from dataclasses import replace
@@ -11,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
+from hypothesis import given
+from hypothesis import strategies as st
 
 import pyrcal
 import pyrcal.offline.recorded
@@ -25,6 +28,7 @@ from pyrcal.offline.importers.files import (
     maps_of,
     mask_of,
 )
+from pyrcal.offline.importers.pyrtc import calibration_of
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.importers.specula import from_specula
 from service.errors import MatrixError
@@ -317,3 +321,25 @@ def test_an_aot_file_without_a_matrix_and_what_is_none_are_refused(tmp_path):
         from_aot(tmp_path / "it.fits", REPORTED)
     with pytest.raises(MatrixError, match="expected an AOT file"):
         from_aot(SPECULA[0], REPORTED)
+
+
+@given(cut=st.integers(0, 3000), flipped=st.integers(0, 3000))
+def test_a_damaged_npz_is_read_or_refused_and_nothing_else(cut, flipped, tmp_path_factory):
+    whole = bytearray((DATA / "pyrtc-im.npz").read_bytes())
+    if flipped < len(whole):
+        whole[flipped] ^= 0xFF
+    path = tmp_path_factory.mktemp("npz") / "it.npz"
+    path.write_bytes(whole[: len(whole) - cut] if cut < len(whole) else b"")
+    with contextlib.suppress(MatrixError):
+        calibration_of(read_npz(path), "it")
+
+
+@pytest.mark.parametrize(("at", "bit"), [(8, 0x40), (6, 0x20), (6, 0x01), (4, 0x80)])
+def test_a_member_that_cannot_be_unpacked_is_refused(at, bit, tmp_path):
+    """Its method, patched or encrypted data, a version to come: in both of a member's headers."""
+    whole = bytearray((DATA / "pyrtc-im.npz").read_bytes())
+    for begins, beside in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
+        whole[whole.index(begins) + at + beside] ^= bit
+    (tmp_path / "it.npz").write_bytes(whole)
+    with pytest.raises(MatrixError, match=r"it\.npz"):
+        read_npz(tmp_path / "it.npz")

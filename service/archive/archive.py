@@ -58,6 +58,7 @@ class Archive:
         self.nights = Nights(self.index.asked, self.index.add_row, noon_utc_h)
         """How the nights went: estimates of α, what happened beside them, trends, notes."""
         self._lock: IO[str] | None = None
+        self._on_disk = False
         self.wrong: tuple[str, ...] = ()
         """What :meth:`open` has found wrong, a line for each."""
 
@@ -84,29 +85,47 @@ class Archive:
         Raises
         ------
         ArchiveError
-            If the directory cannot be written, is in use by another service, or the index is
-            damaged.
+            If the directory cannot be made, is in use by another service, or the index is
+            damaged. A disk that is full is none of these: the index is read into memory, and what
+            is recorded from then on refused until there is room.
         """
         try:
             self.directory.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
             self._lock = _locked(self.directory / "lock")
-            told = [line for folder in self.stores for line in folder.prepare()]
         except OSError as error:
             self.close()
             raise ArchiveError(f"{self.directory}: cannot be used: {error}") from error
         try:
-            anew = self.index.open()
-            for folder in self.stores:
-                told += folder.adopt(anew=anew)
+            told = self._take_in()
+        except StorageError as error:
+            told = self._take_into_memory(error)
         except ArchiveError:
             self.close()
             raise
+        self.wrong = tuple(told)
+        return self.wrong
+
+    def _take_in(self) -> list[str]:
+        """Bring folders and index up to date with each other; return a line for what is wrong."""
+        try:
+            told = [line for folder in self.stores for line in folder.prepare()]
+        except OSError as error:
+            raise StorageError(f"{self.directory}: cannot be used: {error}") from error
+        anew = self.index.open()
+        told += [line for folder in self.stores for line in folder.adopt(anew=anew)]
         if anew and (n_products := len(self.reconstructors.records())):
             lost = self.directory / "index.sqlite"
             text = f"was not there: made anew of {n_products} products; the audit trail begins here"
             told.append(f"{lost}: {text}")
-        self.wrong = tuple(told)
-        return self.wrong
+        self._on_disk = True
+        return told
+
+    def _take_into_memory(self, error: StorageError) -> list[str]:
+        """Do the same in memory, for as long as the disk refuses to be written."""
+        anew = self.index.open_copy()
+        told = [line for folder in self.stores for line in folder.adopt(anew=anew)]
+        self.index.forbid_writing()
+        return [*told, f"{error}: the service runs on what it could read, and records nothing yet"]
 
     def look(self) -> None:
         """Open it to read, beside a service that may be using it; nothing is brought up to date.
@@ -170,6 +189,8 @@ class Archive:
         StorageError
             If the disk refuses.
         """
+        if not self._on_disk:
+            self._take_in()
         for record in records:
             self.reconstructors.write_state(record)
         self.index.record(records, entries, estimates, samples)

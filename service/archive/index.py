@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sqlite3
 import threading
 import time
@@ -174,28 +176,64 @@ class Index:
         self._path = path
         self._lock = threading.Lock()
         self._connection: sqlite3.Connection | None = None
+        self._is_copy = False
 
     def open(self) -> bool:
         """Open the file, or make it; return whether it had to be made.
 
         Raises
         ------
+        StorageError
+            If the disk refuses to be written.
         ArchiveError
-            If it is damaged, of another version, or cannot be written.
+            If it is damaged, of another version, or cannot be opened.
         """
         try:
-            self._connection = sqlite3.connect(
-                self._path, isolation_level=None, check_same_thread=False
-            )
-            with self._use() as connection:
+            connection = sqlite3.connect(self._path, **_OPTIONS)
+        except sqlite3.OperationalError as error:
+            raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
+        anew = self._bring_up(connection)
+        self._is_copy = False
+        return anew
+
+    def open_copy(self) -> bool:
+        """Open a copy in memory while the disk refuses; return whether there is no file to copy.
+
+        It lacks what a service that was killed had written last.
+        """
+        memory = sqlite3.connect(self._name_of_copy, uri=True, **_OPTIONS)
+        with contextlib.suppress(sqlite3.Error):
+            name = f"{self._path.absolute().as_uri()}?mode=ro&immutable=1"
+            with closing(sqlite3.connect(name, uri=True)) as file:
+                file.backup(memory)
+        self._is_copy = True
+        return self._bring_up(memory)
+
+    def forbid_writing(self) -> None:
+        """Refuse to change the copy any more: what would be lost must wait."""
+        with self._use() as connection:
+            connection.execute("PRAGMA query_only = ON")
+
+    @property
+    def _name_of_copy(self) -> str:
+        return f"file:pyrcal-{os.getpid()}-{id(self)}?mode=memory&cache=shared"
+
+    def _bring_up(self, connection: sqlite3.Connection) -> bool:
+        """Use a connection once its tables are those of this version; return if there were none."""
+        try:
+            with self._explained():
                 version = self._version(connection)
                 connection.execute("PRAGMA journal_mode = WAL")
                 connection.execute("PRAGMA synchronous = FULL")
                 older = _widened(connection) if 0 < version < _VERSION else ""
                 connection.executescript(f"BEGIN;{older}{_SCHEMA}")
-                return bool(version == 0)
-        except sqlite3.OperationalError as error:
-            raise ArchiveError(f"{self._path}: cannot be opened: {error}") from error
+        except ArchiveError:
+            connection.close()
+            raise
+        self.close()
+        with self._lock:
+            self._connection = connection
+        return bool(version == 0)
 
     def look(self) -> None:
         """Open the file to read it, as it is, beside a service that may be using it.
@@ -281,6 +319,7 @@ class Index:
     def asked(self, question: str, values: Values) -> list[Any]:
         """Return rows over a connection that only reads; no writer waits."""
         name = f"{self._path.absolute().as_uri()}?mode=ro"
+        name = self._name_of_copy if self._is_copy else name
         with self._explained(), closing(sqlite3.connect(name, uri=True)) as connection:
             return connection.execute(question, values).fetchall()
 
@@ -382,6 +421,8 @@ def begun_ns_utc(record: Product) -> int:
     asked_ns = record.asked_ns_utc if isinstance(record, MeasurementRecord) else None
     return record.created_ns_utc or asked_ns or 0
 
+
+_OPTIONS: dict[str, Any] = {"isolation_level": None, "check_same_thread": False}
 
 _N_COLUMNS = len(fields(AuditEntry)) - 1
 _COLUMNS = ", ".join(

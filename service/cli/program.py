@@ -205,10 +205,13 @@ def announced(data_dir: Path, url: str) -> Iterator[None]:
         yield
         return
     with note:
-        fcntl.flock(note, fcntl.LOCK_EX)
-        json.dump({"data_dir": str(data_dir.absolute()), "url": url}, note)
-        note.flush()
-        Path(note.name).rename(path)  # whoever finds it finds it locked
+        try:
+            fcntl.flock(note, fcntl.LOCK_EX)
+            json.dump({"data_dir": str(data_dir.absolute()), "url": url}, note)
+            note.flush()
+            Path(note.name).rename(path)  # whoever finds it finds it locked
+        except OSError as error:
+            structlog.get_logger().info("service.not-announced", text=str(error))
         try:
             yield
         finally:

@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequenc
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -143,20 +144,10 @@ class FitQueue:
         self._log = structlog.get_logger()
 
     def open(self) -> None:
-        """Remove what an earlier service has left.
-
-        Raises
-        ------
-        ArchiveError
-            If the disk refuses.
-        """
+        """Remove what an earlier service has left."""
         shutil.rmtree(self._folder, ignore_errors=True)
-        try:
+        with contextlib.suppress(OSError):  # a full disk refuses each upload, not the service
             self._folder.mkdir(mode=0o700, parents=True)
-        except OSError as error:
-            raise errors.ArchiveError(
-                f"{self._folder}: cannot be made: {error.strerror}"
-            ) from error
 
     async def close(self) -> None:
         """End the fit that runs, drop those that wait, and remove their files."""
@@ -236,7 +227,7 @@ class FitQueue:
         job = self._remember(name)
         folder = self._folder / job.id
         try:
-            await asyncio.to_thread(folder.mkdir)
+            await asyncio.to_thread(partial(folder.mkdir, parents=True))
             with (folder / UPLOAD).open("wb") as file:
                 await self._receive(job.id, file, body)
         except OSError as error:

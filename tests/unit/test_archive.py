@@ -3,6 +3,7 @@
 import contextlib
 import os
 import random
+import resource
 import signal
 import sqlite3
 import stat
@@ -16,9 +17,9 @@ import h5py
 import numpy as np
 import pytest
 
-from service.archive import Archive, AuditEntry, Range
+from service.archive import Archive, AuditEntry, Pin, Range
 from service.control.gate import GateVerdict
-from service.errors import ArchiveError, UnknownIdError, WireError
+from service.errors import ArchiveError, StorageError, UnknownIdError, WireError
 from service.model.misregistration import Misregistration
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 from service.web.keys import KeyFile, KeyScope
@@ -298,6 +299,44 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path):
         Archive(tmp_path / "var").open()
 
 
+@contextlib.contextmanager
+def full_disk():
+    """No file of this process may grow, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+def test_on_a_full_disk_it_is_open_and_records_as_soon_as_there_is_room(tmp_path, is_new):
+    if not is_new:
+        with contextlib.closing(Archive(tmp_path)) as before:
+            before.open()
+            before.reconstructors.store(record_of("cm-1"), MATRIX, None, {})
+    entry = AuditEntry(t_ns_utc=5, who="ada", name="Stop", text="")
+    with contextlib.closing(Archive(tmp_path)) as archive:
+        with full_disk():
+            (told,) = archive.open()
+            assert "the service runs on what it could read, and records nothing yet" in told
+            assert len(archive.reconstructors.records()) == (not is_new)
+            assert archive.nights.between(0, 100) == ()
+            for _ in range(2):
+                with pytest.raises(StorageError, match="cannot be"):
+                    archive.record((), (entry,))
+            with pytest.raises(StorageError, match="cannot be"):
+                archive.index.pin(Pin(id="cm-1", who="ada", why=""))
+        archive.record((), (entry,))
+        assert [line.who for line in archive.audit_trail()] == ["ada"]
+        archive.reconstructors.store(record_of("cm-2"), MATRIX, None, {})
+    with contextlib.closing(Archive(tmp_path)) as after:
+        assert after.open() == ()
+        assert {record.id for record in after.reconstructors.records()} >= {"cm-2"}
+        assert [line.name for line in after.audit_trail()] == ["Stop"]
+
+
 def test_an_index_that_cannot_be_opened_is_named(tmp_path):
     (tmp_path / "index.sqlite").mkdir()
     with pytest.raises(ArchiveError, match=r"index\.sqlite: cannot be opened"):
@@ -491,7 +530,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from service.archive import Archive, AuditEntry, Range
+from service.archive import Archive, AuditEntry, Pin, Range
 from service.tracking.products import Judged, MatrixState, ReconstructorRecord
 
 archive = Archive(Path(sys.argv[1]))

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import re
+import resource
 import signal
 import stat
 import sys
@@ -42,6 +43,26 @@ def status_of(task: Callable[[], int], name: str = "pyrcal") -> int:
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
+    except (MemoryError, ImportError, OSError, RuntimeError) as error:
+        limit_mb = _memory_limit_mb()
+        if limit_mb is None:
+            raise
+        # a library that finds no room says so in its own way: no thread, no mapping, no memory
+        said = str(error).splitlines()[-1:] or [type(error).__name__]
+        expected = "expected a gigabyte at least, or none (ulimit -v unlimited)"
+        say(f"{name}: found a limit of {limit_mb:.0f} MB of memory, {expected}: {said[0]}")
+        return 2
+
+
+ENOUGH_MB = 1000.0
+"""Of address space: what fails within such a limit and more, fails for another reason."""
+
+
+def _memory_limit_mb() -> float | None:
+    """Return how little memory this process may have; None: enough to run."""
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
+    is_small = 0 <= limit_bytes < ENOUGH_MB * 1e6  # RLIM_INFINITY is negative
+    return limit_bytes / 1e6 if is_small else None
 
 
 def run_command(

@@ -1,9 +1,12 @@
 """How a program ends."""
 
+import resource
 import subprocess
 import sys
 
-from service.cli.program import leave
+import pytest
+
+from service.cli.program import leave, status_of
 
 AT_ITS_END = "import atexit, sys; atexit.register(print, 'taken down'); "
 
@@ -44,3 +47,20 @@ def test_it_is_the_end():
         "taken down"
         not in ended(f"{AT_ITS_END} from {leave.__module__} import leave; leave(0)").stdout
     )
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("can't start new thread"), OSError(12, "no memory")]
+)
+def test_too_small_a_limit_of_memory_is_one_line(monkeypatch, capsys, error):
+    def task():
+        raise error
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (300_000_000, -1))
+    assert status_of(task) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "found a limit of 300 MB of memory, expected a gigabyte at least" in told
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (-1, -1))
+    with pytest.raises(type(error)):  # of another kind: a fault, told with where it is
+        status_of(task)

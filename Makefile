@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long check paper bench clean FORCE
+.PHONY: help setup demo docs test test-long fuzz check paper bench clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -35,6 +35,9 @@ test: $(STAMP) ## all that a change needs, what is known soonest first; ARGS go 
 
 test-long: $(STAMP) ## the other tests: what takes minutes of real time
 	@$(PYTEST) -n 4 $(HUNG)=480 -m 'long and not slow' $(ARGS)  # they wait more than they work
+
+fuzz: $(STAMP) ## a million malformed inputs of every kind; ARGS="--inputs 50000" and the like
+	@$(PY) -m tests.malformed $(ARGS)
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

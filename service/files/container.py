@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Protocol
 
 import h5py
@@ -192,22 +193,27 @@ def _fits(path: Path) -> Iterator[Container]:
         warnings.filterwarnings("error", message=".*truncated")
         try:
             file = fits.open(raw, memmap=False, lazy_load_hdus=False)
-        except (OSError, ValueError, Warning) as error:
+        except (OSError, ValueError, TypeError, LookupError, Warning) as error:
             raise MatrixError(f"{path}: damaged FITS file: {error}") from error
         arrays: dict[str, StoredArray] = {}
         known: dict[str, StoredArray] = {}
-        for number, hdu in enumerate(file):
-            if hdu.is_image and hdu.shape:
-                name = str(hdu.header.get("EXTNAME", number))
-                array = _image(hdu, f"{path}[{name}]", path.stat().st_size)
-                arrays[str(number) if name in arrays else name] = array
-                known.setdefault(name.lower(), array)
-                known[str(number)] = array
+        try:
+            for number, hdu in enumerate(file):
+                if hdu.is_image and hdu.shape:
+                    name = str(hdu.header.get("EXTNAME", number))
+                    array = _image(hdu, f"{path}[{name}]", path.stat().st_size)
+                    arrays[str(number) if name in arrays else name] = array
+                    known.setdefault(name.lower(), array)
+                    known[str(number)] = array
+            facts = {str(key).lower(): value for key, value in file[0].header.items()}
+        except (ValueError, TypeError, LookupError, fits.VerifyError) as error:
+            said = str(error).replace("\n", " ")
+            raise MatrixError(f"{path}: damaged FITS file: {said}") from error
         yield Container(
             path=path,
             arrays=arrays,
             find=lambda name: known.get(name.strip("/").lower()),
-            facts={str(key).lower(): value for key, value in file[0].header.items()},
+            facts=facts,
             is_fits=True,
         )
 
@@ -227,8 +233,9 @@ def _numpy(path: Path) -> Iterator[Container]:
     """Open the one array of a NumPy file; nothing that would have to be unpickled."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise MatrixError(f"{path}: damaged NumPy file: {error}") from error
+    except (OSError, ValueError, EOFError, TypeError, SyntaxError, TokenError) as error:
+        said = str(error).replace("\n", " ")  # of a header that Python's own parser refuses
+        raise MatrixError(f"{path}: damaged NumPy file: {said}") from error
     stored = StoredArray(
         where=str(path),
         shape=array.shape,

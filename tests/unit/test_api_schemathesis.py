@@ -4,6 +4,7 @@ The service behind it is a real one with an archive, which an RTC has told its s
 accepts whatever it is asked and there is no worker: what is ordered is decided as ever.
 """
 
+import contextlib
 import json
 import re
 from pathlib import Path
@@ -64,9 +65,10 @@ class NoWorkers(SimpleNamespace):
         raise WorkerError("nobody is there")
 
 
-@pytest.fixture
-def app(tmp_path, monkeypatch):
-    bridge, workers, archive = Bridge(), NoWorkers(), Archive(tmp_path)
+@contextlib.contextmanager
+def application(folder, keys):
+    """Give the application, its archive in a folder."""
+    bridge, workers, archive = Bridge(), NoWorkers(), Archive(folder)
     archive.open()
     with archive:
         actions = Actions(
@@ -96,10 +98,16 @@ def app(tmp_path, monkeypatch):
             memory_mb=500,
         )
         desk = FitQueue(
-            folder=tmp_path, program=("false",), request=request, limits=limits, clock_ns=Clock()
+            folder=folder, program=("false",), request=request, limits=limits, clock_ns=Clock()
         )
         hosts = Hosts(allowed=("testserver",))
-        yield create_app(supervisor, desk, hosts=hosts, keys=KeyFile(tmp_path))
+        yield create_app(supervisor, desk, hosts=hosts, keys=keys)
+
+
+@pytest.fixture
+def app(tmp_path):
+    with application(tmp_path, KeyFile(tmp_path)) as made:
+        yield made
 
 
 def found_by_asking(app, key, phases, n_examples):

@@ -228,13 +228,17 @@ def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
     )
 
 
+_NOT_NUMPY = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)
+"""What a damaged header of NumPy raises: it is read by Python's own parser."""
+
+
 @contextmanager
 def _numpy(path: Path) -> Iterator[Container]:
     """Open the one array of a NumPy file; nothing that would have to be unpickled."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, TypeError, SyntaxError, TokenError) as error:
-        said = str(error).replace("\n", " ")  # of a header that Python's own parser refuses
+    except _NOT_NUMPY as error:
+        said = str(error).replace("\n", " ")
         raise MatrixError(f"{path}: damaged NumPy file: {said}") from error
     stored = StoredArray(
         where=str(path),

@@ -61,9 +61,10 @@ def refusal(tmp_path, name, content):
 
 def test_what_the_millions_found_stays_mended(tmp_path):
     """A header of NumPy that Python's parser refuses; a card of FITS that astropy cannot read."""
-    header = b"{'descr': '<f8', 'fortran_order': (False, 'shape': (4, 3), }".ljust(117) + b"\n"
-    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
-    assert "damaged NumPy file" in refusal(tmp_path, "a.npy", content)
+    for shape in (b"(False, (4, 3)", b"False, 'shape': (2, 99999999999999999999999)"):
+        header = (b"{'descr': '<f8', 'fortran_order': " + shape + b", }").ljust(117) + b"\n"
+        content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+        assert "damaged NumPy file" in refusal(tmp_path, "a.npy", content)
     card = fits_bytes(TWO_BY_THREE).replace(
         b"SIMPLE  =                    T", b"SIMPLE  = \xff T" + b" " * 17
     )

@@ -25,10 +25,9 @@ from service.model.surface import Gaussian, ThinPlate, mirror_surface
 
 Array = NDArray[np.float64]
 
-CHEAP, FINE = 2, 3
-"""Pupil points per subaperture, and nodes, of the models for derivatives and for residuals; for
-far steps the sensor's kind says how many are enough. Against 8 points the fine one is biased by
-0.02 % of a subaperture and 0.004 % of magnification."""
+CHEAP = 2
+"""Pupil points per subaperture, and nodes, of the model for derivatives; for residuals, and for far
+steps, the sensor's kind says how many are enough."""
 
 BETTER = 0.95
 """Another instrument is believed when it leaves less than this share of χ². On the diffractive
@@ -115,7 +114,7 @@ class FitModels:
     @cached_property
     def fine(self) -> InteractionModel:
         """Decides."""
-        return self.model(FINE)
+        return self.model(kind_of(self.instrument).fine_sampling)
 
     def matrix(self, model: InteractionModel, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D of one of the models, ``(n_slopes, n_modes)``, and count it."""

@@ -235,6 +235,33 @@ def test_every_value_of_the_packaged_aof_names_its_source():
     assert [value for value in values if not named.search(value)] == ['name = "aof-ut4"']
 
 
+def test_the_packaged_maps_has_the_published_number_of_actuators():
+    """Rings 3 to 10 of 6k + 3 each: 3 (11^2 - 3^2) = 336, as Johnson et al. 2024 count them."""
+    maps = load_instrument("maps-mmt")
+    assert len(maps.mirror.positions_m) == 336
+    assert (maps.diameter_m, maps.wfs.kind, maps.stop) == (6.5, "pyramid", Stop.MIRROR)
+    assert not maps.remarks
+
+
+def test_the_packaged_canary_is_what_soapys_tutorial_says():
+    canary = load_instrument("canary")
+    assert canary.diameter_m == 4.2
+    assert canary.obscuration_ratio * 4.2 == pytest.approx(1.2, abs=1e-3)
+    assert (canary.wfs.n_subapertures, canary.wfs.pixels_per_subaperture) == (7, 14)
+    assert 14 * canary.wfs.pixel_scale_arcsec == pytest.approx(2.5, abs=1e-3)
+    assert len(canary.mirror.positions_m) == 52
+    assert canary.loop.frame_rate_hz == 200
+    assert not canary.remarks
+
+
+@pytest.mark.parametrize("name", ["maps-mmt", "canary"])
+def test_every_value_of_maps_and_canary_names_its_source(name):
+    lines = packaged_file(name).read_text(encoding="utf-8").splitlines()
+    values = [line for line in lines if "=" in line and not line.startswith("#")]
+    named = re.compile(r"# (\[[JTS]\]|ours)")
+    assert [value for value in values if not named.search(value)] == [f'name = "{name}"']
+
+
 def test_a_users_file_gives_an_instrument(write):
     pins = 'basis_id = "kl-7"\nconfig_id = "b1"\ndouble_pass = true\n'
     extra = 'influence = "gaussian"\ncoupling = 0.2\n'
@@ -521,8 +548,8 @@ def test_an_unknown_mode_names_those_that_are_known(write):
 
 def test_an_unknown_packaged_name_lists_the_known_ones():
     assert (
-        "neither a packaged name (aof-ut4, flao-lbt, gpao-ut, metis-elt, micado-elt, soul-lbt)"
-        in refusal(load_instrument, "flao-lbtt")
+        "neither a packaged name (aof-ut4, canary, flao-lbt, gpao-ut, maps-mmt, metis-elt, "
+        "micado-elt, soul-lbt)" in refusal(load_instrument, "flao-lbtt")
     )
 
 

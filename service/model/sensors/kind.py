@@ -82,6 +82,10 @@ class SensorKind(ABC):
     loses_gain: ClassVar[bool] = False
     """Whether it answers less the larger the residual wavefront is."""
 
+    fine_sampling: ClassVar[int] = 3
+    """Pupil points along a subaperture, and nodes, of the model that decides the fit of a matrix:
+    against 8 a pyramid's is biased by 0.02 % of a subaperture and 0.004 % of magnification."""
+
     edge_slips: ClassVar[bool] = False
     """Whether it can take the mirror's edge for one a fringe away, and hold it there."""
 

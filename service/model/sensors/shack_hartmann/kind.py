@@ -31,6 +31,10 @@ class ShackHartmannKind(SensorKind):
     name = "shack-hartmann"
     table = ShackHartmannTable
     unknown: ClassVar[Mapping[str, float]] = {"wavelength_m": 750e-9}
+
+    fine_sampling = 4
+    """With three points fits of OOPAO's matrices are off by 0.004 deg on 20 by 20 lenslets, twice
+    their σ; with four by 0.0015, and six change no more than noise."""
     signals = (SignalKind.XY,)
 
     @override

@@ -233,6 +233,8 @@ class Rest:
             sent.append(message)
 
         await self._app(scope, receive, send)
+        if not sent:  # a file is not sent to one who has gone, as this one has
+            return
         status = sent[0]["status"]
         if status >= 500 and scope["path"] != "/readyz":
             raise AssertionError(f"{status}: {sent[-1].get('body', b'')[:300]!r}")

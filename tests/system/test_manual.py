@@ -42,6 +42,10 @@ def desk(tmp_path_factory):
     matrix = push_pull(instrument, alpha, n_modes=60, noise=1e-4, seed=4)
     with h5py.File(folder / "im.h5", "w") as file:
         file["interaction_matrix"] = 2.0 * matrix  # the file says double_pass
+    imported = folder / "bench"  # what pyrcal import writes, of another code's files
+    imported.mkdir()
+    shutil.copy(folder / "bench.toml", imported / "instrument.toml")
+    shutil.copy(folder / "im.h5", imported / "matrix.h5")
     shutil.copytree(ROOT / "tests" / "data" / "tiny", folder / "tests" / "data" / "tiny")
     return folder
 

@@ -26,7 +26,7 @@ from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
-from sim_rtc.held_rate import frame_s, held_rate_hz
+from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz
 from sim_rtc.options import Options
 from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.telescope.detector import Detector, PixelDetector, binned
@@ -136,7 +136,10 @@ def _binned(
 
 
 def at_held_rate(options: Options, instrument: Instrument) -> Options:
-    """Return the options with the highest frame rate that this machine holds, at most theirs."""
+    """Return the options with the highest frame rate that this machine holds, at most theirs.
+
+    Where that is too low for a dither, the loop keeps the rate asked for, in slow motion.
+    """
     instrument = in_sensor_mode(options, instrument)
     n_modes = instrument.modes.n_modes
     n_valid = int(rtc_valid_subapertures(instrument).sum())
@@ -145,7 +148,10 @@ def at_held_rate(options: Options, instrument: Instrument) -> Options:
         n_modes,
         options.n_controlled(n_modes, most_of(instrument)),
     )
-    return replace(options, frame_rate_hz=held_rate_hz(options.frame_rate_hz, one_frame_s))
+    held_hz = held_rate_hz(options.frame_rate_hz, one_frame_s)
+    if held_hz < min(DITHERED_FROM_HZ, options.frame_rate_hz):
+        return replace(options, given_speed=held_hz / options.frame_rate_hz)
+    return replace(options, frame_rate_hz=held_hz)
 
 
 def in_sensor_mode(options: Options, instrument: Instrument) -> Instrument:

@@ -229,7 +229,8 @@ class Options:
     )
     held_rate: bool = option(
         "--held-rate",
-        "run at the highest frame rate, up to --rate, that this machine holds",
+        "run at the highest frame rate, up to --rate, that this machine holds; below 200 Hz, which "
+        "a dither needs, in slow motion instead",
         action="store_true",
     )
     given_gain: float | None = option(

@@ -38,10 +38,10 @@ FAR = f"""\
 loop of 400 modes diverges, so the RTC begins with 120. WFE is what the simulator knows to be left.
 """
 LARGE = """\
-This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs at
-the rate that this machine holds, and the table says which. Until all is ready takes minutes: modes
-(kept on the disk afterwards), D and its derivatives, and the simulator's own matrices, some 8 GB of
-them beside 4 of the service's.
+This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
+fast as this machine goes: at the highest rate that it holds or, where a dither needs more, in slow
+motion. Until all is ready takes minutes: modes (kept on the disk afterwards), D and its derivatives,
+and the simulator's own matrices, some 8 GB of them beside 4 of the service's.
 """
 LARGE_FAR = f"""\
 {PLACE} The RTC begins
@@ -143,7 +143,7 @@ def _promise(options: argparse.Namespace) -> Promise:
     return Promise(
         seconds=options.seconds,
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
-        real_time=options.plant != "diffractive",
+        real_time=options.plant != "diffractive" and large is None,
         wanted_ratio=_wanted_ratio(options),
         held_rate=options.instrument != OWN,
         large=large is not None,

@@ -353,7 +353,7 @@ def rate_line(state: dict[str, Any] | None, asked_hz: float = USUAL_RATE_HZ) -> 
 def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
     """Return what to say where it takes longer than asked for; None: it does not."""
     if pace is not None and pace < REAL_TIME:
-        who = "this machine is slow: the simulator" if real_time else "the diffractive telescope"
+        who = "this machine is slow: the simulator" if real_time else "the simulated telescope"
         return f"         {who} runs at {pace:.1f} of real time; this takes longer"
     if behind:
         return "         this machine is slow: the service's worker is behind; this takes longer"

@@ -30,3 +30,17 @@ def test_the_simulator_takes_the_rate_over(monkeypatch):
     monkeypatch.setattr("sim_rtc.assembly.frame_s", lambda *_: SHARE / 600.0)
     options = parse_options(["--instrument", "soul-lbt", "--held-rate"])
     assert at_held_rate(options, load_instrument("soul-lbt")).frame_rate_hz == 500.0
+
+
+def test_below_what_a_dither_needs_the_loop_keeps_its_rate_in_slow_motion(monkeypatch):
+    monkeypatch.setattr("sim_rtc.assembly.frame_s", lambda *_: SHARE / 120.0)
+    options = parse_options(["--instrument", "soul-lbt", "--rate", "500", "--held-rate"])
+    held = at_held_rate(options, load_instrument("soul-lbt"))
+    assert (held.frame_rate_hz, held.speed) == (500.0, 0.2)
+
+
+def test_one_who_asks_for_a_low_rate_gets_it(monkeypatch):
+    monkeypatch.setattr("sim_rtc.assembly.frame_s", lambda *_: SHARE / 120.0)
+    options = parse_options(["--instrument", "soul-lbt", "--rate", "100", "--held-rate"])
+    held = at_held_rate(options, load_instrument("soul-lbt"))
+    assert (held.frame_rate_hz, held.speed) == (100.0, 1.0)

@@ -90,8 +90,8 @@ class ProbationFinding:
     worse."""
 
     residual_ratio: float | None = None
-    """RMS of the residual, as the matrix before reads it, over that before, seeing taken out; None:
-    nobody knows that matrix's numbers."""
+    """RMS of the residual, as both matrices read it, over that before, seeing taken out; as the one
+    before reads it alone where nobody knows the numbers of the other; None: of neither."""
 
     residual_limit: float | None = None
     """Of that ratio: more is worse; None as above."""
@@ -214,10 +214,7 @@ def compared(
     )
     whole_rms = (None, None) if whole is None else tuple(float(np.sqrt(x)) for x in whole)
     if whole is not None:
-        text += (
-            f", the residual as {before.id} reads it {whole_rms[0]:.2f}, seeing taken out "
-            f"({whole_rms[1]:.2f})"
-        )
+        text += f", the residual {whole_rms[0]:.2f}, seeing taken out ({whole_rms[1]:.2f})"
     if ring_rms is not None:
         text += f", the outer ring {ring_rms:.2f} ({np.sqrt(RING_WORSE):.1f})"
     return ProbationFinding(

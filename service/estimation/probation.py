@@ -6,7 +6,7 @@ mode's steps are compared with its own under the matrix before. A step of the in
 ``g R s``, the residual as the loop sees it; its change over ``LAG`` frames keeps what rings and
 leaves turbulence out. What all modes have in common, their median, is seeing, light, optical gain.
 
-Whatever single modes do, the residual as a whole is compared as well, as the matrix before reads it
+Whatever single modes do, the residual as a whole is compared as well, as both matrices read it
 (``residual``); and the slopes, block by block, for a loop that is lost has no tenth of a second.
 
 Numbers are from docs/results/probation.md.
@@ -115,6 +115,9 @@ class Comparison(Detector):
     reader: Reader | None = None
     """Reads the residual: of the matrix in use, or of the one before while it is compared."""
 
+    own: NDArray[np.float32] | None = None
+    """The matrix in use, where it is not the reader's: it has read the telemetry before, too."""
+
     healthy: Before | None = None
     """What the last matrix found worse was compared with: the next one is compared with it, too."""
 
@@ -180,6 +183,8 @@ def observe(
             state = _swapped(state, some)
         if state.before is None and state.healthy is None:
             state = replace(state, reader=_reader(state.reader, matrix))
+        elif state.before is not None and matrix is not state.own:
+            state = _read_by(state, state.before, matrix)
         state = _observed(_note_runaway(state, some), some, modes, lines_hz, edge)
     return state
 
@@ -188,6 +193,12 @@ def _reader(reader: Reader | None, matrix: NDArray[np.float32] | None) -> Reader
     if matrix is None:
         return None
     return reader if reader is not None and reader.matrix is matrix else Reader.of(matrix)
+
+
+def _read_by(state: Comparison, before: Before, matrix: NDArray[np.float32] | None) -> Comparison:
+    """Have the matrix in use read the telemetry before, too."""
+    level = None if before.level is None else before.level.read_by(matrix)
+    return replace(state, own=matrix, before=replace(before, level=level))
 
 
 def _note_runaway(state: Comparison, block: FrameBlock) -> Comparison:
@@ -240,7 +251,7 @@ def _observed(
         return replace(state, n_skipped=state.n_skipped + block.n_frames)
     steps = _changes(rows)
     lines = tuple(f * block.dt_ns * 1e-9 for f in lines_hz) if moved else ()
-    reader, residual = (None, None) if state.reader is None else state.reader.read(block)
+    reader, residual = (None, None) if state.reader is None else state.reader.read(block, state.own)
     state = replace(state, reader=reader)
     if len(steps) < 3 * (1 + 2 * len(lines)):
         return state

@@ -5,6 +5,9 @@ whichever matrix closes the loop. With the command taken off, it is the turbulen
 that moves in a few hundredths of a second tells how hard the loop's work is just now. Both are
 compared mode by mode.
 
+A loop brings to zero what its own matrix reads, modes beyond the controlled ones included: each
+matrix finds its own loop better. So both read both loops, and what they agree on counts.
+
 **Its rejection.** The residual as the loop itself reads it, over its commands, tells whether it
 holds well.
 """
@@ -27,6 +30,9 @@ STRIDE = 8
 
 LAG = 4
 """Samples between two positions of the turbulence whose difference counts."""
+
+KEPT = 4
+"""One of so many samples is kept, for a matrix to come to read."""
 
 GROUP = 5
 """Parts that are taken together to see how much the residual scatters."""
@@ -62,17 +68,37 @@ class Residual:
     commanded: Array
     """Of the command, over the samples of ``seen``."""
 
+    own: Array | None = None
+    """Of the residual as the loop's own matrix reads it; None: it is the one that is believed, or
+    its numbers are not known."""
+
+    kept: tuple[NDArray[np.float32], ...] = ()
+    """``(n, n_slopes)`` each: some of the samples themselves."""
+
     def plus(self, other: Residual | None) -> Residual:
         """Return the sums over both."""
         if other is None or len(other.seen) != len(self.seen):
             return self
+        own = None
+        if self.own is not None and other.own is not None and len(self.own) == len(other.own):
+            own = self.own + other.own
         return Residual(
             n_seen=self.n_seen + other.n_seen,
             seen=self.seen + other.seen,
             n_moved=self.n_moved + other.n_moved,
             moved=self.moved + other.moved,
             commanded=self.commanded + other.commanded,
+            own=own,
+            kept=self.kept + other.kept,
         )
+
+    def read_by(self, matrix: NDArray[np.float32] | None) -> Residual:
+        """Return the sums with ``own`` as this matrix reads the samples that were kept."""
+        n_kept = sum(map(len, self.kept))
+        if matrix is None or not n_kept:
+            return replace(self, own=None)
+        squares = [_squares(some @ matrix.T) for some in self.kept]
+        return replace(self, own=np.sum(squares, axis=0) * (self.n_seen / n_kept))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,8 +120,13 @@ class Reader:
         none = np.zeros((0, len(matrix)), np.float32)
         return cls(matrix=matrix, seq=np.zeros(0, np.int64), turbulence_m=none)
 
-    def read(self, block: FrameBlock) -> tuple[Reader, Residual | None]:
-        """Return the residual in a block; None: it uses none of its frames."""
+    def read(
+        self, block: FrameBlock, own: NDArray[np.float32] | None = None
+    ) -> tuple[Reader, Residual | None]:
+        """Return the residual in a block; None: it uses none of its frames.
+
+        ``own`` is the matrix ``(n_modes, n_slopes)`` that closes the loop, if it is another one.
+        """
         rows = np.arange(-block.first_seq % STRIDE, block.n_frames, STRIDE)
         if not len(rows):
             return self, None
@@ -106,12 +137,15 @@ class Reader:
         turbulence = np.concatenate([self.turbulence_m, residual - commands])
         moved = turbulence[LAG:] - turbulence[:-LAG]
         moved = moved[seq[LAG:] - seq[:-LAG] == LAG * STRIDE]
+        kept = (block.first_seq + rows) % (KEPT * STRIDE) == 0
         sums = Residual(
             n_seen=len(rows),
             seen=_squares(residual),
             n_moved=len(moved),
             moved=_squares(moved),
             commanded=_squares(commands),
+            own=None if own is None else _squares(block.slopes[rows] @ own.T),
+            kept=(block.slopes[rows[kept]],) if own is None and kept.any() else (),
         )
         return replace(self, seq=seq[-LAG:], turbulence_m=turbulence[-LAG:]), sums
 
@@ -138,6 +172,10 @@ class ResidualLevel:
         logs = [np.log(ratio(total, group, modes)) for group in known]
         scatter = max(float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0, MIN_SCATTER)
         return cls(total=total, scatter=scatter, n_groups=len(known))
+
+    def read_by(self, matrix: NDArray[np.float32] | None) -> ResidualLevel:
+        """Return the level with ``own`` as this matrix reads it."""
+        return replace(self, total=self.total.read_by(matrix))
 
     def limit(self, n_parts: int) -> float:
         """Return the ratio of powers beyond which so many parts are worse."""
@@ -170,6 +208,7 @@ def total_of(parts: tuple[Residual, ...]) -> Residual | None:
 def ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:
     """Return the residual's power in these modes over that before, seeing taken out.
 
+    Where the matrix that closes the loop has read both, it is the geometric mean of both readings.
     How the turbulence moves in a mode that runs away is told wrongly: no mode is forgiven more than
     twice what the median mode is.
     """
@@ -183,8 +222,16 @@ def ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:
         common = float(np.median(harder))
         # half its own, for that scatters; noise does not become less with the seeing
         harder = np.clip(np.sqrt(harder * common), 1.0, max(2.0 * common, 1.0))
+    believed = _over(now / harder, was)
+    own = [r.own / r.n_seen for r in (before, after) if r.own is not None]
+    if len(own) < 2 or len(own[0]) != len(own[1]) or modes.max() >= len(own[0]):
+        return believed
+    return float(np.sqrt(believed * _over(own[1][modes] / harder, own[0][modes])))
+
+
+def _over(now: Array, was: Array) -> float:
     total = float(was.sum())
-    return float((now / harder).sum() / total) if total > 0.0 else 1.0
+    return float(now.sum() / total) if total > 0.0 else 1.0
 
 
 def _squares(rows: NDArray[np.float32]) -> Array:

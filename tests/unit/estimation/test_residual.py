@@ -25,15 +25,29 @@ def turbulence(seconds, rng, strength=1.0):
     return 1e-6 * strength * walk / (1.0 + np.arange(N_MODES))
 
 
-def played(stretches, rng, noise=2e-9):
+BEYOND = np.linalg.qr(np.hstack([RESPONSE, RNG.normal(size=(N_SLOPES, 20))]))[0][:, N_MODES:]
+"""Slopes of modes that no matrix controls."""
+
+
+def reading_beyond(seed):
+    """A matrix that takes modes beyond for its own, each seed other ones."""
+    mixes = np.linalg.qr(np.random.default_rng(seed).normal(size=(N_MODES, 20)))[0]
+    return np.float32(RESPONSE.T + 0.7 * mixes @ BEYOND.T)
+
+
+def played(stretches, rng, noise=2e-9, beyond_m=0.0):
     """Blocks of a loop under matrices one after the other: id, seconds, matrix, seeing."""
     wave = np.concatenate([turbulence(s, rng, seeing) for _, s, _, seeing in stretches])
     names = [name for name, s, _, _ in stretches for _ in range(round(s * 1e9 / DT_NS))]
     matrices = {name: matrix for name, _, matrix, _ in stretches}
+    uncontrolled = beyond_m * scipy.signal.lfilter(
+        [0.14], [1.0, -0.99], rng.normal(size=(len(wave), BEYOND.shape[1])), axis=0
+    )
     commands = np.zeros((len(wave) + DELAY, N_MODES))
     slopes = np.zeros((len(wave), N_SLOPES))
     for k, name in enumerate(names):
         slopes[k] = RESPONSE @ (wave[k] + commands[k]) + noise * rng.normal(size=N_SLOPES)
+        slopes[k] += BEYOND @ uncontrolled[k]
         wanted = commands[k + DELAY - 1] - GAIN * (matrices[name] @ slopes[k])
         commands[k + DELAY] = np.clip(wanted, -1e-4, 1e-4)
     for k in range(0, len(wave), BLOCK):
@@ -53,10 +67,10 @@ def played(stretches, rng, noise=2e-9):
         )
 
 
-def judged(stretches, seed=2, whole=True):
+def judged(stretches, seed=2, whole=True, beyond_m=0.0):
     """All verdicts on these matrices, in order."""
     state, found = Comparison(), []
-    for matrix, block in played(stretches, np.random.default_rng(seed)):
+    for matrix, block in played(stretches, np.random.default_rng(seed), beyond_m=beyond_m):
         state = observe(state, block, np.arange(N_MODES), matrix=matrix if whole else None)
         if state.found is not None and (not found or state.found is not found[-1]):
             found.append(state.found)
@@ -84,6 +98,20 @@ def test_the_same_matrix_in_other_seeing_is_not(seeing, seed):
     (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, MATRIX, seeing)], seed)
     assert found.verdict is Verdict.AS_GOOD, found.text
     assert found.residual_ratio < found.residual_limit
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_loop_is_no_worse_for_what_the_matrix_before_takes_for_its_own(seed):
+    """The loop of the one before had that at zero, and the other's has not."""
+    loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 3.5, reading_beyond(2), 1.0)]
+    (found,) = judged(loops, seed, beyond_m=60e-9)
+    assert found.verdict is Verdict.AS_GOOD, found.text
+
+
+def test_a_third_of_the_gain_is_found_behind_modes_beyond_as_well():
+    loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 3.5, 0.3 * reading_beyond(2), 1.0)]
+    (found,) = judged(loops, beyond_m=30e-9)
+    assert found.verdict is Verdict.WORSE, found.text
 
 
 @pytest.mark.parametrize("mode", [0, 10, 39])

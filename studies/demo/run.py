@@ -31,9 +31,9 @@ WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
 """Of the wavefront error before and after, where the night begins far away: of FLAO, and of any
 other telescope, whose modes leave what they leave."""
 
-FEW_MODES, FEW_RATIO = 170, 1.08
+FEW_MODES, FEW_RATIO = 170, 1.05
 """Of a telescope with fewer modes, which begins with seven tenths of them: all of them leave 1.17
-times less than that (variance by N^(-√3/2), Noll 1976), and half of it in decibels is asked."""
+times less than that (variance by N^(-√3/2), Noll 1976), and a third of it in decibels is asked."""
 
 PLACE = """\
 The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
@@ -137,9 +137,12 @@ def _too_large(options: argparse.Namespace) -> _Large | None:
 
 def _n_slopes(said: InstrumentFile) -> float:
     """Return about how many slopes a file's sensor has."""
-    across = said.section(said.kind.table).said.pupil_diameter
     kind = said.section(SlopesTable).said.kind
-    return float(kind.n_planes * math.pi / 4 * across**2)
+    return float(kind.n_planes * math.pi / 4 * _across_subap(said) ** 2)
+
+
+def _across_subap(said: InstrumentFile) -> float:
+    return float(said.section(said.kind.table).said.pupil_diameter)
 
 
 def _promise(options: argparse.Namespace) -> Promise:
@@ -149,6 +152,7 @@ def _promise(options: argparse.Namespace) -> Promise:
         whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
         real_time=options.plant != "diffractive" and large is None,
         wanted_ratio=_wanted_ratio(options),
+        across_subap=_across_subap(read_instrument_file(options.instrument)),
         held_rate=options.instrument != OWN,
         large=large is not None,
         asked_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,

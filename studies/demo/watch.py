@@ -14,6 +14,7 @@ from studies.demo.children import Child
 from studies.demo.report import (
     MODEL,
     REAL_TIME,
+    TOLERANCE_ACROSS_SUBAP,
     WORKER_BEHIND,
     Circumstances,
     Report,
@@ -121,6 +122,9 @@ class Promise:
     wanted_ratio: float = 1.0
     """Wavefront error before over after."""
 
+    across_subap: float = TOLERANCE_ACROSS_SUBAP
+    """Subapertures across the pupil."""
+
     held_rate: bool = False
     """The simulator runs at the highest rate that this machine holds."""
 
@@ -176,6 +180,7 @@ class TelemetryObserver:
             untold_s=0.0 if clock is None else clock.silent_s,
             endings=self._endings(),
             wanted_ratio=self._promise.wanted_ratio,
+            across_subap=self._promise.across_subap,
             refusal=refusal,
         )
         return make_report(self._state, self._reconstructors, self._truth, circumstances)

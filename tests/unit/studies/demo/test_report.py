@@ -141,6 +141,18 @@ def test_an_estimate_beyond_its_tolerance_fails(truth, name, error):
     assert any(text.startswith(f"{name} is off by") for text in report.failures)
 
 
+@pytest.mark.parametrize(
+    ("across_subap", "allowed_deg"), [(7.0, 0.2143), (15.0, 0.1), (30.0, 0.05), (90.0, 0.05)]
+)
+def test_a_small_pupil_may_turn_until_its_edge_moves_as_far(truth, across_subap, allowed_deg):
+    """0.05 deg at 15 subapertures from the middle: 0.0131 of one; 0.2143 deg at 3.5, too."""
+    well = replace(WELL, across_subap=across_subap)
+    for error, refused in ((0.99 * allowed_deg, False), (1.01 * allowed_deg, True)):
+        report = make_report(service_state(rotation_deg=error), shelf(), truth, well)
+        found = [text for text in report.failures if "allowed" in text]
+        assert bool(found) is refused, found
+
+
 def test_an_estimate_within_its_tolerance_but_surer_than_it_may_be_fails(truth):
     report = make_report(service_state(rotation_deg=0.03), shelf(), truth, WELL)
     assert report.failures == ["rotation_deg is off by +5.0 sigma"]

@@ -65,9 +65,10 @@ def test_another_telescope_runs_as_fast_as_the_machine_holds_and_has_a_bar_of_it
     assert 1.0 < _promise(other).wanted_ratio < _promise(own).wanted_ratio
 
 
-def test_few_modes_are_not_asked_for_more_than_half_of_what_they_can_leave():
-    """40 modes begin with 28: (40 / 28) ** (sqrt(3) / 4) = 1.167, whose root is 1.080."""
-    assert _promise(options("--instrument", "canary")).wanted_ratio == 1.08
+def test_few_modes_are_asked_for_a_third_of_what_they_can_leave():
+    """40 modes begin with 28: (40 / 28) ** (sqrt(3) / 4) = 1.167, whose cubic root is 1.053."""
+    promise = _promise(options("--instrument", "canary"))
+    assert (promise.wanted_ratio, promise.across_subap) == (1.05, 7.0)
 
 
 def test_a_telescope_too_large_for_real_time_is_asked_for_its_own_rate_and_given_time():

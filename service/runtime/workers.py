@@ -74,8 +74,16 @@ class WorkerPool:
         self.cluster_problem = ""
         """What is wrong with the cluster that is to help it, by its last job; empty: nothing."""
 
-        self.cpu_s: defaultdict[str, float] = defaultdict(float)
-        """Processor time of the worker by name of the job, seconds; a job that fails is not in."""
+        self._cpu_s: defaultdict[str, float] = defaultdict(float)
+        self._under_way: tuple[str, float] | None = None
+
+    @property
+    def cpu_s(self) -> dict[str, float]:
+        """Processor time of the worker by name of the job, the one under way included, seconds."""
+        if self._under_way is None:
+            return dict(self._cpu_s)
+        name, cpu_s = self._under_way
+        return {**self._cpu_s, name: self._cpu_s.get(name, 0.0) + cpu_s}
 
     @property
     def busy_s(self) -> float:
@@ -150,6 +158,7 @@ class WorkerPool:
         try:
             await self._watched(name, worker, under_way)
             done = under_way.result()
+            self._under_way = (name, done.cpu_s)
         except EOFError as error:
             raise WorkerError(self._lost(f"the worker process died during {name}")) from error
         except TimeoutError as error:
@@ -161,9 +170,9 @@ class WorkerPool:
             raise
         finally:
             self._busy_s, self._busy_since_s = self.busy_s, None
+            self._cpu_s, self._under_way = defaultdict(float, self.cpu_s), None
         self.problem = ""
         self.cluster_problem = done.cluster_problem
-        self.cpu_s[name] += done.cpu_s
         self._longest_s[name] = max(self._longest_s[name], done.cpu_s)
         self._limit_s[name] = max(MIN_LIMIT_S, LIMIT_RATIO * self._longest_s[name])
         return done
@@ -180,6 +189,7 @@ class WorkerPool:
         moved_s, limit_s = time.monotonic(), self._limit_s.get(name, UNKNOWN_LIMIT_S)
         while not (await asyncio.wait({under_way}, timeout=LOOK_S))[0]:
             cpu_s, now_s = worker.cpu_s(), time.monotonic()
+            self._under_way = (name, cpu_s - begun_cpu_s)
             if cpu_s != last_cpu_s:
                 last_cpu_s, moved_s, self.problem = cpu_s, now_s, ""
             still_s = now_s - moved_s

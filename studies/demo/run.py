@@ -45,7 +45,7 @@ LARGE = """\
 This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
 fast as this machine goes: at the highest rate that it holds or, where a dither needs more, in slow
 motion. Until all is ready takes minutes: modes (kept on disk afterwards), D and its derivatives,
-and the simulator's own matrices, some 8 GB of them beside 4 of the service's.
+and the simulator's own matrices: some 9 GB beside 6 of the service's.
 """
 LARGE_FAR = f"""\
 {PLACE} The RTC begins

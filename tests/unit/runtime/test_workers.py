@@ -98,6 +98,17 @@ async def test_the_worker_tells_the_processor_time_of_every_kind_of_job(workers)
     assert 0.4 <= workers.cpu_s["spinning"] < 2.0
 
 
+async def test_it_tells_that_of_a_job_under_way_as_well(workers, monkeypatch):
+    await workers.call(process_id)
+    monkeypatch.setattr("service.runtime.workers.LOOK_S", 0.02)
+    under_way = asyncio.ensure_future(workers.call(spinning))
+    while not workers.cpu_s.get("spinning"):
+        await asyncio.sleep(0.01)
+    assert not under_way.done()
+    await under_way
+    assert 0.2 <= workers.cpu_s["spinning"] < 1.0
+
+
 async def test_an_interrupt_from_the_keyboard_is_the_services_business(shared):
     assert await shared.call(interrupted) == "still here"
 

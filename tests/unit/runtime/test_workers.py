@@ -102,8 +102,11 @@ async def test_it_tells_that_of_a_job_under_way_as_well(workers, monkeypatch):
     await workers.call(process_id)
     monkeypatch.setattr("service.runtime.workers.LOOK_S", 0.02)
     under_way = asyncio.ensure_future(workers.call(spinning))
-    while not workers.cpu_s.get("spinning"):
-        await asyncio.sleep(0.01)
+    begun = asyncio.Event()
+    while not begun.is_set():
+        await asyncio.wait({under_way}, timeout=0.01)
+        if workers.cpu_s.get("spinning"):
+            begun.set()
     assert not under_way.done()
     await under_way
     assert 0.2 <= workers.cpu_s["spinning"] < 1.0

@@ -146,7 +146,9 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
         _show_passive(context, event, np.full(4, np.inf), np.zeros(4), text)
         return
     text = "no dithered estimate to compare with: nothing is made from this reading alone"
-    _show_passive(context, event, event.estimate.sigma, np.zeros(4), text)
+    # α has the model's own error anyway: that of a coarse mirror is larger than any bias
+    sigma = np.hypot(event.estimate.sigma, context.policy.floor)
+    _show_passive(context, event, sigma, np.zeros(4), text)
 
 
 def _with_first_bias(registration: Registration, estimate: PassiveEstimate) -> Registration:

@@ -69,8 +69,16 @@ def test_it_only_reports_while_there_is_nothing_to_compare_with():
     watch(story, Misregistration())
     assert story.state.alpha.passive.consistent
     assert "no dithered estimate" in story.state.alpha.passive.text
-    np.testing.assert_array_equal(story.state.alpha.passive.sigma, watched(ALPHA).sigma)
     assert story.state.alpha.registration is None
+
+
+def test_while_alpha_is_unknown_a_look_has_the_models_own_error_too():
+    """On a coarse mirror that is larger than all that a look says of itself."""
+    policy = replace(POLICY, floor=np.array([0.01, 0.02, 0.003, 0.004]))
+    story = Story(Mode.AUTO, policy).meet()
+    watch(story, Misregistration())
+    expected = np.hypot(watched(ALPHA).sigma, policy.floor)
+    np.testing.assert_allclose(story.state.alpha.passive.sigma, expected)
 
 
 def test_while_alpha_is_unknown_each_look_begins_at_the_last_one():

@@ -115,9 +115,11 @@ class Player:
             await self._look()
             await self._age()
             progress(self._now_s)
+        rest_s = self._now_s - self._summed_s
         self._now_s += 1.0  # what waited for frames that are missing comes
         await self._look()
-        await self._sum_up()
+        if rest_s > PASSIVE_INTERVAL_S / 2 or not self.track.passive:  # a short one knows little
+            await self._sum_up()
         self.track.state = self._engine.state
         if self._random is not None:
             self.track.noisy = noisy_matrix(self._random)

@@ -133,6 +133,7 @@ def document(track: Track, source: Path) -> dict[str, Any]:
         "passive": [
             {
                 "t_ns_utc": one.t_ns_utc,
+                "estimator": one.estimator,
                 "alpha": one.alpha.to_boundary(),
                 "sigma": _named(one.sigma) if np.isfinite(one.sigma).all() else None,
                 "text": one.text,

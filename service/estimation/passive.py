@@ -230,6 +230,11 @@ class Passive(PassiveSums):
         return None
 
     @property
+    def instrument_filter(self) -> HighPass:
+        """What makes instruments of the commands."""
+        return high_pass(self.delay_frames)
+
+    @property
     def instruments(self) -> NDArray[np.intp]:
         """Modes whose filtered commands are summed with everything, ``(n_instruments,)``, rising.
 
@@ -323,7 +328,7 @@ def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
     if n_rows < 1 or not n_due:
         return state
     head = joined_frames(tuple(block.rows(0, N_TAPS) for block in blocks)).rows(0, N_TAPS)
-    n_before, chosen = n_rows + _REACH - blocks[-1].n_frames, high_pass(state.delay_frames)
+    n_before, chosen = n_rows + _REACH - blocks[-1].n_frames, state.instrument_filter
     later = range(SAMPLE_FRAMES - n_before, n_rows - n_before, SAMPLE_FRAMES)[: n_due - 1]
     samples = list(state.samples)
     for rows in (head, *(blocks[-1].rows(start, start + N_TAPS) for start in later)):
@@ -334,7 +339,7 @@ def _sampled(state: Passive, *blocks: FrameBlock) -> Passive:
 
 def _summed(state: Passive, frames: FrameBlock, *, last: bool) -> Passive:
     """Add frames to the sums: the first of a run, the last, or some between."""
-    chosen, commands = high_pass(state.delay_frames), frames.commands_m
+    chosen, commands = state.instrument_filter, frames.commands_m
     # those that the filter reaches both ends of
     now = slice(chosen.behind, frames.n_frames - chosen.ahead)
     before = slice(now.start - 1, now.stop - 1)
@@ -489,5 +494,5 @@ def _slope_variance(state: Passive, matrix: Array) -> float:
         return float("nan")
     slopes = np.array([slopes for slopes, _ in state.samples])
     commands = np.array([commands for _, commands in state.samples])
-    passed = float(np.sum(high_pass(state.delay_frames).taps ** 2))
+    passed = float(np.sum(state.instrument_filter.taps**2))
     return float(np.mean((slopes - commands @ matrix.T) ** 2)) / passed

@@ -26,7 +26,6 @@ from service.runtime.estimator_bank import (
     with_matrix,
     with_rtc,
 )
-from service.runtime.registry import REGISTRY
 from service.tracker import step
 from service.tracking import alarms
 from service.tracking import events as ev
@@ -98,7 +97,7 @@ class Engine:
 
     def set_description(self, description: Description) -> None:
         """Take what the optical model expects of telemetry: estimators begin to listen."""
-        self.bank = EstimatorBank.of(description)
+        self.bank = EstimatorBank.of(description, self.policy.passive)
         self.policy = replace(
             self.policy, mode_information=description.mode_information, start=description.start
         )
@@ -110,7 +109,8 @@ class Engine:
         """
         self._checked_out = None
         if self.bank is not None:
-            before, anew = self.bank.loop, EstimatorBank.of(self.bank.loop.description)
+            before = self.bank.loop
+            anew = EstimatorBank.of(before.description, self.policy.passive)
             self.bank = replace(anew, loop=replace(anew.loop, matrices=before.matrices))
             self._follow()
 
@@ -254,7 +254,7 @@ def follow_state(
 def detect_changes(before: EstimatorBank, bank: EstimatorBank, state: TrackerState) -> list[Event]:
     """Return what blocks of telemetry have brought besides windows, estimator by estimator."""
     found: list[Event] = []
-    for entry, was, member in zip(REGISTRY, before.members, bank.members, strict=True):
+    for entry, was, member in zip(bank.entries, before.members, bank.members, strict=True):
         if entry.events is not None:
             found += entry.events(was, member, bank.loop, state)
         for name, text, over in entry.conditions(member):

@@ -21,7 +21,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq, same_loop, same_rate
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.windows import SETTLING_S, WindowRefused
-from service.runtime.registry import REGISTRY
+from service.runtime.registry import Entry, listed
 from service.tracking.dither_request import Dither, expected_dither, lock_in_plan, random_plan
 from service.wire import DitherKind, Status
 
@@ -36,8 +36,11 @@ class EstimatorBank:
     """All streaming estimators and their view of the loop."""
 
     loop: LoopContext
+    entries: tuple[Entry, ...]
+    """Of the registry, those that are fed."""
+
     members: tuple[Streaming, ...]
-    """In the order of the registry."""
+    """One for each of them."""
 
     begun_with: Status | None = None
     """The loop as it was when the open window, or the sums of ordinary telemetry, began."""
@@ -46,10 +49,11 @@ class EstimatorBank:
     """The one that is followed."""
 
     @classmethod
-    def of(cls, description: Description) -> EstimatorBank:
-        """Return estimators before any RTC."""
-        loop = LoopContext(description=description)
-        return cls(loop=loop, members=tuple(entry.kind.begin(loop) for entry in REGISTRY))
+    def of(cls, description: Description, passive: str = "slopes") -> EstimatorBank:
+        """Return estimators before any RTC, the passive one made of slopes or commands."""
+        loop, entries = LoopContext(description=description), listed(passive)
+        members = tuple(entry.kind.begin(loop) for entry in entries)
+        return cls(loop=loop, entries=entries, members=members)
 
     def __getitem__(self, kind: type[Member]) -> Member:
         """Return the estimator of a kind."""

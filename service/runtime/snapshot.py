@@ -18,7 +18,7 @@ from service.tracking.commands import GainGroup
 from service.tracking.interlocks import Permission, permissions
 from service.tracking.operations.running import Operating, operating
 from service.tracking.policy import Policy
-from service.tracking.registration import Registration
+from service.tracking.registration import PassiveBias, Registration
 from service.tracking.sending import why_no_return
 from service.tracking.state import LogEntry, TrackerState
 from service.wire import Status
@@ -225,14 +225,22 @@ class Alpha:
     @property
     def passive_bias(self) -> NDArray[np.float64] | None:
         """Bias of the passive estimate, as far as learnt; null: unknown."""
-        biases = self.registration.biases
-        return biases[0].offset if biases else None
+        bias = self._bias
+        return None if bias is None else bias.offset
 
     @property
     def passive_bias_sigma(self) -> NDArray[np.float64] | None:
         """1 σ of it."""
-        biases = self.registration.biases
-        return np.sqrt(np.diag(biases[0].covariance)) if biases else None
+        bias = self._bias
+        return None if bias is None else np.sqrt(np.diag(bias.covariance))
+
+    @property
+    def _bias(self) -> PassiveBias | None:
+        """Of the estimate that is shown; one that was made of something else before is no more."""
+        biases, shown = self.registration.biases, self.snapshot.tracker.alpha.passive
+        if shown is None:
+            return biases[0] if biases else None
+        return next((bias for bias in biases if bias.block.name == shown.estimator), None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

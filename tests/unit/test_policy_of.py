@@ -38,7 +38,8 @@ def test_flexure_slew_and_the_limits_of_a_stale_alpha_are_the_users():
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("flexure_subap_per_degree", -0.1), ("slew_limit_deg", 0.0)]
+    ("key", "value"),
+    [("flexure_subap_per_degree", -0.1), ("slew_limit_deg", 0.0), ("passive", "modes")],
 )
 def test_what_cannot_be_is_refused_by_its_key(key, value):
     with pytest.raises(ConfigurationError, match=key):

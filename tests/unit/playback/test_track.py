@@ -131,6 +131,33 @@ def test_without_a_dither_it_says_what_ordinary_telemetry_says(telemetry, tmp_pa
     assert "alpha was not found: no dithered window" in capsys.readouterr().out
 
 
+def test_a_rest_of_a_second_does_not_outdo_the_estimates_before_it(telemetry, tmp_path, capsys):
+    """Looks are of four seconds; what is left over knows less, and is the last to be told."""
+    plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
+    cut = {k: v[:5000] if k in ("slopes", "commands_m") else v for k, v in plain.items()}
+    _, found, _ = tracked(capsys, saved(tmp_path, cut))
+    assert len(found["passive"]) == 1
+
+
+def test_a_file_too_short_for_one_look_gives_what_it_can(telemetry, tmp_path, capsys):
+    plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
+    cut = {k: v[:1500] if k in ("slopes", "commands_m") else v for k, v in plain.items()}
+    _, found, _ = tracked(capsys, saved(tmp_path, cut))
+    assert len(found["passive"]) == 1
+
+
+def test_commands_alone_tell_alpha_where_the_settings_say_so(telemetry, tmp_path, capsys):
+    """Within 3 sigma, which are mostly the bias that no dither has taught: it is that of a wind."""
+    settings = tmp_path / "commands.toml"
+    settings.write_text('[tracking]\npassive = "commands"\n')
+    plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
+    _, found, _ = tracked(capsys, saved(tmp_path, plain), f"--config={settings}")
+    last = found["passive"][-1]
+    assert last["estimator"] == "commands"
+    for name, value in TRUE.items():
+        assert abs(last["alpha"][name] - value) < 3.0 * last["sigma"][name]
+
+
 def without(name):
     return lambda arrays: arrays.pop(name)
 

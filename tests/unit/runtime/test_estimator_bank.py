@@ -5,10 +5,13 @@ from dataclasses import dataclass, replace
 import pytest
 from typing_extensions import override
 
+from service.estimation.correlation import CommandCorrelation
 from service.estimation.estimator import UNMARKED, Change, Detector, LoopContext, Mark
 from service.estimation.health import LoopHealth
+from service.estimation.passive import Passive
+from service.estimation.passive_sums import PassiveSums
 from service.runtime.estimator_bank import EstimatorBank, process_block, with_dither, with_rtc
-from service.runtime.registry import REGISTRY
+from service.runtime.registry import Entry
 from service.tracking.alarms import ALARMS
 from tests.unit.runtime.test_streams import DESCRIPTION, DITHER, RTC, WINDOW_S, block
 
@@ -50,7 +53,9 @@ class Marker(Detector):
 
 
 def bank_of(*members):
-    return EstimatorBank(loop=LoopContext(description=DESCRIPTION), members=members)
+    entries = tuple(Entry(type(member)) for member in members)
+    loop = LoopContext(description=DESCRIPTION)
+    return EstimatorBank(loop=loop, entries=entries, members=members)
 
 
 def test_one_begins_anew_for_what_it_declares_and_for_nothing_else():
@@ -101,9 +106,18 @@ def test_a_loop_that_ran_away_is_forgotten_with_its_rtc():
     assert with_rtc(bank, None)[LoopHealth] == LoopHealth()
 
 
+@pytest.mark.parametrize(
+    ("passive", "kind"), [("slopes", Passive), ("commands", CommandCorrelation)]
+)
+def test_one_passive_estimate_is_fed_and_never_two(passive, kind):
+    """Both know the same noise: a filter would count it twice."""
+    members = EstimatorBank.of(DESCRIPTION, passive).members
+    assert [type(member) for member in members if isinstance(member, PassiveSums)] == [kind]
+
+
 def test_each_detector_has_as_many_conditions_as_alarms():
-    members = EstimatorBank.of(DESCRIPTION).members
-    for entry, member in zip(REGISTRY, members, strict=True):
+    bank = EstimatorBank.of(DESCRIPTION)
+    for entry, member in zip(bank.entries, bank.members, strict=True):
         names = [name for name, text, over in entry.conditions(member) if over and text is None]
         assert names == list(entry.alarms)
         assert set(names) <= ALARMS.keys()

@@ -25,7 +25,6 @@ from service.runtime.estimator_bank import (
     with_matrix,
     with_rtc,
 )
-from service.runtime.registry import REGISTRY
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm
 from service.tracking.dither_request import Dither
@@ -416,7 +415,7 @@ def raised(bank):
 def told(streams):
     return [
         (name, text)
-        for entry, member in zip(REGISTRY, streams.members, strict=True)
+        for entry, member in zip(streams.entries, streams.members, strict=True)
         for name, text, _ in entry.conditions(member)
     ]
 

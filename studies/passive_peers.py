@@ -3,29 +3,38 @@
 Run by an interpreter that has OOPAO and SPECULA, from the repository's root:
 ``python -m studies.passive_peers oopao --seeds 0:20``. Sensor and turbulence are theirs, the loop
 runs on the matrix that the sensor itself shows, and α is known: the mirror was put there.
+
+With ``--track FOLDER`` telemetry and an instrument file are written there, as a user would have
+them, and what ``pyrcal track`` makes of each is held against the truth, from a perfect registration
+on: the last estimate of each seed.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import io
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 from OOPAO.Atmosphere import Atmosphere
 
-from service.config import load_instrument
+from pyrcal.playback.arrays import opened_arrays
+from pyrcal.playback.player import Player
+from service.config import load_instrument, load_settings
 from service.estimation import passive
 from service.estimation.estimate import PassiveEstimate
 from service.estimation.frames import FrameBlock
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.kinds import Stop
-from service.model.misregistration import Misregistration
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
 from studies.peers_cases import mirror_points
 from studies.peers_oopao import Oopao
@@ -193,6 +202,43 @@ def looks(
     return found
 
 
+def instrument_file(folder: Path, valid: Array) -> Path:
+    """Write what a user of the peer would say of it, and return where."""
+    with h5py.File(folder / "mask.h5", "w") as file:
+        file["valid"] = valid
+    text = INSTRUMENT.read_text()
+    text = re.sub('stop = "mirror"', f'stop = "{Stop.TELESCOPE.value}"', text)
+    text = re.sub("wavelength_m = .*", f"wavelength_m = {BENCH.wavelength_m}", text)
+    text = text.replace("[mirror]", 'valid_subapertures = "mask.h5:/valid"\n\n[mirror]')
+    path = folder / "instrument.toml"
+    path.write_text(text)
+    return path
+
+
+def tracked(
+    folder: Path, seed: int, sky: Sky, slopes: Array, commands: Array, response: Array
+) -> tuple[Array, Array]:
+    """Return error and σ of the last look of ``pyrcal track`` at a file, ``(4,)`` each."""
+    path = folder / f"{seed}.npz"
+    np.savez(
+        path,
+        slopes=slopes,
+        commands_m=commands,
+        reconstructor=np.linalg.pinv(response[:, : sky.n_controlled]),
+        gains=GAIN,
+        leak=LEAK,
+        frame_rate_hz=RATE_HZ,
+        delay_frames=2.0,
+        alpha=sky.alpha.vector * BOUNDARY_SCALE,
+    )
+    instrument = load_instrument(str(folder / "instrument.toml"))
+    player = Player(instrument, load_settings(None, {}), instrument.name)
+    with opened_arrays(path) as arrays:
+        track = asyncio.run(player.play(arrays.messages(instrument), lambda _: None))
+    found = track.passive[-1]  # the one before begins at a perfect registration
+    return found.alpha.vector - sky.alpha.vector, found.sigma
+
+
 def main() -> None:
     """Play the nights that are asked for, and say how far looks lie from the truth by their σ."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -202,8 +248,12 @@ def main() -> None:
     parser.add_argument("--photons", type=float, help="default: 200, 1000 or 5000, drawn")
     parser.add_argument("--modes", type=int, default=0, help="controlled; default: 45 or 60, drawn")
     parser.add_argument("--dithered", action="store_true", help="the four highest modes, 4 nm each")
+    parser.add_argument("--track", type=Path, metavar="FOLDER", help="with pyrcal track")
     given = parser.parse_args()
     sensor = Quadrants(given.peer)
+    if given.track is not None:
+        given.track.mkdir(parents=True, exist_ok=True)
+        instrument_file(given.track, sensor.valid)
     drawn = load_instrument(str(INSTRUMENT))
     wfs = replace(drawn.wfs, valid_subapertures=sensor.valid, wavelength_m=BENCH.wavelength_m)
     model = RtcInteractionModel(
@@ -216,6 +266,13 @@ def main() -> None:
         slopes, commands, dither, response = telemetry(
             sensor, sky, seed, given.frames, dithered=given.dithered
         )
+        if given.track is not None:
+            error, sigma = tracked(given.track, seed, sky, slopes, commands, response)
+            own = np.where(np.isfinite(sigma), error / sigma, np.inf)
+            errors.append((own, own))
+            said = (*(error * BOUNDARY_SCALE), *(sigma * BOUNDARY_SCALE))
+            print(seed, *(f"{value:+.4f}" for value in said), flush=True)
+            continue
         sign = np.sign(np.sum(response * near.matrix))
         shown = dither if given.dithered else None
         for look in looks(sky, near, sign * slopes, commands, shown):
@@ -225,6 +282,10 @@ def main() -> None:
             print(
                 seed, *(f"{value:+.2f}" for value in (*errors[-1][0], *errors[-1][1])), flush=True
             )
+    if given.track is not None:
+        within = np.abs([own for own, _ in errors]) < 2.0
+        print("within 2 sigma", within.sum(axis=0), "of", len(within))
+        return
     scatter, sigma = np.array(errors).transpose(1, 0, 2)
     print("RMS error over scatter", np.sqrt((scatter**2).mean(axis=0)).round(2))
     print("within 2 sigma", (np.abs(sigma) < 2.0).mean(axis=0).round(3), "of", len(sigma))

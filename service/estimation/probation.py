@@ -182,17 +182,21 @@ def observe(
         if some.cm_id != state.cm_id or (state.tail and some.session != state.tail.session):
             state = _swapped(state, some)
         if state.before is None and state.healthy is None:
-            state = replace(state, reader=_reader(state.reader, matrix))
+            state = _believe(state, matrix)
         elif state.before is not None and matrix is not state.own:
             state = _read_by(state, state.before, matrix)
         state = _observed(_note_runaway(state, some), some, modes, lines_hz, edge)
     return state
 
 
-def _reader(reader: Reader | None, matrix: NDArray[np.float32] | None) -> Reader | None:
+def _believe(state: Comparison, matrix: NDArray[np.float32] | None) -> Comparison:
+    """Have the residual read by this matrix; what another one has read does not count any more."""
     if matrix is None:
-        return None
-    return reader if reader is not None and reader.matrix is matrix else Reader.of(matrix)
+        return replace(state, reader=None)
+    if state.reader is not None and state.reader.matrix is matrix:
+        return state
+    parts = tuple(replace(part, residual=None) for part in state.parts)
+    return replace(state, reader=Reader.of(matrix), parts=parts)
 
 
 def _read_by(state: Comparison, before: Before, matrix: NDArray[np.float32] | None) -> Comparison:

@@ -2,7 +2,7 @@
 
 Run: ``python -m studies.campaign.probation --plant diffractive --marginal 50 --good 50 --output
 var/probation.jsonl``. The small telescope, no service: matrices are swapped in one after the other,
-telemetry is compared as the service does, and one that is found worse gives way to the one before
+telemetry is compared as the service does, which knows their numbers, and one that is found worse gives way to the one before
 ``BACK_S`` later. A marginal matrix is made for a registration so far off, in a random direction,
 that the loop's largest pole radius, with the response that the sensor has around the residual
 wavefront of this very night, is what the trial asks for; a good one for the true registration, as
@@ -110,6 +110,7 @@ class Night:
         self.comparison = Comparison()
         self._model = bench_of(SMALL)
         self._n_swaps, self._n_now, self.dithered = 0, N_MODES[0], False
+        self._matrices: dict[str | None, NDArray[np.float32]] = {}
         self._swap(self.good(N_MODES[0]))
         self.pass_(SETTLED_S)
         self.calm_nm = self.wavefront_nm(1.0)
@@ -168,6 +169,8 @@ class Night:
             "mode_ratio": found.mode_ratio if found else None,
             "limit": found.limit if found else None,
             "common_ratio": found.common_ratio if found else None,
+            "residual_ratio": found.residual_ratio if found else None,
+            "residual_limit": found.residual_limit if found else None,
             "slopes_ratio": found.slopes_ratio if found else None,
             "before_nm": before_nm,
             "after_nm": after_nm,
@@ -193,7 +196,8 @@ class Night:
         lines = _DITHER.frequency_hz or ()
         while self.dome.time_s < end_s:
             for block in self.dome.play():
-                self.comparison = observe(self.comparison, block, modes, lines)
+                matrix = self._matrices.get(block.cm_id)
+                self.comparison = observe(self.comparison, block, modes, lines, matrix=matrix)
 
     def wavefront_nm(self, seconds: float) -> float:
         """Return the RMS wavefront error of the last seconds."""
@@ -214,6 +218,7 @@ class Night:
             self.dome.instrument.modes.n_modes,
         )
         gains = (GAIN,) * n_modes + (0.0,) * (total - n_modes)
+        self._matrices[name] = matrix
         self.dome.order(LoopRequest(id=name, n_controlled=n_modes, gains=gains))
         known = self.dome.computer.reconstructor
         manifest = replace(known.manifest, id=name)

@@ -114,6 +114,20 @@ def test_a_third_of_the_gain_is_found_behind_modes_beyond_as_well():
     assert found.verdict is Verdict.WORSE, found.text
 
 
+def test_residuals_of_a_matrix_of_more_modes_are_not_mixed_with_those_of_fewer():
+    """The third comes a second after the verdict on the second: half is read by the first."""
+    loops = [("a", 4.0, MATRIX, 1.0), ("b", 4.0, MATRIX, 1.0), ("c", 3.5, MATRIX, 1.0)]
+    numbers, state, found = {"a": MATRIX[:20].copy(), "b": MATRIX.copy(), "c": MATRIX}, None, []
+    for _, block in played(loops, np.random.default_rng(2)):
+        state = observe(state or Comparison(), block, np.arange(20), matrix=numbers[block.cm_id])
+        if state.found is not None and state.found not in found:
+            found.append(state.found)
+    assert [(one.after, one.verdict) for one in found] == [
+        ("b", Verdict.AS_GOOD),
+        ("c", Verdict.AS_GOOD),
+    ]
+
+
 @pytest.mark.parametrize("mode", [0, 10, 39])
 def test_a_mode_of_the_other_sign_is_noticed_within_a_tenth_of_a_second(mode):
     (found,) = judged([("a", 2.0, MATRIX, 1.0), ("b", 0.2, with_sign(mode), 1.0)])

@@ -18,6 +18,7 @@ from service.archive.store import DAMAGE, Folder, Provenance, Store
 from service.control.gains import gain_table
 from service.errors import ArchiveError, ConfigurationError, StorageError
 from service.files.container import put_covariance
+from service.files.durable import replace_file
 from service.files.recording import Recording
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.tracking.operation_records import MeasurementRecord, MeasureState, NoisyFinding
@@ -369,12 +370,11 @@ def _write_beside(path: Path, text: bytes) -> None:
     StorageError
         If the disk refuses.
     """
-    part = path.with_suffix(".json.part")
+    beside = path.with_suffix(".json")
     try:
-        part.write_bytes(text)
-        part.replace(path.with_suffix(".json"))
+        replace_file(beside, text)
     except OSError as error:
-        raise StorageError(f"{part}: cannot be written: {error}") from error
+        raise StorageError(f"{beside}: cannot be written: {error}") from error
 
 
 def _fill(

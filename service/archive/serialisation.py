@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import threading
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ArchiveError, ModelError, StorageError
+from service.files.durable import replace_file
 from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE
 from service.tracking.filtering import joint_of
 from service.tracking.registration import Purpose, Registration
@@ -161,13 +161,10 @@ class TrackingFile:
         StorageError
             If the disk refuses.
         """
-        part = self._path.with_suffix(".part")
+        text = json.dumps(_kept(saved)).encode()
         try:
-            with self._lock, part.open("w", encoding="utf-8") as file:
-                json.dump(_kept(saved), file)
-                file.flush()
-                os.fsync(file.fileno())
-                part.replace(self._path)
+            with self._lock:
+                replace_file(self._path, text)
         except OSError as error:
             raise StorageError(f"{self._path}: cannot be written: {error}") from error
 

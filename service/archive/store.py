@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -17,6 +16,7 @@ from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
+from service.files.durable import flush
 from service.wire import checked_id, checksum
 
 Provenance = str | int | float | bool | NDArray[Any]
@@ -294,9 +294,9 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
         with h5py.File(part, "w") as file:
             fill(file)
         part.chmod(0o444)
-        _flush(part)
+        flush(part)
         part.rename(path)
-        _flush(path.parent)
+        flush(path.parent)
     except (OSError, RuntimeError) as error:
         part.unlink(missing_ok=True)
         raise StorageError(f"{path}: cannot be written: {error}") from error
@@ -311,11 +311,3 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         raise ArchiveError(f"{path}: missing, although it was stored") from error
     except DAMAGE as error:
         raise ArchiveError(f"{path}: damaged: {error}") from error
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

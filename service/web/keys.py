@@ -24,6 +24,7 @@ from typing import Annotated
 import msgspec
 
 from service.errors import ConfigurationError, UnknownIdError
+from service.files.durable import replace_file
 
 PREFIX = "pyrcal_"
 """Of every key: whoever finds one lying about can tell what it is."""
@@ -175,19 +176,12 @@ class KeyFile:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)
             yield
-            os.fsync(folder)
         finally:
             os.close(folder)
 
     def _write(self, keys: tuple[Key, ...]) -> None:
-        part = self.path.with_suffix(".part")
         try:
-            part.unlink(missing_ok=True)  # with whatever rights somebody left it
-            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-                file.write(msgspec.json.format(msgspec.json.encode(keys)) + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(self.path)
+            replace_file(self.path, msgspec.json.format(msgspec.json.encode(keys)) + b"\n", 0o600)
         except OSError as error:
             raise ConfigurationError(f"{self.path}: cannot be written: {error}") from error
 

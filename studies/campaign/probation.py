@@ -2,11 +2,11 @@
 
 Run: ``python -m studies.campaign.probation --plant diffractive --marginal 50 --good 50 --output
 var/probation.jsonl``. The small telescope, no service: matrices are swapped in one after the other,
-telemetry is compared as the service does, which knows their numbers, and one that is found worse gives way to the one before
-``BACK_S`` later. A marginal matrix is made for a registration so far off, in a random direction,
-that the loop's largest pole radius, with the response that the sensor has around the residual
-wavefront of this very night, is what the trial asks for; a good one for the true registration, as
-well as it is measured. Each has as many modes as before, more, or fewer.
+telemetry is compared as the service does, which knows their numbers, and one that is found worse
+gives way to the one before ``BACK_S`` later. A marginal matrix is made for a registration so far
+off, in a random direction, that the loop's largest pole radius, with the response that the sensor
+has around the residual wavefront of this very night, is what the trial asks for; a good one for the
+true registration, as well as it is measured. Each has as many modes as before, more, or fewer.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ def test_scopes_are_ranks():
 
 def test_nobody_else_can_read_the_file_whatever_lay_there(tmp_path):
     file = KeyFile(tmp_path)
-    part = tmp_path / "keys.part"
+    part = tmp_path / "keys.json.part"
     part.write_text("left over")
     part.chmod(0o666)
     file.add("ada", KeyScope.READ)

@@ -565,7 +565,7 @@ async def test_alpha_that_could_not_be_saved_is_an_alarm_and_saved_later(
     supervisor, archive, monkeypatch, impatient
 ):
     monkeypatch.setattr("service.runtime.archiving.SAVE_INTERVAL_S", 0.01)
-    part = archive.directory / "tracking.part"
+    part = archive.directory / "tracking.json.part"
     async with running(supervisor):
         part.mkdir()
         known = told(Story(Mode.HOLD).meet(), n_windows=1)

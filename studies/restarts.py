@@ -1,0 +1,384 @@
+"""Kill the service again and again; what it has acknowledged must be there afterwards.
+
+Run: ``python -m studies.restarts --rounds 200 --output var/restarts.jsonl``. A service of the small
+telescope on a data folder of its own, and a simulated RTC that goes on all the while. In each round
+somebody gives orders over REST, and the service alone is killed with SIGKILL at a random moment: in
+three rounds of four about when it answers an order to publish. Then it is started anew and asked.
+
+An order counts as acknowledged when its answer of 2xx has come back. The RTC's own account, its
+truth file, says which matrix closes the loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from studies.campaign.small import SETTINGS, SMALL
+from studies.demo.truth import TruthFile
+
+ASKED_S = 5.0
+"""From the start of the process until it tracks again."""
+
+WITHIN_S = 60.0
+"""Longer than this, and the round is broken."""
+
+PUBLISH_S = 0.4
+"""A kill comes at most so long after an order to publish has been sent."""
+
+IDLE_S = 1.5
+"""... or, in the other rounds, after the first order."""
+
+ALPHA = "0.12,-0.08,0.3,1.004"
+N_START = 45
+
+
+@dataclass(kw_only=True)
+class Round:
+    """One kill and what was found after it."""
+
+    number: int
+    publishing: bool
+    """Whether the kill came while an order to publish had been sent and not yet been answered."""
+
+    acknowledged: int = 0
+    """Orders so far in all rounds."""
+
+    answers_s: float | None = None
+    """From the start of the process until REST answers."""
+
+    tracks_s: float | None = None
+    """... until the registration it had is there, the RTC is known and frames come in."""
+
+    window_s: float | None = None
+    """... until the first window of its own."""
+
+    broken: list[str] = field(default_factory=list)
+    """What should have been found, or should not."""
+
+
+@dataclass(kw_only=True)
+class Acknowledged:
+    """What the service has said that it has done."""
+
+    notes: list[str] = field(default_factory=list)
+    products: list[str] = field(default_factory=list)
+    pins: list[str] = field(default_factory=list)
+    mode: str = "auto"
+    n_orders: int = 0
+
+
+class Telescope:
+    """The RTC, which nobody kills, and the service of the moment."""
+
+    def __init__(self, directory: Path, seed: int) -> None:
+        self.directory = directory
+        self.port, self.zenoh_port = _free_port(), _free_port()
+        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=10.0)
+        self.truth = TruthFile(directory / "truth.jsonl")
+        self.settings = directory / "settings.toml"
+        self.settings.write_text(_toml(), encoding="utf-8")
+        self.service: subprocess.Popen[bytes] | None = None
+        self.rtc = self._process(
+            "rtc",
+            *("sim_rtc", "--connect", f"tcp/127.0.0.1:{self.zenoh_port}", "--instrument", SMALL),
+            *(f"--alpha={ALPHA}", "--mag", "6", "--n-controlled", str(N_START), "--quiet"),
+            *("--seed", str(seed), "--truth", str(directory / "truth.jsonl")),
+        )
+
+    def start(self) -> float:
+        """Start the service; return the moment."""
+        begun_s = time.monotonic()
+        self.service = self._process(
+            "service",
+            *("service", "run", "--config", str(self.settings), "--instrument", SMALL),
+            *("--listen", f"tcp/127.0.0.1:{self.zenoh_port}", "--port", str(self.port)),
+            *("--data-dir", str(self.directory / "data"), "--mode", "auto"),
+        )
+        return begun_s
+
+    def kill(self) -> None:
+        """Kill the service, and it alone: its worker has to notice."""
+        if self.service is not None:
+            self.service.send_signal(signal.SIGKILL)
+            self.service.wait()
+
+    def end(self) -> None:
+        """End everything."""
+        self.client.close()
+        for process in (self.service, self.rtc):
+            if process is not None:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+    def get(self, path: str) -> Any:  # noqa: ANN401 - JSON
+        """Return the answer of REST."""
+        return self.client.get(path).raise_for_status().json()
+
+    def state(self) -> dict[str, Any] | None:
+        """Return the state; None: the service does not answer."""
+        try:
+            found: dict[str, Any] = self.get("/v1/state")
+        except httpx.HTTPError:
+            return None
+        return found
+
+    def wait(self, begun_s: float, condition: Callable[[dict[str, Any]], object]) -> float | None:
+        """Return how long after ``begun_s`` the state fulfils it; None: not in time."""
+        while (now_s := time.monotonic() - begun_s) < WITHIN_S:
+            state = self.state()
+            if state is not None and condition(state):
+                return now_s
+            time.sleep(0.05)
+        return None
+
+    def in_use(self) -> str | None:
+        """Return the matrix in use, as the RTC itself accounts for it."""
+        self.truth.read()
+        last = self.truth.last
+        return None if last is None else last["cm_id"]
+
+    def _process(self, name: str, *words: str) -> subprocess.Popen[bytes]:
+        with (self.directory / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", *words],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            )
+
+
+class Operator:
+    """Gives orders, and remembers those that were acknowledged."""
+
+    def __init__(self, telescope: Telescope, rng: np.random.Generator) -> None:
+        self._telescope, self._rng = telescope, rng
+        self.told = Acknowledged()
+        self._answered = threading.Event()
+
+    def orders(self, number: int) -> None:
+        """Note, pin and change the mode, as far as the service lets him."""
+        text = f"round {number}: {self._rng.integers(1 << 30):x}"
+        if self._send("POST", "/v1/annotations", {"note": text}):
+            self.told.notes.append(text)
+        mode = ("auto", "propose", "hold")[int(self._rng.integers(3))]
+        if self._send("PUT", "/v1/mode", {"mode": mode}):
+            self.told.mode = mode
+        own = self._own()
+        if own and self._send("PUT", f"/v1/archive/{own[-1]}/pin", None):
+            self.told.pins.append(own[-1])
+
+    def publish(self) -> None:
+        """Send the newest matrix again; an answer may never come."""
+        own = self._own()
+        if not own:
+            return
+        answer = self._send("POST", f"/v1/reconstructors/{own[-1]}/publish", None)
+        if answer:
+            self.told.products.append(answer.split(" ", 1)[0])
+            self.told.mode = "hold"
+        self._answered.set()
+
+    @property
+    def answered(self) -> bool:
+        """Whether the order to publish has been answered."""
+        return self._answered.is_set()
+
+    def _own(self) -> list[str]:
+        with suppress(httpx.HTTPError):
+            found = self._telescope.get("/v1/reconstructors")["reconstructors"]
+            return [one["id"] for one in found if one["state"] in {"applied", "superseded"}][1:]
+        return []
+
+    def _send(self, method: str, path: str, body: object) -> str:
+        """Return what an acknowledged order was answered; empty: it was not."""
+        with suppress(httpx.HTTPError):
+            with httpx.Client(base_url=self._telescope.client.base_url, timeout=20.0) as client:
+                answer = client.request(method, path, json=body)
+            if answer.is_success:
+                self.told.n_orders += 1
+                return str(answer.json().get("text", "yes")) or "yes"
+        return ""
+
+
+def one_round(telescope: Telescope, told: Acknowledged, number: int, seed: int) -> Round:
+    """Give orders, kill, start anew and look."""
+    rng = np.random.default_rng([seed, number])
+    operator = Operator(telescope, rng)
+    operator.told = told
+    wanted = number % 4 != 3
+    giving = threading.Thread(
+        target=operator.publish if wanted else operator.orders,
+        args=() if wanted else (number,),
+    )
+    giving.start()
+    time.sleep(float(rng.uniform(0.0, PUBLISH_S if wanted else IDLE_S)))
+    found = Round(number=number, publishing=wanted and not operator.answered)
+    telescope.kill()
+    giving.join()
+    found.acknowledged = told.n_orders
+    begun_s = telescope.start()
+    found.answers_s = telescope.wait(begun_s, lambda _: True)
+    found.tracks_s = telescope.wait(begun_s, _tracks)
+    if found.tracks_s is None:
+        found.broken.append(f"does not track within {WITHIN_S:g} s: {_what_it_says(telescope)}")
+        return found
+    _look(telescope, told, found)
+    found.window_s = telescope.wait(begun_s, lambda state: state["registration"]["n_windows"] > 0)
+    if found.window_s is None:
+        found.broken.append(f"no window within {WITHIN_S:g} s")
+    return found
+
+
+def _what_it_says(telescope: Telescope) -> str:
+    state = telescope.state()
+    if state is None:
+        return "it does not answer"
+    waits = [wait["text"] for wait in state["waiting_for"]]
+    alarms = [alarm["text"] for alarm in state["alarms"]]
+    return "; ".join([state["ready_reason"], *waits, *alarms])
+
+
+def _tracks(state: dict[str, Any]) -> bool:
+    known, rtc = state["registration"], state["rtc"]
+    heard = state["ready"] and rtc is not None and state["link"]["frames_received"] > 0
+    return bool(heard and known is not None and known["restored_ns_utc"] is not None)
+
+
+def _look(telescope: Telescope, told: Acknowledged, found: Round) -> None:
+    """Hold what the service says against what it has acknowledged and what the RTC does."""
+    state = telescope.state() or {}
+    shelf = {one["id"]: one for one in telescope.get("/v1/reconstructors")["reconstructors"]}
+    lost = [name for name in told.products if name not in shelf]
+    found.broken += [f"{name} was acknowledged and is gone" for name in lost]
+    notes = {one["note"] for one in telescope.get("/v1/annotations")["annotations"]}
+    found.broken += [f"the note {text!r} is gone" for text in told.notes if text not in notes]
+    archive = telescope.get("/v1/archive")["products"]
+    kept = {one["id"]: "pin" in one["kept_because"] for one in archive}
+    found.broken += [f"{name} is not pinned" for name in set(told.pins) if not kept.get(name)]
+    # a kill may come between the answer's making and its arrival, never the other way round
+    if state["mode"] != told.mode and state["mode"] != "hold":
+        found.broken.append(f"mode {state['mode']}, acknowledged was {told.mode}")
+    told.mode = state["mode"]
+    in_use = telescope.in_use()
+    if state["in_use"] != in_use:
+        found.broken.append(f"{state['in_use']} is said to be in use, the RTC has {in_use}")
+    found.broken += _half_products(telescope, shelf)
+
+
+def _half_products(telescope: Telescope, shelf: dict[str, Any]) -> list[str]:
+    """Return which matrices cannot be read whole, or are said to be on their way for ever."""
+    broken = []
+    for name, record in list(shelf.items())[-4:]:
+        answer = telescope.client.get(f"/v1/reconstructors/{name}/matrix")
+        if answer.status_code != httpx.codes.OK:
+            broken.append(f"{name}: {answer.text}")
+            continue
+        matrix = np.load(io.BytesIO(answer.content))
+        if matrix.shape[0] != record["n_modes"] or not np.isfinite(matrix).all():
+            broken.append(f"{name}: {matrix.shape} of {record['n_modes']} modes")
+    folder = telescope.directory / "data" / "reconstructors"
+    files = {path.stem for path in folder.glob("*.h5")} ^ {
+        path.stem for path in folder.glob("*.json")
+    }
+    return broken + [f"{name}: half of it is on the disk" for name in files if name in shelf]
+
+
+def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:
+    """Run rounds, and write what came of each at once."""
+    telescope, told, rounds = Telescope(directory, seed), Acknowledged(), []
+    try:
+        begun_s = telescope.start()
+        if telescope.wait(begun_s, lambda state: len(_applied(telescope)) > 1) is None:
+            raise RuntimeError(f"no matrix was applied within {WITHIN_S:g} s: see {directory}")
+        for number in range(n_rounds):
+            rounds.append(one_round(telescope, told, number, seed))
+            with output.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(rounds[-1])) + "\n")
+            if rounds[-1].tracks_s is None:
+                break
+    finally:
+        telescope.end()
+    return rounds
+
+
+def _applied(telescope: Telescope) -> list[str]:
+    found = telescope.get("/v1/reconstructors")["reconstructors"]
+    return [one["id"] for one in found if one["state"] in {"applied", "superseded"}]
+
+
+def summary(rounds: list[Round]) -> str:
+    """Return what came of all rounds, for a person."""
+    broken = [f"round {one.number}: {text}" for one in rounds for text in one.broken]
+    lines = [
+        f"{len(rounds)} kills, {sum(one.publishing for one in rounds)} while publishing; "
+        f"{rounds[-1].acknowledged if rounds else 0} orders acknowledged; {len(broken)} broken",
+        *broken,
+    ]
+    for name, text in (("answers_s", "answers"), ("tracks_s", "tracks"), ("window_s", "a window")):
+        took = [s for one in rounds if (s := getattr(one, name)) is not None]
+        if took:
+            lines.append(
+                f"{text} after {min(took):.1f} to {max(took):.1f} s, median "
+                f"{statistics.median(took):.1f}; later than {ASKED_S:g} s: "
+                f"{sum(s > ASKED_S for s in took)}"
+            )
+    return "\n".join(lines)
+
+
+def _free_port() -> int:
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def _toml() -> str:
+    """Return the settings of the small telescope, one table after the other."""
+    tables: dict[str, list[str]] = {}
+    for name, value in SETTINGS.items():
+        table, key = name.split(".")
+        tables.setdefault(table, []).append(f"{key} = {value!r}")
+    tables["dither"].append("longest_pause_s = 0")
+    return "\n".join(line for name, keys in tables.items() for line in (f"[{name}]", *keys)) + "\n"
+
+
+def main() -> int:
+    """Run what is asked for; the exit status is 1 if anything was broken."""
+    parser = argparse.ArgumentParser(prog="python -m studies.restarts")
+    parser.add_argument("--rounds", type=int, default=200, metavar="N")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--directory", type=Path, help="data folder and logs, kept afterwards")
+    parser.add_argument("--output", type=Path, default=Path("var/restarts.jsonl"))
+    given = parser.parse_args()
+    given.output.parent.mkdir(parents=True, exist_ok=True)
+    given.output.unlink(missing_ok=True)
+    with tempfile.TemporaryDirectory(prefix="restarts-") as folder:
+        directory = given.directory or Path(folder)
+        directory.mkdir(parents=True, exist_ok=True)
+        rounds = run(given.rounds, given.seed, given.output, directory)
+    sys.stdout.write(summary(rounds) + "\n")
+    return int(len(rounds) < given.rounds or any(one.broken for one in rounds))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

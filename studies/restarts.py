@@ -297,11 +297,8 @@ def _half_products(telescope: Telescope, shelf: dict[str, Any]) -> list[str]:
         matrix = np.load(io.BytesIO(answer.content))
         if matrix.shape[0] != record["n_modes"] or not np.isfinite(matrix).all():
             broken.append(f"{name}: {matrix.shape} of {record['n_modes']} modes")
-    folder = telescope.directory / "data" / "reconstructors"
-    files = {path.stem for path in folder.glob("*.h5")} ^ {
-        path.stem for path in folder.glob("*.json")
-    }
-    return broken + [f"{name}: half of it is on the disk" for name in files if name in shelf]
+    parts = telescope.directory.glob("data/**/*.part")
+    return broken + [f"{part.name} is left on the disk" for part in parts]
 
 
 def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:

@@ -10,6 +10,7 @@ from service import __version__
 from service.errors import PyrcalError
 
 if TYPE_CHECKING:
+    from pyrcal.offline.bundle import Bundle, read_bundle, write_bundle
     from pyrcal.offline.fit_file import fit_file
     from pyrcal.offline.importers.oopao import from_oopao, to_oopao
     from pyrcal.offline.matrix import FitOptions
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from service.model.modes import modal_basis
 
 __all__ = [
+    "Bundle",
     "FitOptions",
     "Misregistration",
     "PyrcalError",
@@ -31,12 +33,15 @@ __all__ = [
     "from_oopao",
     "load_instrument",
     "modal_basis",
+    "read_bundle",
     "read_fit",
     "reconstruct",
     "to_oopao",
+    "write_bundle",
 ]
 
 _HOMES = {
+    "Bundle": "pyrcal.offline.bundle",
     "FitOptions": "pyrcal.offline.matrix",
     "Misregistration": "service.model.misregistration",
     "Recipe": "service.control.reconstructor",
@@ -45,9 +50,11 @@ _HOMES = {
     "from_oopao": "pyrcal.offline.importers.oopao",
     "load_instrument": "service.config.instrument",
     "modal_basis": "service.model.modes",
+    "read_bundle": "pyrcal.offline.bundle",
     "read_fit": "pyrcal.offline.report",
     "reconstruct": "service.control.reconstructor",
     "to_oopao": "pyrcal.offline.importers.oopao",
+    "write_bundle": "pyrcal.offline.bundle",
 }
 
 

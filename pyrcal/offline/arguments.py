@@ -33,6 +33,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     _describe_archive(
         commands.add_parser("archive", help="list, verify, prune or export what is archived")
     )
+    _describe_bundle(commands.add_parser("bundle", help="write or check a calibration as one file"))
     _describe_certificates(
         commands.add_parser("certificates", help="make certificates for the link to the RTC")
     )
@@ -86,6 +87,36 @@ def _describe_archive(archive: argparse.ArgumentParser) -> None:
     ):
         parser = actions.add_parser(action, help=purpose)
         add(parser, *_OF_A_FOLDER, words("--json", "print JSON"), *more)
+
+
+def _describe_bundle(bundle: argparse.ArgumentParser) -> None:
+    bundle.set_defaults(module="pyrcal.offline.bundles")
+    bundle.description = (
+        "Write a reconstructor with its gains, basis, registration, verdict and provenance into "
+        "one file with checksums, or check such a file. Works beside a running service; of one on "
+        "another machine, 'pyrcal export reconstructor in-use --format hdf5' brings the source. "
+        "docs/integrate/bundle.md says what is in it."
+    )
+    bundle.epilog = (
+        "Exit status: 0 done, 2 it cannot be done, or the file is not as it was written."
+    )
+    actions = bundle.add_subparsers(dest="action", required=True)
+    add(
+        actions.add_parser("write", help="write one"),
+        *_OF_A_FOLDER,
+        words("source ID|in-use|FILE.h5", "a reconstructor of the archive, or an exported one"),
+        words(
+            "output FILE", "FITS where it ends in .fits, else HDF5; never overwritten", type=Path
+        ),
+        words("--instrument NAME|FILE", "default: that of the settings"),
+        words("--interaction-matrix", "with D at its registration"),
+        words("--reference FILE.npy", "with the RTC's reference slopes (n_slopes,)", type=Path),
+    )
+    add(
+        actions.add_parser("check", help="read one, hold it against its checksums, show it"),
+        words("bundle FILE", type=Path),
+        words("--json", "print JSON"),
+    )
 
 
 def _describe_certificates(certificates: argparse.ArgumentParser) -> None:

@@ -1,0 +1,218 @@
+"""A calibration as one file: everything that belongs together, with checksums.
+
+Layout (version 1). HDF5: each array a dataset of its name. FITS: each array an image, EXTNAME its
+name in capitals. In either the manifest, UTF-8 JSON as bytes, is the array ``manifest``: format,
+version, id, what is known of the reconstructor, and for each array its dtype, shape and SHA-256;
+``sha256`` of the manifest itself (as written, without that key, keys sorted, no spaces) is its last
+word. Numbers are little-endian, and the same in both.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from service.archive.store import write_whole
+from service.errors import ConfigurationError, MatrixError, StorageError
+from service.files.container import opened
+from service.files.durable import flush
+
+Array = NDArray[Any]
+
+FORMAT: Final = "pyrcal-bundle"
+VERSION: Final = 1
+MANIFEST: Final = "manifest"
+RECONSTRUCTOR: Final = "reconstructor"
+
+DESCRIBED: Final = {
+    RECONSTRUCTOR: "(n_modes, n_slopes) metres of OPD per slope",
+    "interaction_matrix": "(n_slopes, n_modes) slope per metre of OPD, at alpha",
+    "reference_slopes": "(n_slopes,) what was subtracted from the slopes",
+    "optical_gain": "(n_modes,) of each mode when it was made; 1: not measured",
+    "gain_factor": "(n_modes,) what multiplies one loop gain of all modes",
+    "mode_to_actuator": "(n_actuators, n_modes) strokes of each mode of the basis",
+    "covariance": "(4, 4) of shift_x, shift_y in subapertures, rotation in degrees, magnification",
+}
+"""Arrays that a bundle may have, and what they are; the reconstructor is never missing."""
+
+_FITS_ENDINGS = (".fits", ".fit", ".fts")
+_LARGEST_MANIFEST = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bundle:
+    """A reconstructor and all that belongs to it."""
+
+    id: str
+    """Of the reconstructor."""
+
+    arrays: Mapping[str, Array]
+    """By their names in ``DESCRIBED``, float32 or float64."""
+
+    facts: Mapping[str, Any]
+    """What is known of it, as JSON has it: alpha, sigma, verdict, provenance, parent..."""
+
+    @property
+    def sha256(self) -> str:
+        """Of the manifest, and so of all."""
+        return _digest(_manifest(self))
+
+
+def write_bundle(path: Path, bundle: Bundle) -> None:
+    """Write a bundle, complete or not at all: FITS where the name ends so, else HDF5.
+
+    Raises
+    ------
+    ConfigurationError
+        If the file is there already, or FITS is asked for and astropy is missing.
+    MatrixError
+        If an array is unknown, not finite, or of another type than float32 or float64.
+    StorageError
+        If the disk refuses.
+    """
+    if path.exists():
+        raise ConfigurationError(f"{path}: is there already; a bundle is never overwritten")
+    _check(bundle)
+    manifest = _manifest(bundle)
+    text = json.dumps({**manifest, "sha256": _digest(manifest)}, sort_keys=True).encode()
+    arrays = {**bundle.arrays, MANIFEST: np.frombuffer(text, np.uint8)}
+    if path.suffix.lower() in _FITS_ENDINGS:
+        _write_fits(path, arrays)
+        return
+
+    def fill(file: h5py.File) -> None:
+        file.attrs["format"] = FORMAT
+        for name, values in arrays.items():
+            file[name] = _plain(values)
+            file[name].attrs["description"] = DESCRIBED.get(name, "JSON")
+
+    write_whole(path, fill)
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Return a bundle, every array as it was written.
+
+    Raises
+    ------
+    MatrixError
+        If it is none, of another version, or anything in it is not what was written: the message
+        names the array.
+    """
+    with opened(path) as container:
+        stored = {name.lower(): array for name, array in container.arrays.items()}
+        if MANIFEST not in stored:
+            raise MatrixError(f"{path}: found {container.listing()}, expected a bundle's manifest")
+        manifest = _read_manifest(path, stored.pop(MANIFEST).read())
+        arrays = {}
+        for name, told in manifest["arrays"].items():
+            if name not in stored:
+                raise MatrixError(f"{path}: {name} is missing, which its manifest has")
+            values = _plain(stored[name].read())
+            found = {"dtype": values.dtype.str, "shape": list(values.shape), **_sum_of(values)}
+            if found != told:
+                raise MatrixError(
+                    f"{path}: {name} is not as it was written: found {found['dtype']} "
+                    f"{found['shape']} {found['sha256'][:12]}, expected {told.get('dtype')} "
+                    f"{told.get('shape')} {str(told.get('sha256'))[:12]}"
+                )
+            arrays[name] = values
+        others = stored.keys() - arrays.keys()
+        if others:
+            raise MatrixError(f"{path}: found {', '.join(sorted(others))}, not in its manifest")
+    bundle = Bundle(id=manifest["id"], arrays=arrays, facts=manifest["facts"])
+    _check(bundle)
+    return bundle
+
+
+def _read_manifest(path: Path, stored: Array) -> dict[str, Any]:
+    refused = MatrixError(f"{path}: manifest is not as it was written")
+    if stored.ndim != 1 or stored.dtype.itemsize != 1 or len(stored) > _LARGEST_MANIFEST:
+        raise refused
+    try:
+        manifest = json.loads(stored.astype(np.uint8).tobytes())
+        told = manifest.pop("sha256")
+        if manifest["format"] != FORMAT or manifest["version"] != VERSION:
+            raise MatrixError(
+                f"{path}: found {manifest['format']} of version {manifest['version']}, expected "
+                f"{FORMAT} of version {VERSION}"
+            )
+        arrays = manifest["arrays"]
+        whole = all(isinstance(one, dict) for one in (arrays, manifest["facts"], *arrays.values()))
+        if not whole or not isinstance(manifest["id"], str) or told != _digest(manifest):
+            raise refused
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise refused from error
+    return dict(manifest)
+
+
+def _manifest(bundle: Bundle) -> dict[str, Any]:
+    arrays = {name: _plain(values) for name, values in bundle.arrays.items()}
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "id": bundle.id,
+        "facts": dict(bundle.facts),
+        "arrays": {
+            name: {"dtype": values.dtype.str, "shape": list(values.shape), **_sum_of(values)}
+            for name, values in arrays.items()
+        },
+    }
+
+
+def _check(bundle: Bundle) -> None:
+    if RECONSTRUCTOR not in bundle.arrays:
+        raise MatrixError(f"{bundle.id}: found no reconstructor, which a bundle is made for")
+    for name, values in bundle.arrays.items():
+        if name not in DESCRIBED:
+            raise MatrixError(f"{bundle.id}: found {name}, expected one of {', '.join(DESCRIBED)}")
+        n_axes = DESCRIBED[name].partition(")")[0].rstrip(",").count(",") + 1
+        if values.dtype.kind != "f" or values.ndim != n_axes or not np.isfinite(values).all():
+            raise MatrixError(
+                f"{bundle.id}: {name}: found {values.dtype} of shape {values.shape}; expected "
+                f"finite numbers {DESCRIBED[name]}"
+            )
+
+
+def _plain(values: Array) -> Array:
+    """Return an array as it is summed and written: C order, little-endian."""
+    return np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+
+
+def _sum_of(values: Array) -> dict[str, str]:
+    return {"sha256": hashlib.sha256(values.tobytes()).hexdigest()}
+
+
+def _digest(manifest: Mapping[str, Any]) -> str:
+    text = json.dumps(manifest, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _write_fits(path: Path, arrays: Mapping[str, Array]) -> None:
+    try:
+        from astropy.io import fits  # takes long to import
+    except ImportError as error:
+        raise ConfigurationError(
+            f"{path}: FITS needs astropy; expected it beside pyrcal: pip install astropy"
+        ) from error
+    first = fits.PrimaryHDU()
+    first.header["FORMAT"] = (FORMAT, "one calibration, all its parts")
+    images = [fits.ImageHDU(values, name=name.upper()) for name, values in arrays.items()]
+    part = path.with_name(path.name + ".part")
+    try:
+        fits.HDUList([first, *images]).writeto(part, overwrite=True)
+        flush(part)
+        os.link(part, path)  # never over another file
+        flush(path.parent)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written: {error}") from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -76,5 +76,5 @@ $(STAMP): pyproject.toml constraints.txt
 	    "$$python" -m venv --clear .venv || exit 1; \
 	fi
 	@echo "setup: installing pyrcal and its tools (the first time takes a minute or two)"
-	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test,plots,aot,docs,cluster]'
+	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,test,plots,aot,docs,cluster,array]'
 	@printf '%s\n' '$(CURDIR)' > $@

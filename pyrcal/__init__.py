@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pyrcal.offline.report import read_fit
     from service.config.instrument import load_instrument
     from service.control.reconstructor import Recipe, reconstruct
+    from service.model.arrays import arrays_of
     from service.model.interaction import RtcInteractionModel
     from service.model.misregistration import Misregistration
     from service.model.modes import modal_basis
@@ -29,6 +30,7 @@ __all__ = [
     "Recipe",
     "RtcInteractionModel",
     "__version__",
+    "arrays_of",
     "fit_file",
     "from_oopao",
     "load_instrument",
@@ -46,6 +48,7 @@ _HOMES = {
     "Misregistration": "service.model.misregistration",
     "Recipe": "service.control.reconstructor",
     "RtcInteractionModel": "service.model.interaction",
+    "arrays_of": "service.model.arrays",
     "fit_file": "pyrcal.offline.fit_file",
     "from_oopao": "pyrcal.offline.importers.oopao",
     "load_instrument": "service.config.instrument",

@@ -16,6 +16,7 @@ from pyrcal.options import add, words
 from service.cli.program import check_settings, port, such, whole
 from service.errors import ConfigurationError
 from service.files import kind_of, numbers_in, parse_alpha, parse_modes
+from service.model.kinds import ArrayLibrary
 from service.model.sensors.registry import KINDS
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 _memory_gb = such(float, lambda gb: gb > 0.0, "GB above 0")
 _MEMORY = "refuse what takes more, before it is begun; default %(default)g"
+
+_ARRAY = "what computes rows of D; torch and cupy use a GPU, default %(default)s"
 
 _count = such(whole, lambda n: n > 0, "a whole number above 0")
 seconds = such(float, lambda s: 0.0 < s <= 3600.0, "seconds above 0 and up to 3600")
@@ -268,6 +271,7 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         condition,
         words("--slope-noise RMS", noise, type=float, default=0.05),
         words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
+        words("--array LIBRARY", _ARRAY, choices=tuple(ArrayLibrary), default="numpy"),
         words("--no-gains", gains),
         words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),

@@ -32,6 +32,7 @@ from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
+from service.model.arrays import arrays_of
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import Basis, ModalBasis, modal_basis
@@ -55,7 +56,7 @@ def main(options: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--max-condition: found {options.max_condition:g}, expected at least 1"
         )
-    fit = _fit_of(options)
+    arrays, fit = arrays_of(options.array), _fit_of(options)
     described = load_instrument(options.instrument)
     found = instrument_sha256(described)
     if fit.instrument_sha256 not in {None, found}:
@@ -71,6 +72,7 @@ def main(options: argparse.Namespace) -> int:
             detector_nodes=SAMPLING,
             illumination=None if light is None else light.illumination,
             mapper=pool.map,
+            arrays=arrays,
         )
         show_progress(f"{model.n_slopes} slopes, {model.basis.n_modes} modes")
         matrix = model.interaction_matrix(fit.alpha)

@@ -173,6 +173,7 @@ def compute_of(settings: Settings) -> Compute:
     return Compute(
         threads=table.threads,
         cluster=table.cluster,
+        array=table.array,
         nice=table.nice,
         memory_gb=table.memory_gb,
         sampling=Sampling(table.pupil_sampling, table.detector_nodes, table.working_point_modes),

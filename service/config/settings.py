@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from service.config.link_tables import ZenohTable
 from service.config.sources import Id, Network, Table, in_file, nearest, read_toml, validated
 from service.errors import ConfigurationError
+from service.model.kinds import ArrayLibrary
 
 PREFIX = "PYRCAL_"
 """Of the environment variables: ``PYRCAL_<SECTION>__<KEY>``, like ``PYRCAL_API__PORT``."""
@@ -273,6 +274,10 @@ class ComputeTable(Table):
     cluster: str | None = Field(default=None, pattern=r"^(tcp|tls)://\S+:\d+$")
     """Dask scheduler, ``tcp://HOST:PORT``, whose workers help with D of telescopes of 70
     subapertures and more (extra ``cluster``). None: the worker computes alone."""
+
+    array: ArrayLibrary = ArrayLibrary.NUMPY
+    """Library that computes a pyramid's rows of D: ``"torch"`` and ``"cupy"`` use a GPU where there
+    is one (extra ``array``, and the library itself)."""
 
     nice: int = Field(default=10, ge=0, le=19)
     """Niceness of the worker."""

@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from service.model.arrays import NUMPY, Arrays
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.local import LocalShapes, Patch, Shapes, beside, tiles_of
@@ -119,6 +120,7 @@ class InteractionModel:
         mapper: Mapper = map,
         kept_bytes: float = KEPT_BYTES,
         anamorphosis: bool = False,
+        arrays: Arrays = NUMPY,
     ) -> None:
         self.instrument = instrument
         self._anamorphosis = anamorphosis
@@ -127,7 +129,11 @@ class InteractionModel:
         pupil = instrument_pupil(instrument, pupil_sampling * binning)
         self.pupil = pupil if illumination is None else pupil.lit_by(illumination)
         fineness = Fineness(
-            n_nodes=detector_nodes * binning, dtype=dtype, mapper=mapper, kept_bytes=kept_bytes
+            n_nodes=detector_nodes * binning,
+            dtype=dtype,
+            mapper=mapper,
+            kept_bytes=kept_bytes,
+            arrays=arrays,
         )
         kind = kind_of(instrument)
         self.sensor: Sensor = kind.sensor(instrument, self.pupil, fineness, working_point)

@@ -29,6 +29,14 @@ class Influence(StrEnum):
     GAUSSIAN = "gaussian"
 
 
+class ArrayLibrary(StrEnum):
+    """Libraries that may compute rows of D."""
+
+    NUMPY = "numpy"
+    TORCH = "torch"
+    CUPY = "cupy"
+
+
 class BasisKind(StrEnum):
     """Modes of a mirror whose user brings none."""
 

@@ -163,11 +163,12 @@ def beside(shapes: Sequence[Shapes]) -> Shapes:
 def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:
     """Return the tiles of a pupil that see any light, row after row."""
     lit, side = pupil.lit, TILE_SUBAP * pupil.sampling
+    end = len(lit)
     place = np.cumsum(lit).reshape(lit.shape) - 1
     found = []
-    for row in range(0, len(lit), side):
-        for column in range(0, len(lit), side):
-            part = (slice(row, row + side), slice(column, column + side))
+    for row in range(0, end, side):
+        for column in range(0, end, side):
+            part = (slice(row, min(row + side, end)), slice(column, min(column + side, end)))
             inside = np.flatnonzero(lit[part])
             if len(inside) == 0:
                 continue

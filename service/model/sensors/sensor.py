@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from service.model.arrays import NUMPY, Arrays
 from service.model.local import Shapes
 from service.model.pupil import Illumination
 
@@ -121,6 +122,9 @@ class Fineness:
 
     kept_bytes: float = KEPT_BYTES
     """What a response may keep for the shapes that come next; one that needs more keeps nothing."""
+
+    arrays: Arrays = NUMPY
+    """What computes rows of a pyramid; sparse lenslets are SciPy's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -69,7 +69,6 @@ four times as fast."""
 FIT_RANGE = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
 """An estimate further than this from its start has diverged (numeric units)."""
 
-
 Dithered = TypeVar("Dithered", bound=DitheredEstimate)
 
 
@@ -105,6 +104,7 @@ class OpticsWorker:
                 mapper=self.rows.map,
                 mode_response=self._mode_response,
                 anamorphosis=compute.anamorphosis,
+                arrays=compute.arrays,
             )
 
         sampling, nodes, working_point_modes = compute.sampling

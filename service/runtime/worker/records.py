@@ -15,9 +15,10 @@ from service.control.loop import ControlLoop
 from service.control.reconstructor import MAX_CONDITION, InversionMethod
 from service.errors import ModelError
 from service.estimation.description import Actuators
+from service.model.arrays import Arrays, arrays_of
 from service.model.instrument import Instrument, Mirror
 from service.model.interaction import RtcInteractionModel
-from service.model.kinds import Influence
+from service.model.kinds import ArrayLibrary, Influence
 from service.model.memory import GB, work_of
 from service.model.misregistration import Determination
 from service.model.modes import ModalBasis
@@ -71,6 +72,9 @@ class Compute:
     cluster: str | None = None
     """Address of a Dask scheduler whose workers help with rows; None: nobody does."""
 
+    array: ArrayLibrary = ArrayLibrary.NUMPY
+    """What computes rows of D."""
+
     nice: int = 10
     memory_gb: float = 6.0
     """That modes, D and its derivatives may take; a quarter of it for what a sensor keeps."""
@@ -95,6 +99,17 @@ class Compute:
 
     cache: Path | None = None
     """Folder of what is prepared once; None: it is computed every time."""
+
+    @property
+    def arrays(self) -> Arrays:
+        """The library that computes rows of D.
+
+        Raises
+        ------
+        ModelError
+            If it is not there.
+        """
+        return arrays_of(self.array)
 
     @property
     def kept_bytes(self) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ModelError
+from service.model.arrays import NUMPY, Arrays, Foreign
 from service.model.kinds import Normalisation, SignalKind
-from service.model.local import LocalShapes, Patch, Shapes
+from service.model.local import LocalShapes, Shapes
 from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
+from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import Mapper, RowTask
 from service.model.slopes import PLAIN, SlopeRecipe
@@ -111,6 +113,9 @@ class PyramidOptics:
     recipe: SlopeRecipe = PLAIN
     """Which signals, and whose flux, a response has the gradient of."""
 
+    arrays: Arrays = NUMPY
+    """What computes a row of subapertures; all that rows share is made by NumPy."""
+
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
 
@@ -178,13 +183,13 @@ class PyramidOptics:
             fields=fields_at_rest,
             roof_y=roof_y,
             along_y=along_y,
-            modulated_x=self._modulated_x(roof_x, along_x),
+            modulated_x=self.arrays.there(self._modulated_x(roof_x, along_x)),
             finish=self._finish(of_row.shapes),
         )
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
-        return rows.finish(*self._row_factors(row, columns, rows))
+        return self.arrays.here(rows.finish(*self._row_factors(row, columns, rows)))
 
     @property
     def n_pairs(self) -> int:
@@ -274,7 +279,7 @@ class PyramidOptics:
         parts = np.stack([product.real, product.imag], axis=-2)
         return parts.reshape(*parts.shape[:3], -1, parts.shape[-1])
 
-    def _row_factors(self, row: int, columns: Array, rows: PreparedRows) -> tuple[Array, Array]:
+    def _row_factors(self, row: int, columns: Array, rows: PreparedRows) -> tuple[Foreign, Foreign]:
         """Return factors ``(n_terms, N)`` along y, ``(n_terms, n_lines, N)`` along x of one row.
 
         The sum of their products over the terms, times the amplitude, is the gradient of each line:
@@ -291,84 +296,76 @@ class PyramidOptics:
         real = np.stack([here.real, here.imag], axis=-1)
         left = np.stack([imaginary, real], axis=3)
         left = left.reshape(*left.shape[:3], 4 * len(weights), -1)
-        span = slice(columns[0], columns[-1] + 1)  # a slice is not copied, a list of columns is
-        without_gap = len(columns) == span.stop - span.start
-        right = rows.modulated_x[:, :, span if without_gap else columns]
-        seen = np.empty((*left.shape[:2], left.shape[3], len(columns), right.shape[-1]), self.dtype)
-        np.matmul(left, right, out=seen.swapaxes(2, 3))
-        lines = self._lines(seen.reshape(2, *factor_y.shape[:-1], *seen.shape[3:]))
+        xp, there = self.arrays.xp, self.arrays.there
+        span = slice(int(columns[0]), int(columns[-1]) + 1)  # not copied, as a list of columns is
+        if len(columns) == span.stop - span.start:
+            right = rows.modulated_x[:, :, span, :, :]
+        else:
+            right = xp.take(rows.modulated_x, there(columns), axis=2)
+        product = xp.permute_dims(xp.matmul(there(left), right), (0, 1, 3, 2, 4))
+        seen = xp.reshape(product, (2, *factor_y.shape[:-1], *product.shape[3:]))
+        lines = self._lines(seen)
         return (
-            factor_y.reshape(-1, factor_y.shape[-1]),
-            lines.reshape(-1, *lines.shape[-2:]),
+            there(factor_y.reshape(-1, factor_y.shape[-1])),
+            xp.reshape(lines, (-1, *lines.shape[-2:])),
         )
 
-    def _lines(self, seen: Array) -> Array:
+    def _lines(self, seen: Foreign) -> Foreign:
         """Return what images ``(2, M/2, 2, 2, n_nodes, n_columns, N)`` add to every line of a row.
 
         Image side along x, source, Im | Re, image side along y, node along y.
         """
-        n = seen.shape[-2]
+        xp, n = self.arrays.xp, seen.shape[-2]
+        left, right = seen[0, ...], seen[1, ...]
         local = self.recipe.normalisation is Normalisation.LOCAL
         n_signals = self.recipe.kind.n_planes * n
-        out = np.zeros(
-            (*seen.shape[1:-2], n_signals + (n if local else 1), seen.shape[-1]), self.dtype
+        n_lines = n_signals + (n if local else 1)
+        out = xp.zeros(
+            (*left.shape[:-2], n_lines, seen.shape[-1]), dtype=seen.dtype, device=seen.device
         )
-        total = seen[0] + seen[1]
+        total = left + right
         if self.recipe.kind is SignalKind.INTENSITY:
             for plane, (side, along_x) in enumerate(itertools.product((0, 1), repeat=2)):
-                out[:, :, side, :, plane * n : (plane + 1) * n] = seen[along_x][:, :, side]
+                part = slice(plane * n, (plane + 1) * n)
+                out[:, :, side, :, part, :] = seen[along_x, :, :, side, ...]
         else:
-            signs = _SIGNS[:, None, None, None].astype(self.dtype)
-            np.subtract(seen[0], seen[1], out=out[..., :n, :])
-            np.multiply(total, signs, out=out[..., n : 2 * n, :])
-        out[..., n_signals:, :] = total if local else total.sum(axis=-2, keepdims=True)
+            out[..., :n, :] = left
+            out[..., :n, :] -= right
+            out[..., n : 2 * n, :] = total
+            out[:, :, 1, :, n : 2 * n, :] *= float(_SIGNS[1])  # that of the other side is 1
+        flux = total if local else xp.sum(total, axis=-2, keepdims=True)
+        out[..., n_signals:, :] = flux
         return out
 
-    def _finish(self, shapes: Shapes | None) -> Callable[[Array, Array], Array]:
+    def _finish(self, shapes: Shapes | None) -> Callable[[Foreign, Foreign], Foreign]:
         """Return what makes of a row's factors its gradient, or its response to shapes."""
-        if shapes is None:
-            return self._fold
         if isinstance(shapes, LocalShapes):
-            return self._tile_by_tile(shapes)
-        return lambda along_y, along_x: self._fold(along_y, along_x) @ shapes
+            return TiledResponse(shapes, self._scale, self.arrays)
+        there = self.arrays.there
+        lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
+        known = None if shapes is None else there(shapes)
+        return partial(self._fold, lit=lit, scale=scale, shapes=known)
 
     @property
     def _scale(self) -> Array:
         """``(N, N)`` what a product of factors is multiplied by."""
         return (-2.0 * self.pupil.amplitude).astype(self.dtype)
 
-    def _fold(self, along_y: Array, along_x: Array) -> Array:
-        """Return the gradient of every line, ``(n_lines, n_points)``."""
-        n_terms, n_lines, n_u = along_x.shape
-        lit = self.pupil.lit
-        product = along_y.T @ along_x.reshape(n_terms, -1)
-        gradient = product.reshape(n_u, n_lines, n_u).transpose(1, 0, 2)[:, lit]
-        gradient *= self._scale[lit]
-        return np.asarray(gradient)
-
-    def _tile_by_tile(self, shapes: LocalShapes) -> Callable[[Array, Array], Array]:
-        """Return what makes of a row's factors the response to local shapes."""
-        strips: dict[int, list[tuple[Patch, Array]]] = {}
-        scale = self._scale
-        for patch in shapes.patches:
-            tile = patch.tile
-            at_points = scale[tile.rows, tile.columns].reshape(-1, 1)
-            heights = np.ascontiguousarray((patch.weights * at_points).T)
-            strips.setdefault(tile.rows.start, []).append((patch, heights))
-
-        def respond(along_y: Array, along_x: Array) -> Array:
-            n_terms, n_lines, n_u = along_x.shape
-            flat_x = along_x.reshape(n_terms, -1)
-            by_function = np.zeros((shapes.n_all_functions, n_lines), self.dtype)
-            for strip in strips.values():
-                product = along_y[:, strip[0][0].tile.rows].T @ flat_x
-                by_line = product.reshape(-1, n_lines, n_u).swapaxes(0, 1)
-                for patch, heights in strip:
-                    seen = by_line[..., patch.tile.columns].reshape(n_lines, -1)
-                    by_function[patch.functions] += heights @ seen.T
-            return shapes.combined(by_function.T)
-
-        return respond
+    def _fold(
+        self,
+        along_y: Foreign,
+        along_x: Foreign,
+        *,
+        lit: Foreign,
+        scale: Foreign,
+        shapes: Foreign | None,
+    ) -> Foreign:
+        """Return the gradient of every line ``(n_lines, n_points)``, or its product with shapes."""
+        xp = self.arrays.xp
+        product = xp.matmul(along_y.T, xp.permute_dims(along_x, (1, 0, 2)))
+        gradient = xp.take(xp.reshape(product, (product.shape[0], -1)), lit, axis=1)
+        gradient *= scale
+        return gradient if shapes is None else xp.matmul(gradient, shapes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -379,8 +376,8 @@ class PreparedRows:
     fields: Array
     roof_y: _Roof
     along_y: Array
-    modulated_x: Array
-    finish: Callable[[Array, Array], Array]
+    modulated_x: Foreign
+    finish: Callable[[Foreign, Foreign], Foreign]
     """What makes of a row's factors its gradient, or its response to shapes."""
 
 

@@ -56,6 +56,7 @@ def pyramid_sensor(
         dtype=fineness.dtype,
         halo=working_point,
         recipe=instrument.slopes,
+        arrays=fineness.arrays,
     )
     return PyramidSensor(
         optics=optics,

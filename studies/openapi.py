@@ -319,6 +319,20 @@ class FitDocument(BaseModel):
     instrument_found: dict[str, dict[str, float | None]] = {}
     """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
 
+    recommendation: str = ""
+    """What to do with it, in one sentence: begins with "use it", "measure more" or "do not use"."""
+
+    found_not_told: list[dict[str, Any]] = []
+    """What the matrix has told: key, found, told (as the file says it), how, and whether to correct
+    the file."""
+
+    alternatives: list[dict[str, Any]] = []
+    """What else might explain the matrix: words, misfit (χ² over the fit's; null: not comparable),
+    moved (by name), moved_sigma, preferred, undecided."""
+
+    left_over: dict[str, Any] | None = None
+    """Where the residual is: border (over inside), subapertures and modes that stand out."""
+
     notes: list[str]
     """What was decided on the way, or overruled, and should be known."""
 

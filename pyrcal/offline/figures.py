@@ -72,7 +72,12 @@ def write_sheet(report: FitReport, instrument: Instrument, path: Path) -> None:
     if steps:
         heights.append(_SCAN_ROW * _rows(steps, _SCANS_ACROSS))
     figure = Figure(figsize=(_WIDTH, sum(heights) + 0.8), layout="constrained")
-    heading = [f"{report.instrument}: {report.reference}", *textwrap.wrap(verdict_line(fit), 150)]
+    advice = textwrap.wrap(fit.recommendation, 150) + textwrap.wrap(verdict_line(fit), 150)
+    heading = [
+        f"{report.instrument}: {report.reference}",
+        *advice,
+        *textwrap.wrap(verdict_line(fit), 150),
+    ]
     figure.suptitle("\n".join(heading), fontsize="medium")
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).ravel()
     grid = parts[0].subplots(2, 3)
@@ -167,6 +172,10 @@ def residual(axes: Axes, fit: Fit) -> None:
     image = axes.imshow(
         100.0 * side_by_side(fit.residual_map), origin="lower", cmap="viridis", vmin=0.0
     )
+    for y, x, _ in () if fit.left_over is None else fit.left_over.subapertures:
+        n, planes = len(fit.valid), np.arange(len(fit.residual_map))
+        places = x + n * (planes % 2), y + n * (planes // 2)
+        axes.plot(*places, "o", color="tab:red", fillstyle="none", markersize=9.0)
     axes.set(title=f"left over: {_shown(fit)}, % of the measured RMS", xticks=[], yticks=[])
     axes.figure.colorbar(image, ax=axes, shrink=0.7)
 

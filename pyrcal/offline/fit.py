@@ -10,10 +10,11 @@ from pathlib import Path
 
 from pyrcal.offline.figures import check_plots, write_sheet
 from pyrcal.offline.fit_file import fit_file
+from pyrcal.offline.fit_table import table
 from pyrcal.offline.light import SeenLight, read_light
 from pyrcal.offline.light_rotation import Arms
 from pyrcal.offline.matrix import FitOptions
-from pyrcal.offline.report import document, fill_fit, table
+from pyrcal.offline.report import document, fill_fit
 from pyrcal.terminal import show_progress
 from service.archive.store import write_whole
 from service.config import load_instrument

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,7 @@ def fit_file(
     """
     recorded = read_recorded(path, dataset)
     reference, notes = reference_of(recorded, instrument)
+    options = replace(options, explain=True)
     begun = time.perf_counter()
     # BLAS keeps to one thread: nested threading made a fit seven times slower
     with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.methods import Settled
-from pyrcal.offline.models import BETTER, FitModels, Optic, Other
-from pyrcal.offline.pupil_checks import Few, other_pupils
+from pyrcal.offline.models import BETTER, FAR_BETTER, FitModels, Optic, Other
+from pyrcal.offline.pupil_checks import Few, TriedPupil
 from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import Uncertainty
 
@@ -43,6 +43,9 @@ class Rival:
     moved: Array
     """``(4,)`` by how much the registration would be another, where the matrix cannot tell the two
     instruments apart, numeric units; 0 where it can."""
+
+    estimate: Array
+    """``(4,)`` the same, to first order, whether it can or not."""
 
     @property
     def believed(self) -> bool:
@@ -115,7 +118,7 @@ class AsTold:
     """``(4,)`` by how much its registration is another, numeric units."""
 
 
-def rivals(settled: Settled, few: Few) -> tuple[Rival, ...]:
+def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[Rival, ...]:
     """Return other instruments, the one that explains the matrix best first.
 
     Each is allowed its own registration, coupling and sensor, to first order about those found;
@@ -123,14 +126,24 @@ def rivals(settled: Settled, few: Few) -> tuple[Rival, ...]:
     """
     solution, own = settled.solution, few.left(few.own)
     found = [
-        Rival(change=change, share=share, moved=moved) for change, share, moved in other_pupils(few)
+        Rival(
+            change=Other(words=one.words, believed=FAR_BETTER),
+            share=one.share,
+            moved=one.moved,
+            estimate=one.moved,
+        )
+        for one in pupils
+        if one.explains
     ]
     for change, other in settled.models.other_instruments.items():
-        share, moved = few.left(few.matrix(other)) / own, np.zeros(4)
+        matrix = few.matrix(other)
+        share, moved = few.left(matrix) / own, np.zeros(4)
+        estimate = few.step(matrix)[:4] - few.step(few.own)[:4]
         if change.believed <= share < 1.0 / BETTER:
             there = refine(other, settled.target, solution.alpha, settled.nuisances)
             moved = there.vector - solution.vector if there.converged else moved
-        found.append(Rival(change=change, share=share, moved=moved))
+            estimate = moved if there.converged else estimate
+        found.append(Rival(change=change, share=share, moved=moved, estimate=estimate))
     return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
 
 

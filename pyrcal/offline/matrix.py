@@ -9,6 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
+from pyrcal.offline.alternatives import Alternative, alternatives
+from pyrcal.offline.columns import displaced_columns, strange_columns
+from pyrcal.offline.gain_causes import gain_causes
 from pyrcal.offline.instrument_checks import (
     FoundOptic,
     as_told,
@@ -16,6 +20,7 @@ from pyrcal.offline.instrument_checks import (
     found_optics,
     rivals,
 )
+from pyrcal.offline.left_over import LeftOver
 from pyrcal.offline.methods import (
     Landing,
     ScanStep,
@@ -28,7 +33,8 @@ from pyrcal.offline.methods import (
 )
 from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
-from pyrcal.offline.pupil_checks import Few, left_by_light
+from pyrcal.offline.origins import Origin, origins
+from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
 from pyrcal.offline.solver import ANAMORPHOSIS_SIGMA, nuisances_of
@@ -82,6 +88,9 @@ class FitOptions:
 
     illumination: Illumination | None = None
     """Measured light of the beam, in the axes of conventions.md; None: even."""
+
+    explain: bool = False
+    """Whether rival explanations are tried, and causes of gains that are far from 1 looked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -154,6 +163,18 @@ class Fit(Determination):
 
     optics: tuple[FoundOptic, ...] = ()
     """What of the instrument was fitted, too: coupling or width, modulation."""
+
+    alternatives: tuple[Alternative, ...] = ()
+    """What else might explain the matrix, and how far it would move α; empty: not asked for."""
+
+    origins: tuple[Origin, ...] = ()
+    """What of the instrument was found rather than told."""
+
+    left_over: LeftOver | None = None
+    """Where the residual is."""
+
+    recommendation: str = ""
+    """What to do with it, in one sentence."""
 
     paper_table: tuple[ScanStep, ...] | None = None
     """The scans, in their order; None for the other methods."""
@@ -249,7 +270,13 @@ def _fitted(
             start = replace(start, rotation_rad=rotation_rad)
     found = _found(models, target, instrument.with_anamorphosis(start), options)
     tell("verdict")
-    return _answer(models, found, usable, untold, reported)
+    fit = _answer(models, found, usable, untold, reported, explain=options.explain)
+    if options.explain and not fit.accepted:
+        columns = displaced_columns(
+            replace(instrument, slopes=reported), usable, used, mapper=mapper
+        )
+        fit = with_displaced(fit, tuple(columns))
+    return fit
 
 
 def _stroke_known(instrument: Instrument) -> bool:
@@ -347,7 +374,13 @@ def _found(
 
 
 def _answer(
-    as_in_file: FitModels, found: _Found, usable: Reference, untold: str, reported: SlopeRecipe
+    as_in_file: FitModels,
+    found: _Found,
+    usable: Reference,
+    untold: str,
+    reported: SlopeRecipe,
+    *,
+    explain: bool,
 ) -> Fit:
     settled = found.settled
     solution, target, models = settled.solution, settled.target, settled.models
@@ -357,7 +390,8 @@ def _answer(
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
     few = Few(settled)
-    others = rivals(settled, few)
+    pupils = tried_pupils(few)
+    others = rivals(settled, few, pupils)
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = structure(seen.residual, power, noise)
@@ -376,6 +410,8 @@ def _answer(
         doubt=np.array([doubt_of_width(settled, few), *(rival.moved for rival in others)]),
     )
     optics = found_optics(as_in_file, settled, sure)
+    stroke_known = _stroke_known(models.instrument)
+    without = as_told(as_in_file, settled) if any(one.notable for one in optics) else None
     findings = FitFindings(
         solution=solution,
         residual_fraction=residual_fraction,
@@ -385,13 +421,14 @@ def _answer(
         landing=found.landing,
         rivals=others,
         optics=optics,
-        as_told=as_told(as_in_file, settled) if any(one.notable for one in optics) else None,
+        as_told=without,
         axes=untold,
         passes=usable.passes,
-        stroke_known=_stroke_known(models.instrument),
+        stroke_known=stroke_known,
     )
-    accepted, verdict = judged(findings)
-    return Fit(
+    refusal, verdict = judged(findings)
+    columns = tuple(strange_columns(solution, target))
+    fit = Fit(
         alpha=solution.alpha,
         covariance=sure.covariance,
         gains=seen.gains,
@@ -403,15 +440,12 @@ def _answer(
         orientation=slopes.assumed_orientation,
         order=slopes.order,
         subset_scatter=sure.subset_scatter,
-        accepted=accepted,
+        accepted=refusal is None,
         converged=solution.converged,
         verdict=verdict,
-        remarks=remarks(
-            findings,
-            target,
-            reported=reported,
-            found=slopes,
-            about=models.instrument,
+        remarks=(
+            *remarks(findings, reported=reported, found=slopes, about=models.instrument),
+            *columns,
         ),
         left_out=(*usable.left_out, *_rows_left_out(target, models.instrument)),
         n_evaluations=models.counter.n,
@@ -421,8 +455,17 @@ def _answer(
         gain_map=nuisances.gain_map(solution.nuisances, target.valid),
         anamorphosis_sigma=nuisances.stretch_sigma(sure.nuisance_sigma),
         optics=optics,
+        origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains),
         paper_table=found.table,
     )
+    grounds = Grounds(
+        refusal=refusal, structure=structured, n_sets=len(sure.subset_steps), columns=columns
+    )
+    if not explain:
+        return replace(fit, recommendation=recommendation(fit, grounds))
+    tried = alternatives(settled, few, others, pupils, optics, without)
+    causes = gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
+    return explained(fit, tried, replace(grounds, gains=tuple(causes)))
 
 
 def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:

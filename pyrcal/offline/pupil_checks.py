@@ -6,7 +6,6 @@ there uneven light looks alike. What would explain the matrix far better is name
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.methods import Settled, spread
-from pyrcal.offline.models import BETTER, CHEAP, FAR_BETTER, FitModels, Other
+from pyrcal.offline.models import BETTER, CHEAP, FitModels
 from pyrcal.offline.solver import nuisances_of
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -56,6 +55,25 @@ class PupilNumber:
         if self.key == "obscuration_ratio":
             return replace(about, obscuration_ratio=value)
         return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
+
+    def near(self, few: Few) -> tuple[float, float, Array]:
+        """Return the value that explains most, χ² over the file's, α's move; to first order."""
+        light = self.reported**self.power
+        there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
+        rate = (there - few.own) / self.step
+        if not few.tells(few.own, rate):
+            return self.reported, 1.0, np.zeros(4)
+        step = few.step(few.own, rate)
+        low, high = (limit**self.power for limit in self.range)
+        value = float(np.clip(light + step[-1], low, high)) ** (1.0 / self.power)
+        share = few.left(few.own, rate) / few.left(few.own)
+        return value, share, step[:4] - few.step(few.own)[:4]
+
+    def far(self, few: Few) -> tuple[float, float, Array]:
+        """Return the same with D of the value itself."""
+        value, matrix = self.found(few)
+        share = few.left(matrix) / few.left(few.own)
+        return value, share, few.step(matrix)[:4] - few.step(few.own)[:4]
 
     def found(self, few: Few) -> tuple[float, Array]:
         """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
@@ -146,26 +164,52 @@ class Few:
         return np.concatenate([self.derivatives, np.array(more)]) if more else self.derivatives
 
 
-def other_pupils(few: Few) -> Iterator[tuple[Other, float, Array]]:
-    """Yield pupils that explain the matrix better.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TriedPupil:
+    """Another obscuration or diameter, at the value that explains most."""
 
-    Each with what to write into the file, χ² that is left over what the file's leaves, and by how
-    much α would be another ``(4,)``.
+    words: str
+    """What to write into the file."""
+
+    share: float
+    """χ² that it leaves, over what the file's pupil leaves."""
+
+    moved: Array
+    """``(4,)`` by how much α would be another, numeric units."""
+
+    explains: bool
+    """Whether it explains enough of the signal to be worth a word."""
+
+
+def tried_pupils(few: Few) -> tuple[TriedPupil, ...]:
+    """Return other pupils, each at the value that explains most.
+
+    Where less is left over than a pupil would have to explain, to first order.
     """
-    if few.residual_fraction < LEAST_EXPLAINED:
-        return  # less is left than a pupil would have to explain
+    found = []
+    little = few.residual_fraction < LEAST_EXPLAINED
     for number in _numbers(few.models.instrument):
-        value, matrix = number.found(few)
-        share = few.left(matrix) / few.left(few.own)
+        value, share, moved = number.near(few) if little else number.far(few)
         explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
         notable = abs(value - number.reported) >= number.notable and explained >= LEAST_EXPLAINED
-        if notable and share < BETTER:
-            other = Other(words=f"{number.key} = {value:.3g}", believed=FAR_BETTER)
-            yield other, share, few.step(matrix)[:4] - few.step(few.own)[:4]
+        found.append(
+            TriedPupil(
+                words=f"{number.key} = {value:.3g}",
+                share=share,
+                moved=moved,
+                explains=notable and share < BETTER,
+            )
+        )
+    return tuple(found)
 
 
 def left_by_light(few: Few) -> float:
     """Return χ² that a smooth gain over the pupil, common to all modes, leaves, over what is."""
-    kind, own = few.models.instrument.slopes.kind, few.own
-    maps = nuisances_of(few.target.valid, kind, gain_map=True).maps
-    return few.left(own, *(pattern[:, None] * own for pattern in maps)) / few.left(own)
+    own = few.own
+    return few.left(own, *(pattern[:, None] * own for pattern in gain_maps(few))) / few.left(own)
+
+
+def gain_maps(few: Few) -> Array:
+    """Return the shapes of a smooth gain over the pupil, ``(n_maps, n_slopes)``."""
+    kind = few.models.instrument.slopes.kind
+    return nuisances_of(few.target.valid, kind, gain_map=True).maps

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pyrcal.offline.solver import Solution
 from pyrcal.offline.verdict import MOST_STRUCTURE, FitFindings, factor_of_passes
-from service.estimation.reference import Target
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE
 from service.model.slopes import FLIPS, SlopeRecipe
-
-Array = NDArray[np.float64]
-
-OPPOSITE = -0.5
-"""Correlation with its model below which a column has the wrong sign."""
-
-ANOTHERS = 0.7
-"""Correlation with another mode's model above which a column is that mode's."""
-
-OWN = 0.35
-"""... unless its own model explains more than this of it."""
-
-_NAMED = 12
 
 STRAIGHT = 0.01
 """Distance of the magnification from 1 beyond which pitch or diameter may be told wrong."""
@@ -38,12 +22,14 @@ OFF_TOGETHER = 0.08
 """... by more than this, ..."""
 
 EXPLAINED = 0.1
-"""... where no more than this share of the signal is left over."""
+"""... where no more than this share of the signal is left over, ..."""
+
+LIKELY = (0.3, 3.0)
+"""... and a wavelength may be wrong by so much."""
 
 
 def remarks(
     findings: FitFindings,
-    target: Target,
     *,
     reported: SlopeRecipe,
     found: SlopeRecipe,
@@ -53,9 +39,9 @@ def remarks(
 
     Parameters
     ----------
-    evidence, target
+    findings
         Of the fit.
-    told, found
+    reported, found
         How slopes are listed, as the instrument file says it and as the matrix lists them.
     about
         The instrument of the file.
@@ -68,7 +54,6 @@ def remarks(
         *_size(findings),
         *_passes(findings),
         *_scale(findings, about),
-        *_columns(findings.solution, target),
     )
 
 
@@ -146,7 +131,7 @@ def _scale(findings: FitFindings, about: Instrument) -> Iterator[str]:
             f"flat wavefront: gains of the modes scatter by {float(np.std(gains)) / middle:.1%}"
         )
     together = float(np.std(gains)) < UNIFORM * abs(middle) and abs(middle - 1.0) > OFF_TOGETHER
-    explained = findings.residual_fraction < EXPLAINED
+    explained = findings.residual_fraction < EXPLAINED and LIKELY[0] < middle < LIKELY[1]
     if findings.stroke_known and explained and together and factor_of_passes(findings) is None:
         yield (
             f"the gain of every mode is {middle:.3g}: a wavelength of {wavelength_m:.3g} "
@@ -170,37 +155,3 @@ def _passes(findings: FitFindings) -> Iterator[str]:
         f"the gains' median is {middle:.2f} with {passes}: "
         f"{'twice' if factor > 1.0 else 'half'} what was expected; {cause}"
     )
-
-
-def _columns(solution: Solution, target: Target) -> Iterator[str]:
-    """Yield which columns have the wrong sign, and which are other modes'."""
-    measured = _unit(target.matrix[target.rows])
-    alike = measured.T @ _unit(np.asarray(solution.matrix, dtype=np.float64)[target.rows])
-    own = np.diag(alike)
-    turned = target.modes[own < OPPOSITE]
-    if len(turned):
-        yield f"columns of the wrong sign: {_named(turned)}"
-    likest = np.argmax(np.abs(alike), axis=1)
-    columns = np.arange(len(own))
-    strange = (np.abs(alike[columns, likest]) > ANOTHERS) & (np.abs(own) < OWN)
-    exchanged, moved = [], []
-    for column in np.flatnonzero(strange):
-        other = likest[column]
-        pair = target.modes[column], target.modes[other]
-        if not (strange[other] and likest[other] == column):
-            moved.append(f"{pair[0]} is mode {pair[1]}'s")
-        elif column < other:
-            exchanged.append(f"{pair[0]} and {pair[1]}")
-    if exchanged:
-        yield f"columns that have changed places: {_named(exchanged, '; ')}"
-    if moved:
-        yield f"columns that are another mode's: {_named(moved, '; ')}"
-
-
-def _unit(columns: Array) -> Array:
-    return np.asarray(columns / np.linalg.norm(columns, axis=0))
-
-
-def _named(what: Sequence[object] | NDArray[np.intp], between: str = ", ") -> str:
-    more = f" and {len(what) - _NAMED} more" if len(what) > _NAMED else ""
-    return between.join(str(one) for one in what[:_NAMED]) + more

@@ -1,9 +1,9 @@
-"""A fit and its inputs as JSON, as a table, as HDF5."""
+"""A fit and its inputs as JSON, as HDF5."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,13 +13,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.instrument_checks import NOTABLE, NOTABLE_SIGMA
+from pyrcal.offline.left_over import LeftOver
 from pyrcal.offline.matrix import Fit
-from pyrcal.offline.methods import ScanStep
 from service import __version__
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
-from service.errors import MatrixError, shown
+from service.errors import MatrixError
 from service.files.container import put_array, put_covariance
 from service.model.kinds import Method, SlopeOrder
 from service.model.misregistration import (
@@ -90,8 +91,42 @@ def document(report: FitReport) -> dict[str, Any]:
             }
             for one in fit.optics
         },
+        "recommendation": fit.recommendation,
+        "found_not_told": [
+            {
+                "key": one.key,
+                "found": one.found,
+                "told": one.reported,
+                "how": one.how,
+                "correct": one.correct,
+            }
+            for one in fit.origins
+        ],
+        "alternatives": [_alternative(one, fit.sigma) for one in fit.alternatives],
+        "left_over": None if fit.left_over is None else _left_over(fit.left_over),
         "notes": list(report.notes),
         "seconds": round(report.seconds, 3),
+    }
+
+
+def _alternative(one: Alternative, sigma: NDArray[np.float64]) -> dict[str, Any]:
+    return {
+        "words": one.words,
+        "misfit": None if one.share is None else _plain(one.share),
+        "moved": _parameters(one.moved),
+        "moved_sigma": dict(zip(PARAMETERS, _plain(one.moved / sigma), strict=True)),
+        "preferred": one.preferred,
+        "undecided": one.undecided,
+    }
+
+
+def _left_over(left: LeftOver) -> dict[str, Any]:
+    return {
+        "border": left.border,
+        "subapertures": [
+            {"row": y, "column": x, "share": share} for y, x, share in left.subapertures
+        ],
+        "modes": [{"mode": mode, "share": share} for mode, share in left.modes],
     }
 
 
@@ -121,121 +156,6 @@ def _plain(values: float | NDArray[np.float64]) -> Any:  # noqa: ANN401 - as nes
 _WIDTH = "influence_width"
 """What is found of influence functions that have no coupling: no key of an instrument file."""
 
-_ROWS = (
-    ("shift x", "subapertures", 4),
-    ("shift y", "subapertures", 4),
-    ("rotation", "deg", 4),
-    ("magnification", "ratio, of the mirror as drawn over the pupil as described", 5),
-)
-"""Name, unit and decimals of each parameter."""
-
-_FAR_GAIN = 0.2
-"""Gains further than this from the median are named: such modes are worth a look."""
-
-_NAMED = 8
-
-
-def table(report: FitReport) -> str:
-    """Return the verdict, the registration and what it rests on, as text."""
-    fit = report.fit
-    lines = [
-        verdict_line(fit),
-        "",
-        *_registration(fit),
-        "",
-        *_basis(report),
-        *_extras(fit),
-        *(f"note: {note}" for note in report.notes),
-    ]
-    return "\n".join(shown(line) for line in lines)
-
-
-def _registration(fit: Fit) -> Iterator[str]:
-    yield f"{'':15s}{'value':>11s}{'1 sigma':>11s}{'subsets':>11s}"
-    values = fit.alpha.vector * BOUNDARY_SCALE
-    sigma = fit.sigma * BOUNDARY_SCALE
-    scatter = fit.subset_scatter * BOUNDARY_SCALE
-    for (name, unit, decimals), value, one, spread in zip(
-        _ROWS, values, sigma, scatter, strict=True
-    ):
-        numbers = "".join(_number(number, decimals) for number in (value, one, spread))
-        yield f"{name:15s}{numbers}  {unit}"
-
-
-def _anamorphosis(found: NDArray[np.float64], sigma: NDArray[np.float64]) -> str:
-    (along, askew), (one, other) = 100.0 * found, 100.0 * sigma
-    return f"{along:+.3f} +- {one:.3f} % along x, {askew:+.3f} +- {other:.3f} % along 45 deg"
-
-
-def _number(value: float, decimals: int) -> str:
-    return f"{value:11.{decimals}f}" if np.isfinite(value) else f"{'-':>11s}"
-
-
-def _basis(report: FitReport) -> Iterator[str]:
-    fit = report.fit
-    yield f"{'residual':20s}{100.0 * fit.residual_fraction:.2f} % of the measured slopes"
-    yield f"{'modes used':20s}{len(fit.modes)} ({_spans(fit)})"
-    for sentence in fit.left_out:
-        yield f"{'left out':20s}{sentence}"
-    yield f"{'gains':20s}{_gains(fit)}"
-    yield f"{'condition number':20s}{fit.condition_number:.2f}"
-    words = ", ".join(
-        f"{k} = {v}" for k, v in orientation_words(fit.orientation, fit.order).items()
-    )
-    yield f"{'slopes':20s}{words}"
-    yield f"{'double pass':20s}{'yes' if report.double_pass else 'no'}"
-    yield f"{'method':20s}{report.method}, {fit.n_evaluations} matrices, {report.seconds:.1f} s"
-    yield f"{'reference':20s}{report.reference}"
-    yield f"{'instrument':20s}{report.instrument}"
-
-
-def _extras(fit: Fit) -> Iterator[str]:
-    for one in fit.optics:
-        if one.found is not None:
-            stated = "unknown" if one.reported is None else f"{one.reported:g}"
-            words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
-            yield f"{one.key[:19]:20s}{words} (the instrument file says {stated})"
-    if fit.anamorphosis_sigma is not None:
-        words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
-        told = "" if fit.anamorphosis is not None else "not observable with these modes: "
-        yield f"{'anamorphosis':20s}{told}{words}"
-    if fit.gain_map is not None:
-        gains = fit.gain_map[fit.valid]
-        yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"
-    if fit.paper_table is not None:
-        yield ""
-        yield from paper_lines(fit.paper_table)
-
-
-def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
-    """Yield the paper's Table 1: which parameter was scanned, how finely, and its minimum."""
-    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'every':>9s}{'minimum':>11s}"
-    for number, scan in enumerate(steps, start=1):
-        yield (
-            f"{number:4d}  {scan.parameter:15s}{scan.samples.min():11.4f}"
-            f"{scan.samples.max():11.4f}{scan.step:9.4f}{scan.minimum:11.4f}"
-        )
-
-
-def _spans(fit: Fit) -> str:
-    """Return the modes as ranges, ends included."""
-    modes = np.sort(fit.modes)
-    runs = np.split(modes, np.flatnonzero(np.diff(modes) > 1) + 1)
-    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:_NAMED]]
-    return ", ".join(words) + (", ..." if len(runs) > _NAMED else "")
-
-
-def _gains(fit: Fit) -> str:
-    low, middle, high = np.percentile(fit.gains, [5.0, 50.0, 95.0])
-    text = f"median {middle:.3g}, 90 % of them within {low:.3g} to {high:.3g}"
-    far = fit.modes[np.abs(fit.gains / middle - 1.0) > _FAR_GAIN]
-    if len(far):
-        named = ", ".join(str(mode) for mode in far[:_NAMED])
-        more = f" and {len(far) - _NAMED} more" if len(far) > _NAMED else ""
-        text += f"; more than {100 * _FAR_GAIN:.0f} % off: mode {named}{more}"
-    return text
-
-
 # --- as an HDF5 file
 
 
@@ -261,6 +181,7 @@ def fill_fit(file: h5py.File, report: FitReport) -> None:
     """
     fit = report.fit
     put_covariance(file, fit.covariance)
+    _put_alternatives(file, fit)
     arrays = {name: getattr(fit, name) for name in _DESCRIPTIONS}
     arrays["subset_scatter"] = fit.subset_scatter * BOUNDARY_SCALE
     for name, values in arrays.items():
@@ -275,6 +196,26 @@ def fill_fit(file: h5py.File, report: FitReport) -> None:
     file.attrs["document"] = json.dumps(document(report), allow_nan=False)
 
 
+def _put_alternatives(file: h5py.File, fit: Fit) -> None:
+    """Write what else was tried; its words as an attribute, in the same order."""
+    if not fit.alternatives:
+        return
+    group = file.create_group("alternatives")
+    group.attrs["words"] = [one.words for one in fit.alternatives]
+    moved = np.array([one.moved for one in fit.alternatives]) * BOUNDARY_SCALE
+    misfit = [np.nan if one.share is None else one.share for one in fit.alternatives]
+    put_array(group, "moved", moved, f"(n, 4) move of {', '.join(PARAMETERS)} under each")
+    put_array(
+        group, "misfit", np.array(misfit), "(n,) chi squared over the fit's; NaN: not comparable"
+    )
+    put_array(
+        group,
+        "preferred",
+        np.array([one.preferred for one in fit.alternatives]),
+        "(n,) whether the matrix is explained better",
+    )
+
+
 def _provenance(report: FitReport) -> dict[str, Any]:
     """Return where a fit comes from, as HDF5 attributes."""
     return {
@@ -285,6 +226,7 @@ def _provenance(report: FitReport) -> dict[str, Any]:
         "double_pass": report.double_pass,
         "method": str(report.method),
         "verdict": report.fit.verdict,
+        "recommendation": report.fit.recommendation,
         "accepted": report.fit.accepted,
         "notes": "\n".join(report.notes),
         **_made_now(),

@@ -10,6 +10,7 @@ named. Remarks say what was overruled, and what looks odd.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,23 +81,38 @@ class FitFindings:
     stroke_known: bool
 
 
-def judged(findings: FitFindings) -> tuple[bool, str]:
-    """Return whether the registration is accepted, and the verdict on one line."""
-    for refusal in (
-        findings.axes,
-        _unsettled(findings),
-        _undetermined(findings),
-        _unexplained(findings),
-        _another_minimum(findings),
-        _another_instrument(findings),
-        _another_basis(findings),
-        _another_unit(findings),
-        _divided(findings),
-        _without_a_cause(findings),
+class Refusal(StrEnum):
+    """Why a fit is refused."""
+
+    AXES = "axes"
+    UNSETTLED = "unsettled"
+    UNDETERMINED = "undetermined"
+    UNEXPLAINED = "unexplained"
+    ANOTHER_MINIMUM = "another minimum"
+    ANOTHER_INSTRUMENT = "another instrument"
+    ANOTHER_BASIS = "another basis"
+    ANOTHER_UNIT = "another unit"
+    DIVIDED = "divided"
+    NO_CAUSE = "no cause"
+
+
+def judged(findings: FitFindings) -> tuple[Refusal | None, str]:
+    """Return why the registration is refused, or None, and the verdict on one line."""
+    for reason, refusal in (
+        (Refusal.AXES, findings.axes),
+        (Refusal.UNSETTLED, _unsettled(findings)),
+        (Refusal.UNDETERMINED, _undetermined(findings)),
+        (Refusal.UNEXPLAINED, _unexplained(findings)),
+        (Refusal.ANOTHER_MINIMUM, _another_minimum(findings)),
+        (Refusal.ANOTHER_INSTRUMENT, _another_instrument(findings)),
+        (Refusal.ANOTHER_BASIS, _another_basis(findings)),
+        (Refusal.ANOTHER_UNIT, _another_unit(findings)),
+        (Refusal.DIVIDED, _divided(findings)),
+        (Refusal.NO_CAUSE, _without_a_cause(findings)),
     ):
         if refusal:
-            return False, f"refused: {refusal}"
-    return True, f"accepted: {_quality(findings)}"
+            return reason, f"refused: {refusal}"
+    return None, f"accepted: {_quality(findings)}"
 
 
 def _quality(findings: FitFindings) -> str:

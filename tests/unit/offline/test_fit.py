@@ -80,10 +80,12 @@ def test_json_is_one_object_with_the_keys_promised_and_nothing_else(run):
     assert all(line.startswith("note: ") for line in lines), "progress is for terminals"
 
 
-def test_without_json_it_is_a_table_that_begins_with_the_verdict(run):
+def test_without_json_it_is_a_table_that_begins_with_what_to_do_and_the_verdict(run):
     status, out, _ = run(MATRIX)
     assert status == 0
-    assert out.startswith("accepted")
+    first, second, *_ = out.splitlines()
+    assert first.startswith("use it")
+    assert second.startswith("accepted")
     assert "shift x" in out
 
 

@@ -60,11 +60,14 @@ def modulated(radius: float) -> Instrument:
 
 
 @cache
-def zonal() -> np.ndarray:
+def zonal(
+    truth: Misregistration = TRUTH, pupil_subap: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
     """Every actuator pushed where the truth puts it, ``(n_slopes, n_actuators)``."""
     n = N * SAMPLING
     fine = (np.arange(8 * n) - (8 * n - 1) / 2) / (4 * n)
-    radius = np.hypot(fine, fine[:, None])
+    off_x, off_y = np.array(pupil_subap) * 2.0 / N
+    radius = np.hypot(fine - off_x, (fine - off_y)[:, None])
     lit = (radius <= 1.0) & (radius >= OBSCURATION)
     pyramid = FftPyramid(
         amplitude=lit.reshape(n, 8, n, 8).mean(axis=(1, 3)),
@@ -75,9 +78,9 @@ def zonal() -> np.ndarray:
         padded_subap=80,
     )
     x, y = np.meshgrid(pyramid.coordinates, pyramid.coordinates)
-    x, y = x - TRUTH.shift_x_subap, y - TRUTH.shift_y_subap
-    c, s = np.cos(TRUTH.rotation_rad), np.sin(TRUTH.rotation_rad)
-    on_mirror = np.stack([c * x + s * y, -s * x + c * y]) / TRUTH.magnification * DIAMETER_M / N
+    x, y = x - truth.shift_x_subap, y - truth.shift_y_subap
+    c, s = np.cos(truth.rotation_rad), np.sin(truth.rotation_rad)
+    on_mirror = np.stack([c * x + s * y, -s * x + c * y]) / truth.magnification * DIAMETER_M / N
     apart = np.hypot(*(on_mirror[:, None] - ACTUATORS_M.T[:, :, None, None]))
     return pyramid.jacobian(COUPLING ** ((apart / PITCH_M) ** 2), lit_subapertures(bench()))
 

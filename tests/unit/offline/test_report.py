@@ -3,7 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from pyrcal.offline.report import document, read_fit, table
+from pyrcal.offline.alternatives import Alternative
+from pyrcal.offline.fit_table import table
+from pyrcal.offline.left_over import LeftOver
+from pyrcal.offline.origins import Origin
+from pyrcal.offline.report import document, read_fit
 from service.model.misregistration import PARAMETERS
 from service.model.slopes import Orientation
 from tests.unit.offline.made import ALPHA, GAINS, SCAN, a_fit, a_report
@@ -21,6 +25,10 @@ KEYS = {
     "converged",
     "verdict",
     "notes",
+    "recommendation",
+    "found_not_told",
+    "alternatives",
+    "left_over",
     "anamorphosis",
     "anamorphosis_sigma",
     "instrument_found",
@@ -93,9 +101,82 @@ def line(text, name):
     return found
 
 
-def test_the_verdict_comes_first():
-    fit = a_fit(accepted=False, verdict="refused: sets of modes disagree; check the stop")
-    assert table(a_report(fit)).splitlines()[0] == fit.verdict
+def test_what_to_do_comes_first_and_then_the_verdict():
+    advised = "do not use it: the stop is another"
+    fit = a_fit(
+        accepted=False,
+        verdict="refused: sets of modes disagree; check the stop",
+        recommendation=advised,
+    )
+    assert table(a_report(fit)).splitlines()[:2] == [advised, fit.verdict]
+
+
+RIVALS = (
+    Alternative(
+        words='stop = "mirror"',
+        share=0.5,
+        moved=np.array([0.02, 0.0, np.deg2rad(0.1), 0.0]),
+        preferred=True,
+    ),
+    Alternative(
+        words="no anamorphosis fitted",
+        share=1.001,
+        moved=np.array([0.002, 0.0, 0.0, 0.0]),
+        undecided=True,
+    ),
+    Alternative(words="the lower half of the modes", share=None, moved=np.full(4, 1e-3)),
+)
+
+
+def test_what_else_was_tried_is_counted_and_the_largest_move_named():
+    text = table(a_report(a_fit(alternatives=RIVALS)))
+    assert "3 tried, 1 preferred: see notes" in line(text, "rivals")
+    assert "as likely: would move it by up to 0.2 sigma (no anamorphosis fitted)" in text
+    assert "other weights and modes: by up to 5.7 sigma (the lower half of the modes)" in text
+
+
+def test_alternatives_are_told_in_the_units_of_their_names_and_in_sigma():
+    first, _, last = document(a_report(a_fit(alternatives=RIVALS)))["alternatives"]
+    assert first["words"] == 'stop = "mirror"'
+    assert first["misfit"] == 0.5
+    assert first["moved"]["rotation_deg"] == pytest.approx(0.1)
+    assert first["moved_sigma"]["rotation_deg"] == pytest.approx(10.0)
+    assert first["moved_sigma"]["shift_x_subap"] == pytest.approx(2.0)
+    assert first["preferred"]
+    assert last["misfit"] is None
+
+
+def test_what_was_found_rather_than_told_has_its_line():
+    order = Origin(
+        key="order", found='"yx"', reported='"xy"', how="scanned: the lowest modes", correct=True
+    )
+    report = a_report(a_fit(origins=(order,)))
+    assert line(table(report), "found, not told").endswith(
+        'order = "yx" (scanned: the lowest modes; the file says "xy")'
+    )
+    assert document(report)["found_not_told"] == [
+        {
+            "key": "order",
+            "found": '"yx"',
+            "told": '"xy"',
+            "how": "scanned: the lowest modes",
+            "correct": True,
+        }
+    ]
+
+
+def test_where_something_is_left_over_is_told():
+    left = LeftOver(border=2.5, subapertures=((1, 2, 0.4),), modes=((4, 0.3),))
+    report = a_report(a_fit(left_over=left))
+    text = table(report)
+    assert "2.5 times as much at the pupil's border as inside" in text
+    assert "row 1 column 2" in text
+    assert "4 (30%)" in text
+    assert document(report)["left_over"] == {
+        "border": 2.5,
+        "subapertures": [{"row": 1, "column": 2, "share": 0.4}],
+        "modes": [{"mode": 4, "share": 0.3}],
+    }
 
 
 def test_the_four_parameters_are_there_with_unit_and_uncertainty():

@@ -1,0 +1,336 @@
+"""What a rival explanation would change: other instruments, weights and sets of modes.
+
+Each is allowed its own registration, to first order about the one found. It says how far the
+registration would move, and by its χ² whether the matrix prefers it. What is fitted beside the
+registration is held where the file has it; what is not is fitted as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
+from pyrcal.offline.methods import Settled
+from pyrcal.offline.models import BETTER, FAR_BETTER, Optic
+from pyrcal.offline.pupil_checks import Few, TriedPupil, gain_maps
+from service.model.kinds import SignalKind, Stop
+from service.model.misregistration import BOUNDARY_SCALE
+
+Array = NDArray[np.float64]
+
+OFFSET_STEP_SUBAP = 0.05
+"""Of a pupil off the centre of the subapertures, for the difference that stands for a rate."""
+
+NOTABLE_OFFSET_SUBAP = 0.05
+"""Less is not worth a word: the border of a pupil drawn on a grid is not better known."""
+
+NOTABLE_OFFSET_SHARE = 0.2
+"""... nor less than this share of a shift: where the mirror is the stop, on the diffractive
+telescope, a tenth of the shift looks like an offset."""
+
+LEAST_OFFSET = 0.01
+"""RMS share of the signal that an offset of the pupil has to explain."""
+
+NOTABLE_AXES = 0.02
+"""Of the gain of Sx over that of Sy, less 1."""
+
+MODULATION_STEP = 0.1
+"""Share by which a modulation is taken for another, to see what it moves."""
+
+_FEWEST = 6
+"""Modes below which a set tells nothing by itself."""
+
+_WORST = 0.1
+"""Share of the modes that fit worst, left out to see what they move."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Alternative:
+    """Another explanation of the matrix, or another way to weigh it."""
+
+    words: str
+    """What would be another, as the instrument file says it where it has a key."""
+
+    share: float | None
+    """χ² that it leaves over what the fit leaves, to first order; None: weights or modes are
+    others, and the two cannot be compared."""
+
+    moved: Array
+    """``(4,)`` by how much the registration would be another, numeric units."""
+
+    preferred: bool = False
+    """Whether the matrix is explained better by it, as far as χ² tells."""
+
+    undecided: bool = False
+    """Whether the matrix cannot tell the two apart."""
+
+
+def alternatives(
+    settled: Settled,
+    few: Few,
+    others: tuple[Rival, ...],
+    pupils: tuple[TriedPupil, ...],
+    optics: tuple[FoundOptic, ...],
+    without: AsTold | None,
+) -> tuple[Alternative, ...]:
+    """Return every alternative that was tried, those that the matrix prefers first.
+
+    Parameters
+    ----------
+    settled, few
+        The fit, and some of its modes on the cheap grid.
+    others
+        Other instruments that were tried for the verdict.
+    pupils
+        Other obscurations and diameters.
+    optics, without
+        What was fitted of the instrument, and the fit without where they differ.
+    """
+    found = (
+        *map(_of_rival, others),
+        *(_of_pupil(one, others) for one in pupils),
+        *_off_centre(few),
+        *_axes_apart(few),
+        *_uneven_light(few),
+        *_optics(settled, optics, without),
+        *_held(settled),
+        *_wavelength(few),
+        *_weighted(settled),
+        *_some_modes(settled),
+        *_without_border(few),
+    )
+    return tuple(
+        sorted(
+            (one for one in found if one is not None),
+            key=lambda one: (not one.preferred, not one.undecided, _share(one)),
+        )
+    )
+
+
+def _share(one: Alternative) -> float:
+    return float("inf") if one.share is None else one.share
+
+
+def preference(one: Alternative, sigma: Array) -> str:
+    """Return in a sentence that the matrix prefers an alternative, and what it would move."""
+    move = np.abs(one.moved) / sigma
+    share = "" if one.share is None else f" ({one.share:.0%} of the misfit)"
+    return (
+        f"the matrix is explained better with {one.words}{share}: the registration would move by "
+        f"{moved_words(one.moved)}, at most {np.max(move):.1f} sigma"
+    )
+
+
+def moved_words(moved: Array) -> str:
+    """Return how far a registration moves, boundary units."""
+    x, y, turn, size = moved * BOUNDARY_SCALE
+    return f"{x:+.2g}, {y:+.2g} subapertures, {turn:+.2g} deg, {size:+.2g}"
+
+
+# --- other instruments
+
+
+def _of_rival(rival: Rival) -> Alternative:
+    return Alternative(
+        words=rival.change.words,
+        share=rival.share,
+        moved=rival.estimate,
+        preferred=rival.believed,
+        undecided=not rival.believed and rival.share < 1.0 / BETTER,
+    )
+
+
+def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
+    """Return another pupil, unless it is among the rivals already."""
+    if any(one.words == rival.change.words for rival in others):
+        return None
+    return Alternative(words=one.words, share=one.share, moved=one.moved)
+
+
+def _off_centre(few: Few) -> Iterator[Alternative]:
+    """Yield that the pupil's image is not in the middle of the subapertures."""
+    about, alpha = few.models.instrument, few.here
+    here = np.array(about.pupil_shift_subap or (0.0, 0.0))
+    if about.stop is Stop.MIRROR:
+        here = alpha.vector[:2]
+    rates = []
+    for step in np.eye(2) * OFFSET_STEP_SUBAP:
+        beside = replace(about, stop=Stop.TELESCOPE, pupil_shift_subap=tuple(here + step))
+        rates.append((few.matrix(few.of(beside)) - few.own) / OFFSET_STEP_SUBAP)
+    if not all(few.tells(few.own, rate) for rate in rates):
+        return
+    (x, y), share, moved = _fitted_as_well(few, *rates)
+    explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
+    off = float(np.hypot(x, y))
+    shift = float(np.hypot(*alpha.vector[:2])) if about.stop is Stop.MIRROR else 0.0
+    notable = max(NOTABLE_OFFSET_SUBAP, NOTABLE_OFFSET_SHARE * shift)
+    middle = "mirror's" if about.stop is Stop.MIRROR else "sensor's"
+    yield Alternative(
+        words=f"the pupil {x:+.2f}, {y:+.2f} subapertures off the {middle} middle",
+        share=share,
+        moved=moved,
+        preferred=share < FAR_BETTER and off > notable and explained > LEAST_OFFSET,
+    )
+
+
+def _axes_apart(few: Few) -> Iterator[Alternative]:
+    """Yield that Sx and Sy have gains of their own."""
+    if few.models.instrument.slopes.kind is not SignalKind.XY:
+        return
+    half = len(few.own) // 2
+    rate = np.concatenate([few.own[:half], -few.own[half:]])
+    (value,), share, moved = _fitted_as_well(few, rate)
+    apart = float((1.0 + value) / (1.0 - value)) - 1.0
+    side = "stronger" if apart > 0.0 else "weaker"
+    yield Alternative(
+        words=f"Sx {abs(apart):.1%} {side} than Sy",
+        share=share,
+        moved=moved,
+        preferred=share < BETTER and abs(apart) > NOTABLE_AXES,
+    )
+
+
+def _uneven_light(few: Few) -> Iterator[Alternative]:
+    """Yield that a smooth gain over the pupil is common to all modes."""
+    maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
+    _, share, moved = _fitted_as_well(few, *maps)
+    yield Alternative(words="uneven light (--gain-map)", share=share, moved=moved)
+
+
+def _wavelength(few: Few) -> Iterator[Alternative]:
+    """Yield a tenth more of the wavelength: the modulation, in λ/D, stays."""
+    about = few.models.instrument
+    wfs = replace(about.wfs, wavelength_m=1.1 * about.wfs.wavelength_m)
+    matrix = few.matrix(few.of(replace(about, wfs=wfs)))
+    matrix *= np.linalg.norm(few.own) / np.linalg.norm(matrix)  # the gains take that up
+    yield Alternative(
+        words=f"wavelength_m = {wfs.wavelength_m:.3g}",
+        share=few.left(matrix) / few.left(few.own),
+        moved=few.step(matrix)[:4] - few.step(few.own)[:4],
+        undecided=True,
+    )
+
+
+def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, float, Array]:
+    """Return the values of more unknowns, χ² over what is without them, and α's move."""
+    step = few.step(few.own, *rates)
+    share = few.left(few.own, *rates) / few.left(few.own)
+    return step[-len(rates) :], share, step[:4] - few.step(few.own)[:4]
+
+
+# --- what is fitted beside the registration, held
+
+
+def _optics(
+    settled: Settled, optics: tuple[FoundOptic, ...], without: AsTold | None
+) -> Iterator[Alternative]:
+    """Yield coupling and modulation as the file says, and a modulation that is another."""
+    stated = [one for one in optics if one.reported is not None]
+    if without is not None:
+        words = " and ".join(f"{one.key} = {one.reported:.3g}" for one in stated) or "as told"
+        yield Alternative(words=words, share=1.0 / max(without.share, 1e-12), moved=without.moved)
+    first = settled.nuisances.first_optic
+    for place, one in enumerate(optics, first):
+        if without is None and one.reported is not None:
+            share, moved = _with(settled, {place: -one.change})
+            near = share < 1.0 / BETTER
+            words = f"{one.key} = {one.reported:.3g}, not fitted"
+            yield Alternative(words=words, share=share, moved=moved, undecided=near)
+        if one.optic is Optic.SENSOR and one.found is not None:
+            share, moved = _with(settled, {place: float(np.log1p(MODULATION_STEP))})
+            words = f"{one.key} = {one.found * (1.0 + MODULATION_STEP):.3g}"
+            near = share < 1.0 / BETTER
+            yield Alternative(words=words, share=share, moved=moved, undecided=near)
+
+
+def _held(settled: Settled) -> Iterator[Alternative]:
+    """Yield the slopes' axes as they are told, and an image that is not stretched."""
+    nuisances, values = settled.nuisances, settled.solution.nuisances
+    distance = nuisances.from_prior(values)
+    groups = [("the slopes' axes not turned", [0])]
+    if nuisances.anamorphosis:
+        groups.append(("no anamorphosis fitted", [1, 2]))
+    for words, places in groups:
+        share, moved = _with(settled, {place: -float(distance[place]) for place in places})
+        near = share < 1.0 / BETTER
+        yield Alternative(words=words, share=share, moved=moved, undecided=near)
+
+
+def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
+    """Return χ² over the fit's, and α's move, where nuisances are held so far from theirs."""
+    seen, nuisances = settled.solution.projection, settled.nuisances
+    noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
+    normal = seen.normal
+    held = normal + np.diag(nuisances.prior * noise)
+    places = np.array([4 + place for place in steps])
+    free = np.setdiff1d(np.arange(len(normal)), places)
+    step = np.zeros(len(normal))
+    step[places] = list(steps.values())
+    step[free] = -np.linalg.solve(
+        held[np.ix_(free, free)], held[np.ix_(free, places)] @ step[places]
+    )
+    return 1.0 + float(step @ normal @ step) / seen.chi, step[:4]
+
+
+# --- other weights, modes and slopes
+
+
+def _weighted(settled: Settled) -> Iterator[Alternative]:
+    """Yield modes weighed as if every slope had the same noise at the same stroke."""
+    alike = np.full(len(settled.target.weights), np.mean(settled.target.weights))
+    yield Alternative(
+        words="every slope with the same weight", share=None, moved=_stepped(settled, alike)
+    )
+
+
+def _some_modes(settled: Settled) -> Iterator[Alternative]:
+    """Yield halves of the modes, and all but those that fit worst."""
+    n_modes = settled.target.n_modes
+    order, numbers = np.argsort(settled.target.modes), np.arange(n_modes)
+    worst = np.argsort(settled.by_mode)[: n_modes - int(np.ceil(_WORST * n_modes))]
+    for words, kept in (
+        ("the lower half of the modes", order[: (n_modes + 1) // 2]),
+        ("the upper half of the modes", order[n_modes // 2 :]),
+        ("without the tenth of the modes that fits worst", worst),
+    ):
+        if len(kept) < _FEWEST:
+            continue
+        weights = np.where(np.isin(numbers, kept), settled.target.weights, 0.0)
+        yield Alternative(words=words, share=None, moved=_stepped(settled, weights))
+
+
+def _stepped(settled: Settled, weights: Array) -> Array:
+    """Return how far other weights of the modes ``(n_modes,)`` move α."""
+    seen, nuisances = settled.solution.projection, settled.nuisances
+    noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
+    prior = nuisances.prior * noise
+    values = np.concatenate([np.zeros(4), nuisances.from_prior(settled.solution.nuisances)])
+
+    def step(weights: Array) -> Array:
+        other = replace(seen, weights=weights)
+        held = other.normal + np.diag(prior)
+        return np.linalg.solve(held, other.scores.sum(axis=1) - prior * values)
+
+    return np.asarray(step(weights) - step(seen.weights))[:4]
+
+
+def _without_border(few: Few) -> Iterator[Alternative]:
+    """Yield the fit without the subapertures at the border of the pupil."""
+    border = border_of(few.target.valid)
+    rows = np.tile(border[few.target.valid], len(few.own) // int(few.target.valid.sum()))
+    if (few.target.rows & ~rows).sum() < len(rows) // 3:
+        return
+    inside = few.target.without(rows)
+    moved = inside.project(few.own, few.derivatives).best_step - few.step(few.own)
+    yield Alternative(words="without the border of the pupil", share=None, moved=moved[:4])
+
+
+def border_of(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which valid subapertures ``(n, n)`` have a neighbour that is none."""
+    wide = np.pad(valid, 1)
+    inside = wide[:-2, 1:-1] & wide[2:, 1:-1] & wide[1:-1, :-2] & wide[1:-1, 2:]
+    return np.asarray(valid & ~inside)

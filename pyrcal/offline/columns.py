@@ -1,0 +1,114 @@
+"""Columns of a matrix that are not those of their modes: signs, places, one too many."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.solver import Solution
+from service.estimation.orientation import find_orientation
+from service.estimation.reference import Reference, Target
+from service.model.instrument import Instrument
+from service.model.modes import Basis
+from service.model.sensors.sensor import Mapper
+
+Array = NDArray[np.float64]
+
+OPPOSITE = -0.5
+"""Correlation with its model below which a column has the wrong sign."""
+
+ANOTHERS = 0.7
+"""Correlation with another mode's model above which a column is that mode's."""
+
+OWN = 0.35
+"""... unless its own model explains more than this of it."""
+
+SURE = 0.7
+"""Correlation of the lowest orders above which columns listed another way are believed, ..."""
+
+CLEARER = 1.3
+"""... where it is so many times what it is as they stand."""
+
+_FEWEST = 9
+"""Modes below which some other order always looks alike."""
+
+_NAMED = 12
+
+
+def strange_columns(solution: Solution, target: Target) -> Iterator[str]:
+    """Yield which columns have the wrong sign, and which are other modes'."""
+    measured = _unit(target.matrix[target.rows])
+    alike = measured.T @ _unit(np.asarray(solution.matrix, dtype=np.float64)[target.rows])
+    own = np.diag(alike)
+    turned = target.modes[own < OPPOSITE]
+    if len(turned):
+        yield f"columns of the wrong sign: {_named(turned)}"
+    likest = np.argmax(np.abs(alike), axis=1)
+    columns = np.arange(len(own))
+    strange = (np.abs(alike[columns, likest]) > ANOTHERS) & (np.abs(own) < OWN)
+    exchanged, moved = [], []
+    for column in np.flatnonzero(strange):
+        other = likest[column]
+        pair = target.modes[column], target.modes[other]
+        sign = alike[column, other] < 0.0
+        if not (strange[other] and likest[other] == column):
+            moved.append(f"{pair[0]} is mode {pair[1]}'s{' with the other sign' if sign else ''}")
+        elif column < other:
+            signs = sign or alike[other, column] < 0.0
+            exchanged.append(f"{pair[0]} and {pair[1]}{' with other signs' if signs else ''}")
+    if exchanged:
+        yield f"columns that have changed places: {_named(exchanged, '; ')}"
+    if moved:
+        yield f"columns that are another mode's: {_named(moved, '; ')}"
+
+
+def displaced_columns(
+    instrument: Instrument, usable: Reference, basis: Basis, *, mapper: Mapper = map
+) -> Iterator[str]:
+    """Yield that all columns stand one place off, or in reverse, where the lowest modes say so.
+
+    Parameters
+    ----------
+    instrument
+        As it is told; its orientation may be open.
+    usable, basis
+        The matrix, and the modes of its columns in their order.
+    """
+    n = len(usable.columns)
+    if n < _FEWEST:
+        return
+    every = np.arange(n)
+
+    def correlation(columns: NDArray[np.intp], modes: NDArray[np.intp]) -> float:
+        listed = replace(usable, matrix=usable.matrix[:, columns], modes=None, noise=None)
+        search = find_orientation(instrument, listed, basis.subset(modes), mapper=mapper)
+        return search.best.correlation
+
+    tried = {
+        "a column too many stands in front (piston?): column 1 is mode 0's, and so on": (
+            every[1:],
+            every[:-1],
+        ),
+        "the first column is missing: column 0 is mode 1's, and so on": (every[:-1], every[1:]),
+        "the columns stand in reverse": (every, every[::-1]),
+    }
+    found = {words: correlation(*places) for words, places in tried.items()}
+    best = max(found, key=lambda words: found[words])
+    here = correlation(every, every)
+    if found[best] > max(SURE, CLEARER * here):
+        yield (
+            f"{best}; the lowest modes then correlate with the model by {found[best]:.2f}, "
+            f"as listed by {here:.2f}"
+        )
+
+
+def _unit(columns: Array) -> Array:
+    return np.asarray(columns / np.linalg.norm(columns, axis=0))
+
+
+def _named(what: Sequence[object] | NDArray[np.intp], between: str = ", ") -> str:
+    more = f" and {len(what) - _NAMED} more" if len(what) > _NAMED else ""
+    return between.join(str(one) for one in what[:_NAMED]) + more

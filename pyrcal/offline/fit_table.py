@@ -1,0 +1,170 @@
+"""A fit as text: what to do, the registration, and what it rests on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.matrix import Fit
+from pyrcal.offline.methods import ScanStep
+from pyrcal.offline.report import FitReport, orientation_words, verdict_line
+from service.errors import shown
+from service.model.misregistration import BOUNDARY_SCALE
+
+_ROWS = (
+    ("shift x", "subapertures", 4),
+    ("shift y", "subapertures", 4),
+    ("rotation", "deg", 4),
+    ("magnification", "ratio, of the mirror as drawn over the pupil as described", 5),
+)
+"""Name, unit and decimals of each parameter."""
+
+_FAR_GAIN = 0.2
+"""Gains further than this from the median are named: such modes are worth a look."""
+
+_NAMED = 8
+
+
+def table(report: FitReport) -> str:
+    """Return what to do, the verdict, the registration and what it rests on, as text."""
+    fit = report.fit
+    lines = [
+        *([fit.recommendation] if fit.recommendation else []),
+        verdict_line(fit),
+        "",
+        *_registration(fit),
+        "",
+        *_basis(report),
+        *_extras(fit),
+        *(f"note: {note}" for note in report.notes),
+    ]
+    return "\n".join(shown(line) for line in lines)
+
+
+def _registration(fit: Fit) -> Iterator[str]:
+    yield f"{'':15s}{'value':>11s}{'1 sigma':>11s}{'subsets':>11s}"
+    values = fit.alpha.vector * BOUNDARY_SCALE
+    sigma = fit.sigma * BOUNDARY_SCALE
+    scatter = fit.subset_scatter * BOUNDARY_SCALE
+    for (name, unit, decimals), value, one, spread in zip(
+        _ROWS, values, sigma, scatter, strict=True
+    ):
+        numbers = "".join(_number(number, decimals) for number in (value, one, spread))
+        yield f"{name:15s}{numbers}  {unit}"
+
+
+def _anamorphosis(found: NDArray[np.float64], sigma: NDArray[np.float64]) -> str:
+    (along, askew), (one, other) = 100.0 * found, 100.0 * sigma
+    return f"{along:+.3f} +- {one:.3f} % along x, {askew:+.3f} +- {other:.3f} % along 45 deg"
+
+
+def _number(value: float, decimals: int) -> str:
+    return f"{value:11.{decimals}f}" if np.isfinite(value) else f"{'-':>11s}"
+
+
+def _basis(report: FitReport) -> Iterator[str]:
+    fit = report.fit
+    yield f"{'residual':20s}{100.0 * fit.residual_fraction:.2f} % of the measured slopes"
+    yield from _where_left(fit)
+    yield f"{'modes used':20s}{len(fit.modes)} ({_spans(fit)})"
+    for sentence in fit.left_out:
+        yield f"{'left out':20s}{sentence}"
+    yield f"{'gains':20s}{_gains(fit)}"
+    yield f"{'condition number':20s}{fit.condition_number:.2f}"
+    words = ", ".join(
+        f"{k} = {v}" for k, v in orientation_words(fit.orientation, fit.order).items()
+    )
+    yield f"{'slopes':20s}{words}"
+    yield from _not_told(fit)
+    yield from _alternatives(fit)
+    yield f"{'double pass':20s}{'yes' if report.double_pass else 'no'}"
+    yield f"{'method':20s}{report.method}, {fit.n_evaluations} matrices, {report.seconds:.1f} s"
+    yield f"{'reference':20s}{report.reference}"
+    yield f"{'instrument':20s}{report.instrument}"
+
+
+def _where_left(fit: Fit) -> Iterator[str]:
+    left = fit.left_over
+    if left is None:
+        return
+    if left.border is not None and np.isfinite(left.border):
+        yield f"{'':20s}{left.border:.1f} times as much at the pupil's border as inside"
+    if left.words:
+        yield f"{'':20s}{left.words}"
+
+
+def _not_told(fit: Fit) -> Iterator[str]:
+    """Yield what the matrix has told, but for the orientation, which has its line."""
+    words = [one.words for one in fit.origins if one.correct and one.key != "orientation"]
+    if words:
+        yield f"{'found, not told':20s}{'; '.join(words)}"
+
+
+def _alternatives(fit: Fit) -> Iterator[str]:
+    """Yield how many rivals were tried, what the matrix prefers, and how far α would move."""
+    tried = fit.alternatives
+    if not tried:
+        return
+    sigma = fit.sigma
+    preferred = [one for one in tried if one.preferred]
+    named = f"{len(preferred)} preferred: see notes" if preferred else "none preferred"
+    yield f"{'rivals':20s}{len(tried)} tried, {named}"
+    open_ = [one for one in tried if one.undecided]
+    weights = [one for one in tried if one.share is None]
+    for words, group in (
+        ("as likely: would move it by up to", open_),
+        ("other weights and modes: by up to", weights),
+    ):
+        if group:
+            most = max(group, key=lambda one: float(np.max(np.abs(one.moved / sigma))))
+            far = float(np.max(np.abs(most.moved / sigma)))
+            yield f"{'':20s}{words} {far:.1f} sigma ({most.words})"
+
+
+def _extras(fit: Fit) -> Iterator[str]:
+    for one in fit.optics:
+        if one.found is not None:
+            stated = "unknown" if one.reported is None else f"{one.reported:g}"
+            words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
+            yield f"{one.key[:19]:20s}{words} (the instrument file says {stated})"
+    if fit.anamorphosis_sigma is not None:
+        words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
+        told = "" if fit.anamorphosis is not None else "not observable with these modes: "
+        yield f"{'anamorphosis':20s}{told}{words}"
+    if fit.gain_map is not None:
+        gains = fit.gain_map[fit.valid]
+        yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"
+    if fit.paper_table is not None:
+        yield ""
+        yield from paper_lines(fit.paper_table)
+
+
+def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
+    """Yield the paper's Table 1: which parameter was scanned, how finely, and its minimum."""
+    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'every':>9s}{'minimum':>11s}"
+    for number, scan in enumerate(steps, start=1):
+        yield (
+            f"{number:4d}  {scan.parameter:15s}{scan.samples.min():11.4f}"
+            f"{scan.samples.max():11.4f}{scan.step:9.4f}{scan.minimum:11.4f}"
+        )
+
+
+def _spans(fit: Fit) -> str:
+    """Return the modes as ranges, ends included."""
+    modes = np.sort(fit.modes)
+    runs = np.split(modes, np.flatnonzero(np.diff(modes) > 1) + 1)
+    words = [f"{run[0]}" if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs[:_NAMED]]
+    return ", ".join(words) + (", ..." if len(runs) > _NAMED else "")
+
+
+def _gains(fit: Fit) -> str:
+    low, middle, high = np.percentile(fit.gains, [5.0, 50.0, 95.0])
+    text = f"median {middle:.3g}, 90 % of them within {low:.3g} to {high:.3g}"
+    far = fit.modes[np.abs(fit.gains / middle - 1.0) > _FAR_GAIN]
+    if len(far):
+        named = ", ".join(str(mode) for mode in far[:_NAMED])
+        more = f" and {len(far) - _NAMED} more" if len(far) > _NAMED else ""
+        text += f"; more than {100 * _FAR_GAIN:.0f} % off: mode {named}{more}"
+    return text

@@ -1,0 +1,124 @@
+"""Why gains of modes are far from 1: what each mode was scaled by, and what all were.
+
+The gain of a mode is the size of its measured column over the model's. Modes that are scaled
+another way have gains that go as one over their peak to valley, say; a unit is common to all of
+them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.methods import Settled
+from service.model.modes import ModalBasis
+
+Array = NDArray[np.float64]
+
+SCATTERED = 0.06
+"""Robust relative scatter of gains beyond which a cause is looked for in each mode."""
+
+CLEARER = 0.3
+"""A size of the modes is the cause when what it leaves scatters by less than this share, ..."""
+
+CLEAR = 0.08
+"""... and by less than this."""
+
+SMOOTH = 0.05
+"""Scatter about a parabola in the logarithm of the mode's number that still is smooth."""
+
+DIMMED = 0.9
+"""Gains whose median is less may be what residual turbulence leaves of them."""
+
+UNIT = 0.03
+"""Relative distance from a unit at which it is believed."""
+
+_POINTS = 4000
+"""Of the pupil, that the modes' sizes are taken from."""
+
+_FEWEST = 8
+"""Modes below which scatter tells nothing."""
+
+
+def gain_causes(settled: Settled, *, passes: int, stroke_known: bool) -> Iterator[str]:
+    """Yield likely causes of gains that are far from 1, one sentence each."""
+    gains = settled.solution.projection.gains
+    if len(gains) < 1 or np.any(gains <= 0.0):
+        if np.all(gains < 0.0):
+            yield (
+                "every mode answers with the wrong sign: commands or slopes have the other sign; "
+                "write sign = -1 into [slopes], or leave orientation to be found"
+            )
+        return
+    if stroke_known:
+        yield from _unit(float(np.median(gains)), settled, passes)
+    if len(gains) < _FEWEST or scatter_of(gains) <= SCATTERED:
+        return
+    sizes = _sizes(settled)
+    apart = {words: scatter_of(gains * size) for words, size in sizes.items()}
+    words = min(apart, key=lambda one: apart[one])
+    if apart[words] < min(CLEARER * scatter_of(gains), CLEAR):
+        middle = float(np.median(gains * sizes[words]))
+        times = "" if abs(middle - 1.0) < UNIT or "normalised" in words else f", times {middle:.3g}"
+        yield (
+            f"the gains go as one over {words}{times}: the matrix's modes are scaled so, the "
+            "file's are not; the registration does not depend on it"
+        )
+    elif stroke_known and float(np.median(gains)) < DIMMED and _smooth(gains, settled.target.modes):
+        low, high = np.percentile(gains, [5.0, 95.0])
+        yield (
+            f"the gains run smoothly from {low:.2g} to {high:.2g} over the modes, as the optical "
+            "gain of a pyramid in residual turbulence does; the registration does not depend on it"
+        )
+
+
+def scatter_of(values: Array) -> float:
+    """Return the robust relative scatter of positive values."""
+    logarithms = np.log(values)
+    return float(np.median(np.abs(logarithms - np.median(logarithms)))) * 1.4826
+
+
+def _unit(middle: float, settled: Settled, passes: int) -> Iterator[str]:
+    """Yield the unit that all gains are off by."""
+    wavelength_m = settled.models.instrument.wfs.wavelength_m
+    radian_m = wavelength_m / (2.0 * np.pi)
+    units = {
+        "per wave of OPD: divide it by the wavelength": wavelength_m,
+        "per radian of phase: multiply it by 2 pi over the wavelength": radian_m,
+        "per millimetre: multiply it by 1000": 1e-3,
+        "per micrometre: multiply it by 1e6": 1e-6,
+        "per nanometre: multiply it by 1e9": 1e-9,
+    }
+    if passes == 1:
+        units["of both passes and per metre of surface: divide it by 4"] = 4.0
+    for words, unit in units.items():
+        if abs(np.log(middle / unit)) < UNIT:
+            yield f"the gains' median is {middle:.3g}: the matrix is {words}"
+
+
+def _sizes(settled: Settled) -> Mapping[str, Array]:
+    """Return sizes that modes may be scaled by, ``(n_modes,)`` each."""
+    basis, points = settled.models.basis, settled.models.cheap.pupil.points
+    shapes = basis.render(points[:: 1 + len(points) // _POINTS])
+    sizes = {
+        "the modes' peak to valley": np.ptp(shapes, axis=0),
+        "the modes' largest value": np.abs(shapes).max(axis=0),
+        "the modes' RMS": shapes.std(axis=0),
+        "the size of their slopes, as normalised columns do": np.linalg.norm(
+            np.asarray(settled.solution.matrix, dtype=np.float64), axis=0
+        ),
+    }
+    if isinstance(basis, ModalBasis):
+        sizes["the largest stroke of their actuators"] = np.abs(basis.mode_to_actuator).max(axis=0)
+        sizes["the norm of their strokes"] = np.linalg.norm(basis.mode_to_actuator, axis=0)
+    return sizes
+
+
+def _smooth(gains: Array, modes: NDArray[np.intp]) -> bool:
+    """Return whether gains are smooth over the modes' numbers."""
+    order = np.log1p(modes.astype(np.float64))
+    logarithms = np.log(gains)
+    left = logarithms - np.polyval(np.polyfit(order, logarithms, 2), order)
+    return bool(np.std(left) < SMOOTH)

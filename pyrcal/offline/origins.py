@@ -1,0 +1,127 @@
+"""What was found rather than told: each key, what the file says, what the matrix does, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.instrument_checks import FoundOptic
+from service.model.instrument import Instrument
+from service.model.slopes import FLIPS, Orientation, SlopeRecipe
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """A number or a choice that the matrix has told."""
+
+    key: str
+    """As the instrument file has it."""
+
+    found: str
+    """As the file would write it."""
+
+    reported: str
+    """What the file says."""
+
+    how: str
+    """How it was found: from what, by what."""
+
+    correct: bool
+    """Whether the file should be corrected, or completed."""
+
+    @property
+    def words(self) -> str:
+        """All of it in a few words."""
+        return f"{self.key} = {self.found} ({self.how}; the file says {self.reported})"
+
+
+def origins(
+    about: Instrument,
+    reported: SlopeRecipe,
+    found: SlopeRecipe,
+    optics: tuple[FoundOptic, ...],
+    gains: NDArray[np.float64],
+) -> tuple[Origin, ...]:
+    """Return what was found of the instrument and its slopes.
+
+    Parameters
+    ----------
+    about
+        The instrument as the file has it.
+    reported, found
+        How slopes are listed, as asked for and as found.
+    optics
+        Numbers of the instrument fitted beside the registration.
+    gains
+        ``(n_used,)`` of the modes.
+    """
+    return (
+        *_slopes(reported, found),
+        *map(_of_optic, (one for one in optics if one.found is not None)),
+        *_wavelength(about, gains),
+        *_strokes(about),
+    )
+
+
+def _slopes(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[Origin]:
+    if reported.order is not found.order:
+        yield Origin(
+            key="order",
+            found=f'"{found.order}"',
+            reported=f'"{reported.order}"',
+            how="scanned: the lowest modes",
+            correct=True,
+        )
+    if reported.orientation is None:
+        yield Origin(
+            key="orientation",
+            found=written(found.assumed_orientation),
+            reported='"auto"',
+            how="scanned: the lowest modes",
+            correct=False,
+        )
+
+
+def written(orientation: Orientation) -> str:
+    """Return an orientation as the instrument file writes it."""
+    flips = ", ".join(f"{name} = {str(getattr(orientation, name)).lower()}" for name in FLIPS)
+    both = [orientation.sign_x, orientation.sign_y]
+    return f"{{ {flips}, sign = {both[0] if both[0] == both[1] else both} }}"
+
+
+def _of_optic(one: FoundOptic) -> Origin:
+    unknown = one.reported is None
+    return Origin(
+        key=one.key,
+        found=f"{one.found:.3g}",
+        reported='"unknown"' if unknown else f"{one.reported:.3g}",
+        how=f"fitted, 1 sigma {one.found_sigma:.1g}",
+        correct=unknown or one.notable,
+    )
+
+
+def _wavelength(about: Instrument, gains: NDArray[np.float64]) -> Iterator[Origin]:
+    middle = float(np.median(gains))
+    if "wfs.wavelength_m" in about.unknown and about.mirror.stroke_known and middle > 0.0:
+        scatter = float(np.std(gains)) / middle
+        yield Origin(
+            key="wavelength_m",
+            found=f"{about.wfs.wavelength_m / middle:.3g}",
+            reported='"unknown"',
+            how=f"from the gains, which scatter by {scatter:.1%}",
+            correct=True,
+        )
+
+
+def _strokes(about: Instrument) -> Iterator[Origin]:
+    if not about.mirror.stroke_known:
+        yield Origin(
+            key="stroke",
+            found="one gain for each mode",
+            reported='"unknown"',
+            how="fitted: shapes alone tell the registration",
+            correct=False,
+        )

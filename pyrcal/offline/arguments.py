@@ -211,6 +211,7 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
         words("--gain-map", "also fit a smooth gain over the pupil"),
         words("--no-anamorphosis", "take the image for as stretched as the instrument file says"),
         words("--anamorphosis", "as without it: the stretch is always fitted"),
+        words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),
         *_OF_AN_ANSWER,
     )
 

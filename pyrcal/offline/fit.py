@@ -51,6 +51,7 @@ def main(options: argparse.Namespace) -> int:
         asked,
         dataset=options.dataset,
         threads=options.threads,
+        memory_gb=options.memory_gb,
         progress=show_progress,
     )
     if light is not None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.memory import check_fit
 from pyrcal.offline.recorded import FLUX_FRAME, Recorded, read_recorded
 from pyrcal.offline.report import FitReport
 from service.errors import MatrixError
@@ -31,10 +32,13 @@ def fit_file(
     *,
     dataset: str | None = None,
     threads: int = 2,
+    memory_gb: float | None = None,
     basis: Basis | None = None,
     progress: Progress | None = None,
 ) -> FitReport:
     """Return the fit of the measured matrix in a file; ``basis`` as in ``fit_matrix``.
+
+    What would take more than ``memory_gb`` is refused before it is fitted; None: it is not asked.
 
     Raises
     ------
@@ -46,6 +50,9 @@ def fit_file(
     recorded = read_recorded(path, dataset)
     reference, notes = reference_of(recorded, instrument)
     options = replace(options, explain=True)
+    if memory_gb is not None:
+        n_modes = len(reference.columns if options.modes is None else options.modes)
+        check_fit(instrument, n_modes, memory_gb, gain_map=options.gain_map)
     begun = time.perf_counter()
     # BLAS keeps to one thread: nested threading made a fit seven times slower
     with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:

@@ -1,4 +1,4 @@
-"""Refuse a reconstructor that would not fit in memory, before anything of it is computed."""
+"""Refuse what would not fit in memory, before anything of it is computed."""
 
 from __future__ import annotations
 
@@ -41,4 +41,52 @@ def check_reconstruction(
             f"{instrument.name}: found {instrument.modes.n_modes} modes, whose D and the inverse "
             f"of {n_modes} of them take {expected_gb:.1f} GB; expected at most --memory-gb "
             f"{most_gb:g}: allow more, or ask for fewer modes"
+        )
+
+
+def bytes_of_fit(instrument: Instrument, n_modes: int, *, gain_map: bool = False) -> float:
+    """Return what a fit of ``n_modes`` columns takes at its largest, the program included."""
+    kind = kind_of(instrument)
+    pupil = instrument_pupil(instrument, kind.fine_sampling * instrument.binning)
+    fineness = Fineness(n_nodes=kind.fine_sampling * instrument.binning)
+    sensor = kind.sensor(instrument, pupil, fineness)
+    made = work_of(instrument, sensor, pupil, n_matrices=1).memory_bytes
+    n_unknowns = _USUAL_UNKNOWNS + _OF_GAIN_MAP * gain_map
+    column_bytes = 8.0 * sensor.n_signals * n_modes
+    of_unknowns = column_bytes * n_unknowns
+    modelling = _MODELS * (made - PROGRAM_BYTES) + _KEPT * of_unknowns
+    return PROGRAM_BYTES + max(modelling, _PROJECTED * of_unknowns)
+
+
+_USUAL_UNKNOWNS = 9
+"""Registration, turn of the axes, anamorphosis, coupling and modulation."""
+
+_OF_GAIN_MAP = 14
+"""Coefficients of the gain over the pupil."""
+
+_KEPT = 2.3
+"""Copies of the derivatives by each of them, float64, while a model is computed, ..."""
+
+_PROJECTED = 5.7
+"""... and while they are projected."""
+
+_MODELS = 1.4
+"""Over what the fine model takes: the coarser ones together with it."""
+
+
+def check_fit(
+    instrument: Instrument, n_modes: int, most_gb: float, *, gain_map: bool = False
+) -> None:
+    """Refuse a fit that takes more than ``most_gb``.
+
+    Raises
+    ------
+    ModelError
+        In one line with what it takes.
+    """
+    expected_gb = bytes_of_fit(instrument, n_modes, gain_map=gain_map) / GB
+    if expected_gb > most_gb:
+        raise ModelError(
+            f"{instrument.name}: found {n_modes} modes, whose fit takes {expected_gb:.1f} GB; "
+            f"expected at most --memory-gb {most_gb:g}: allow more, or fit fewer (--modes)"
         )

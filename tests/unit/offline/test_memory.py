@@ -1,19 +1,23 @@
-"""What a reconstructor takes is known, and refused in one line, before it is begun."""
+"""What a fit or a reconstructor takes is known, and refused in one line, before it is begun."""
 
 import tracemalloc
+from dataclasses import replace
 
 import pytest
 
 from pyrcal.arguments import command_line
-from pyrcal.offline import reconstruct
-from pyrcal.offline.memory import bytes_of_reconstruction, check_reconstruction
+from pyrcal.offline import fit, fit_file, reconstruct
+from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.memory import bytes_of_fit, bytes_of_reconstruction, check_reconstruction
 from service.control.reconstructor import invert
 from service.errors import ModelError
+from service.estimation.reference import Reference
 from service.model.interaction import InteractionModel
 from service.model.kinds import Influence
 from service.model.memory import PROGRAM_BYTES
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
+from service.model.slopes import Orientation, SlopeRecipe
 from tests.unit.model.test_memory import instrument_of
 from tests.unit.offline.test_reconstruct import TINY
 
@@ -33,6 +37,34 @@ def test_the_estimate_is_within_a_fifth_of_the_measured_peak(n_modes, sampling):
     finally:
         tracemalloc.stop()
     assert expected == pytest.approx(peak, rel=0.2)
+
+
+@pytest.mark.parametrize("gain_map", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_the_estimate_of_a_fit_is_within_a_fifth_of_the_measured_peak(gain_map):
+    plain = SlopeRecipe(orientation=Orientation())
+    instrument = replace(instrument_of(Influence.GAUSSIAN, 200), slopes=plain)
+    alpha = Misregistration(shift_x_subap=0.3, rotation_rad=0.02)
+    measured = InteractionModel(instrument, modal_basis(instrument)).interaction_matrix(alpha)
+    expected = bytes_of_fit(instrument, 200, gain_map=gain_map) - PROGRAM_BYTES
+    tracemalloc.start()
+    try:
+        options = FitOptions(gain_map=gain_map, start=alpha)
+        fit_matrix(instrument, Reference(matrix=measured.astype(float)), options)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert expected == pytest.approx(peak, rel=0.2)
+
+
+def test_a_fit_that_is_too_large_is_refused_in_one_line_before_it_is_begun(monkeypatch):
+    monkeypatch.setattr(fit_file, "fit_matrix", None)
+    words = ["fit", str(TINY), str(TINY.with_suffix(".h5")), "--memory-gb", "0.13"]
+    with pytest.raises(ModelError) as refused:
+        fit.main(command_line().parse_args(words))
+    text = str(refused.value)
+    assert "tiny: found 40 modes, whose fit takes 0." in text
+    assert "expected at most --memory-gb 0.13: allow more, or fit fewer (--modes)" in text
+    assert "\n" not in text
 
 
 def test_too_large_is_refused_in_one_line_before_modes_are_made(monkeypatch, tmp_path):

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import Fit, fit_matrix
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import fit_matrix
 from pyrcal.offline.recorded import read_recorded
 from pyrcal.terminal import print_lines
 from service.config import load_instrument

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import FitOptions, fit_matrix
 from pyrcal.offline.methods import SAME, land
 from pyrcal.offline.models import FitModels
 from service.config import load_instrument

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.matrix import Fit, fit_matrix
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import fit_matrix
 from service.config import load_instrument
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from threadpoolctl import threadpool_limits
 
-from pyrcal.offline.matrix import Fit, fit_matrix
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import fit_matrix
 from service.config.instrument import load_instrument
 from service.estimation.reference import Reference
 from service.model.instrument import Instrument, TabulatedModes

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative, moved_words, preference
+from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import left_over
 from pyrcal.offline.verdict import MOST_STRUCTURE, Refusal
-
-if TYPE_CHECKING:
-    from pyrcal.offline.matrix import Fit
 
 Array = NDArray[np.float64]
 
@@ -63,7 +60,11 @@ def explained(fit: Fit, tried: tuple[Alternative, ...], grounds: Grounds) -> Fit
         if one.preferred and one.words not in fit.verdict
     )
     said = (*fit.remarks, *grounds.gains, *preferred)
-    fit = replace(fit, alternatives=tried, remarks=said, left_over=left_over(fit))
+    size = np.linalg.norm(np.asarray(fit.measured, dtype=np.float64), axis=0)
+    left = left_over(
+        fit.residual_map, fit.residual_by_mode, valid=fit.valid, modes=fit.modes, size=size
+    )
+    fit = replace(fit, alternatives=tried, remarks=said, left_over=left)
     return replace(fit, recommendation=recommendation(fit, grounds))
 
 

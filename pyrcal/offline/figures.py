@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pyrcal.offline.matrix import Fit
+from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport, verdict_line
 from service.errors import ConfigurationError

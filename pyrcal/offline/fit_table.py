@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.matrix import Fit
+from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport, orientation_words, verdict_line
 from service.errors import shown

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import border_of
-
-if TYPE_CHECKING:
-    from pyrcal.offline.matrix import Fit
 
 Array = NDArray[np.float64]
 
@@ -58,19 +54,34 @@ class LeftOver:
         return "; ".join(parts)
 
 
-def left_over(fit: Fit) -> LeftOver:
-    """Return where the residual of a fit is."""
-    planes = fit.residual_map
+def left_over(
+    planes: Array, by_mode: Array, *, valid: NDArray[np.bool_], modes: NDArray[np.intp], size: Array
+) -> LeftOver:
+    """Return where the residual of a fit is.
+
+    Parameters
+    ----------
+    planes
+        ``(n_planes, n, n)`` RMS of what is left over, over the measured RMS.
+    by_mode
+        ``(n_used,)`` the same of each mode.
+    valid
+        ``(n, n)`` subapertures that give signals.
+    modes
+        ``(n_used,)`` basis indices.
+    size
+        ``(n_used,)`` of the measured columns.
+    """
     known = np.isfinite(planes).any(axis=0)
     squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
     by_place = np.full(known.shape, np.nan)
     by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
-    border = border_of(fit.valid)
+    border = border_of(valid)
     at_border, inside = by_place[known & border], by_place[known & ~border]
     return LeftOver(
         border=float(_rms(at_border) / _rms(inside)) if inside.any() and at_border.any() else None,
         subapertures=tuple(_strange_places(by_place, border)),
-        modes=tuple(_strange_modes(fit)),
+        modes=tuple(_strange_modes(by_mode, size, modes)),
     )
 
 
@@ -89,13 +100,12 @@ def _strange_places(by_place: Array, border: NDArray[np.bool_]) -> list[tuple[in
     return sorted(found, key=lambda one: -one[2])[:NAMED]
 
 
-def _strange_modes(fit: Fit) -> list[tuple[int, float]]:
-    shares = fit.residual_by_mode
+def _strange_modes(shares: Array, size: Array, modes: NDArray[np.intp]) -> list[tuple[int, float]]:
     if not np.isfinite(shares).all():
         return []
     # actuators beyond the pupil hardly move a slope: noise is much of them and strange in none
-    left = shares * np.linalg.norm(np.asarray(fit.measured, dtype=np.float64), axis=0)
+    left = shares * size
     large = left > LARGE * float(np.median(left))
     places = np.flatnonzero(large & (shares > max(STRANGE * float(np.median(shares)), LEAST)))
-    found = [(int(fit.modes[k]), float(shares[k])) for k in places]
+    found = [(int(modes[k]), float(shares[k])) for k in places]
     return sorted(found, key=lambda one: -one[1])[:NAMED]

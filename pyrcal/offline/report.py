@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative
+from pyrcal.offline.fitted import Fit
 from pyrcal.offline.instrument_checks import NOTABLE, NOTABLE_SIGMA
 from pyrcal.offline.left_over import LeftOver
-from pyrcal.offline.matrix import Fit
 from service import __version__
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe

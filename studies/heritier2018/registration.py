@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import FitOptions, fit_matrix
 from service.errors import PyrcalError
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pyrcal.offline.matrix import Fit
+from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport
 from service.model.kinds import Method, SlopeOrder

@@ -10,7 +10,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pyrcal.offline.matrix import Fit, FitOptions, fit_matrix
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import FitOptions, fit_matrix
 from service.estimation.reference import Reference
 from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration

@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long fuzz check paper bench clean FORCE
+.PHONY: help setup demo docs test test-long fuzz check paper bench soak load clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -50,6 +50,12 @@ paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--
 
 bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/bench.md; a quarter of an hour
 	@$(PY) -m benchmarks.bench $(ARGS)
+
+soak: $(STAMP) ## an hour at 1 kHz with company, for what grows or is lost; ARGS="--minutes 5" rehearses
+	@$(PY) -m benchmarks.soak $(ARGS)
+
+load: $(STAMP) ## 50 clients of REST at 1 kHz, then beside 1400 who only wait; ARGS="--seconds 20" and the like
+	@$(PY) -m benchmarks.load $(ARGS)
 
 clean: ## remove what make made; never var/, which holds calibration products
 	rm -rf .venv build dist service/web/manual *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \

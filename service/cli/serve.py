@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
 from service.archive import Archive
+from service.cli.notify import keep_informed, notify
 from service.cli.program import announced, leave
 from service.config import Settings
 from service.config.link_tables import link_security
@@ -139,12 +140,18 @@ async def _until_stopped(
     work = asyncio.create_task(supervisor.run())
     web = asyncio.create_task(answer())
     asked = asyncio.create_task(ending.asked.wait())
+    told = asyncio.create_task(
+        keep_informed(
+            lambda: supervisor.snapshot().stalled, lambda: supervisor.snapshot().ready_reason
+        )
+    )
     await asyncio.wait({work, web, asked}, return_when=asyncio.FIRST_COMPLETED)
     failed = work.done() or web.done()
+    notify("STOPPING=1")
     ending.begin()
-    for task in (work, asked):
+    for task in (work, asked, told):
         task.cancel()
-    outcomes = await asyncio.gather(work, web, return_exceptions=True)
+    outcomes = await asyncio.gather(work, web, told, return_exceptions=True)
     await desk.close()
     for outcome in outcomes:
         _explain(outcome)

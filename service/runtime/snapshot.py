@@ -84,6 +84,9 @@ class Snapshot:
     archive_waiting: int = 0
     """Lines of the audit trail that are not on the disk yet."""
 
+    stalled: str = ""
+    """Which part of the service stands still, and for how long; empty: none does."""
+
     @property
     def uptime_s(self) -> float:
         """Since the service started."""

@@ -29,6 +29,7 @@ from service.runtime.clock import ServiceClock
 from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
+from service.runtime.heartbeat import Heartbeat
 from service.runtime.snapshot import Snapshot
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_worker
@@ -102,6 +103,7 @@ class Supervisor:
         self._telemetry_lock = asyncio.Lock()
         """Held by whoever has, or changes, the estimators."""
         self._running: set[asyncio.Task[None]] = set()
+        self._heartbeat = Heartbeat()
         self._broken = ""
         """The last fault that nobody foresaw."""
         self._started_ns = self._clock.now_ns()
@@ -134,6 +136,7 @@ class Supervisor:
             worker_load=self._worker_load.worker_load,
             archive_failures=self._writer.failures,
             archive_waiting=self._writer.waiting,
+            stalled=self._heartbeat.stalled,
         )
 
     def _waiting_for(self, link: statistics.LinkStatistics) -> tuple[Prerequisite, ...]:
@@ -264,6 +267,7 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         self._bridge.set_wakeup(lambda: loop.call_soon_threadsafe(rung.set), for_frames=False)
         while True:
+            self._heartbeat.beat("the intake of telemetry")
             await asyncio.sleep(GATHER_S)
             # asyncio.wait_for of Python 3.11 swallows a cancel that meets the bell
             with contextlib.suppress(TimeoutError):
@@ -332,6 +336,7 @@ class Supervisor:
         alarms: frozenset[tuple[str, str]] = frozenset()
         told, revival, losses = readiness.ReadinessLog(), readiness.Revival(), readiness.Losses()
         while True:
+            self._heartbeat.beat("the tick")
             link = self._bridge.statistics()
             if revival.due(link, time.monotonic()):
                 await self._reopen_link()
@@ -367,6 +372,7 @@ class Supervisor:
     async def _reopen_link(self) -> None:
         """Open the link anew, for as long as that takes."""
         while True:
+            self._heartbeat.beat("the tick")
             try:
                 await asyncio.to_thread(self._bridge.reopen)
             except LinkError as error:

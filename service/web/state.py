@@ -91,7 +91,7 @@ FRESH_S = 3.0
 
 
 class HealthView(BaseModel):
-    """The process runs and answers."""
+    """The service answers and goes on."""
 
     status: str
     version: str
@@ -105,10 +105,18 @@ class ReadyView(BaseModel):
     reason: str
 
 
-@health.get("/healthz", openapi_extra=OPEN)
-async def healthz(service: ServiceDep) -> HealthView:
-    """Answer as long as the process lives."""
+@health.get(
+    "/healthz",
+    openapi_extra=OPEN,
+    response_model=HealthView,
+    responses={503: problem_response("A part of the service stands still: the detail says which")},
+)
+async def healthz(request: Request, service: ServiceDep) -> HealthView | Response:
+    """Say whether the service goes on: it takes telemetry in and ticks, with an RTC or without."""
     snapshot = service.snapshot()
+    if snapshot.stalled:
+        status = HTTPStatus.SERVICE_UNAVAILABLE
+        return problem(request, status, "stalled", snapshot.stalled)
     return HealthView(status="ok", version=__version__, uptime_s=snapshot.uptime_s)
 
 

@@ -713,12 +713,17 @@ async def test_a_wrong_method_is_a_problem_that_says_what_is_allowed(client):
 # --- health, metrics, description
 
 
-async def test_healthz_answers_while_the_process_lives(client):
+async def test_healthz_answers_while_the_service_goes_on(client):
     assert await body_of(client, "/healthz") == {
         "status": "ok",
         "version": __version__,
         "uptime_s": 60.0,
     }
+
+
+async def test_healthz_of_a_service_that_stands_still_says_what_does(client, service):
+    service.now = replace(service.now, stalled="the tick has stood still for 31 s")
+    assert_problem(await client.get("/healthz"), 503, "stalled", "the tick has stood")
 
 
 async def metrics_of(client):

@@ -14,6 +14,7 @@ import pytest
 from service.archive import Actor, AuditEntry, Channel, Range
 from service.errors import ArchiveError, CommandError, PyrcalError
 from service.rtc_bridge import Bridge, Endpoint
+from service.runtime import heartbeat
 from service.runtime.archiving import taken_up
 from service.runtime.engine import follow_state
 from service.runtime.supervisor import Supervisor
@@ -314,6 +315,20 @@ async def test_frames_that_the_link_cannot_hand_on_end_no_service(supervisor, br
         await until(lambda: supervisor._engine.bank.loop.rtc is not None)
         entry = next(e for e in supervisor._engine.state.log if e.name == "internal.error")
         assert "a ring that is bent" in entry.text
+
+
+async def test_an_intake_that_hangs_is_named_though_the_process_lives(
+    supervisor, bridge, monkeypatch
+):
+    gone_on = threading.Event()
+    async with running(supervisor):
+        assert not supervisor.snapshot().stalled
+        monkeypatch.setattr(heartbeat, "STALLED_S", 0.3)
+        monkeypatch.setattr(bridge, "drain", lambda **_: gone_on.wait(60.0) and [])
+        await until(lambda: "the intake of telemetry has stood" in supervisor.snapshot().stalled)
+        gone_on.set()
+        monkeypatch.undo()
+        await until(lambda: not supervisor.snapshot().stalled)
 
 
 async def test_frames_are_looked_at_before_what_was_told_after_them(

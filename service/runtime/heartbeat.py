@@ -1,0 +1,41 @@
+"""Whether the service still moves: a process that lives may stand still all the same."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+STALLED_S: Final = 30.0
+"""A round takes a second at most; on a machine that is full, or swaps, some."""
+
+
+class Heartbeat:
+    """When each part of the service last began a round of its work.
+
+    A part counts from its first round on: what has not begun cannot stand still.
+
+    Parameters
+    ----------
+    now_s
+        The clock: monotonic, seconds.
+    """
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._beats_s: dict[str, float] = {}
+
+    def beat(self, part: str) -> None:
+        """Take note that a part goes on."""
+        self._beats_s[part] = self._now_s()
+
+    @property
+    def stalled(self) -> str:
+        """Which part stands still, and for how long; empty: all go on."""
+        ages_s = {part: self._now_s() - beat_s for part, beat_s in self._beats_s.items()}
+        return "; ".join(
+            f"{part} has stood still for {age_s:.0f} s, expected a round within {STALLED_S:g} s: "
+            "restart the service"
+            for part, age_s in ages_s.items()
+            if age_s > STALLED_S
+        )

@@ -1,45 +1,50 @@
-ARG BASE=python:3.12-slim
-FROM ${BASE} AS manual
-WORKDIR /opt
-COPY constraints.txt ./
-RUN pip install --no-cache-dir -c constraints.txt sphinx myst-parser
-# the manual links into these
+# By digest: what is built is what was tested. A newer one: docker buildx imagetools inspect python:3.12-slim
+ARG BASE=python:3.12-slim@sha256:78387bc3881b8273120a12ebe6c1ab22b018ccc2c9adf565ae1ac9b536e184ea
+FROM ${BASE} AS wheel
+WORKDIR /opt/checkout
+COPY deploy/build.lock deploy/build.lock
+RUN python3 -m venv /opt/build \
+    && /opt/build/bin/pip install --no-cache-dir --require-hashes -r deploy/build.lock
+COPY pyproject.toml build_backend.py constraints.txt MANIFEST.in README.md LICENSE ./
+# the manual links into the examples
 COPY examples examples
-COPY sim_rtc sim_rtc
 COPY docs docs
-RUN python -m sphinx -q docs manual
-
-FROM ${BASE}
-
-WORKDIR /opt/pyrcal
-COPY pyproject.toml build_backend.py constraints.txt README.md LICENSE ./
-COPY docs/openapi.json docs/openapi.json
 COPY service service
 COPY pyrcal pyrcal
-COPY --from=manual /opt/manual service/web/manual
 COPY check_rtc check_rtc
 COPY sim_rtc sim_rtc
 COPY cacao_bridge cacao_bridge
 COPY studies studies
-RUN pip install --no-cache-dir -c constraints.txt . \
-    && useradd --system --create-home --home-dir /var/lib/pyrcal pyrcal
+RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir /opt/wheels .
+
+FROM ${BASE}
+COPY deploy/requirements.lock /opt/requirements.lock
+COPY --from=wheel /opt/wheels /opt/wheels
+RUN python3 -m venv /opt/pyrcal \
+    && /opt/pyrcal/bin/pip install --no-cache-dir --require-hashes -r /opt/requirements.lock \
+    && /opt/pyrcal/bin/pip install --no-cache-dir --no-deps --no-index /opt/wheels/*.whl \
+    && useradd --system --uid 10001 --user-group --create-home --home-dir /var/lib/pyrcal pyrcal
 
 # Inside a container loopback reaches nobody: listen on all its interfaces and publish what you want.
 # The link to the RTC is open to nobody without a certificate: pyrcal certificates new makes them.
-ENV PYRCAL_API__HOST=0.0.0.0 \
+ENV PATH=/opt/pyrcal/bin:/usr/local/bin:/usr/bin:/bin \
+    PYTHONDONTWRITEBYTECODE=1 \
+    PYRCAL_API__HOST=0.0.0.0 \
     PYRCAL_API__PORT=8080 \
     PYRCAL_ZENOH__LISTEN='["tls/0.0.0.0:7447"]' \
     PYRCAL_ZENOH__TLS='{ ca = "/var/lib/pyrcal/tls/ca.pem", certificate = "/var/lib/pyrcal/tls/service.pem", key = "/var/lib/pyrcal/tls/service-key.pem" }' \
     PYRCAL_SERVICE__DATA_DIR=/var/lib/pyrcal \
     PYRCAL_SERVICE__CACHE_DIR=/var/lib/pyrcal/cache
 
-USER pyrcal
+# by number, for whoever asks for a user that is not root
+USER 10001:10001
 WORKDIR /var/lib/pyrcal
 VOLUME /var/lib/pyrcal
 EXPOSE 8080 7447
 
-HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
-    CMD ["python", "-c", "import os, urllib.request as u; u.urlopen(f\"http://127.0.0.1:{os.environ['PYRCAL_API__PORT']}/healthz\", timeout=2)"]
+# 503, and unhealthy, once the service lives and stands still; without an RTC it is well.
+HEALTHCHECK --interval=10s --timeout=5s --start-period=120s --retries=3 \
+    CMD ["python3", "-c", "import os, urllib.request as u; u.urlopen(f\"http://127.0.0.1:{os.environ['PYRCAL_API__PORT']}/healthz\", timeout=4)"]
 
 ENTRYPOINT ["pyrcal"]
 CMD ["run"]

@@ -23,7 +23,9 @@ from service.tracking.products import MatrixState, ReconstructorRecord
 from service.tracking.sending import why_no_return, why_unread
 from service.tracking.state import Mode, TrackerState
 from service.tracking.update_policy import PROPOSAL_STANDS_S, is_outdated
-from service.wire import TEXT_LIMIT, StateMessage
+from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
+
+AlarmTexts = frozenset[tuple[str, str]]
 
 SILENT_S: Final = 3.0
 """What has not come for so long is waited for."""
@@ -485,3 +487,12 @@ def state_message(
         waiting_for=tuple(f"{w.responsible}: {w.text}"[:TEXT_LIMIT] for w in waiting),
         operation=operating(state, hindered, now_ns).words,
     )
+
+
+def alarm_messages(
+    system: str, before: AlarmTexts, now: AlarmTexts, now_ns: int
+) -> Iterator[AlarmMessage]:
+    """Yield what changes between two sets of alarms, as the wire says it."""
+    for name, text in now ^ before:
+        active, short = (name, text) in now, text[:TEXT_LIMIT]
+        yield AlarmMessage(system=system, t_ns=now_ns, name=name, active=active, text=short)

@@ -15,7 +15,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from service import rtc_bridge, wire
+from service import rtc_bridge
 from service.archive import Actor, Archive, AuditEntry
 from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError
@@ -356,16 +356,10 @@ class Supervisor:
                 self._note("waiting", text, Level.INFO)
             self._bridge.publish_state(readiness.state_message(self._engine.state, now_ns, waiting))
             raised = frozenset((a.name, a.text) for a in self._engine.state.alarms.active)
-            for name, text in raised ^ alarms:
-                self._bridge.publish_alarm(
-                    wire.AlarmMessage(
-                        system=self._engine.state.system,
-                        t_ns=now_ns,
-                        name=name,
-                        active=(name, text) in raised,
-                        text=text[: wire.TEXT_LIMIT],
-                    )
-                )
+            for message in readiness.alarm_messages(
+                self._engine.state.system, alarms, raised, now_ns
+            ):
+                self._bridge.publish_alarm(message)
             alarms = raised
             await asyncio.sleep(1.0)
 

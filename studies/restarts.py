@@ -14,16 +14,11 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import os
-import signal
-import socket
 import statistics
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -32,23 +27,16 @@ from typing import Any
 import httpx
 import numpy as np
 
-from studies.campaign.small import SETTINGS, SMALL
-from studies.demo.truth import TruthFile
+from studies.live import WITHIN_S, Telescope, tracks
 
 ASKED_S = 5.0
 """From the start of the process until it tracks again."""
-
-WITHIN_S = 60.0
-"""Longer than this, and the round is broken."""
 
 PUBLISH_S = 0.4
 """A kill comes at most so long after an order to publish has been sent."""
 
 IDLE_S = 1.5
 """... or, in the other rounds, after the first order."""
-
-ALPHA = "0.12,-0.08,0.3,1.004"
-N_START = 45
 
 
 @dataclass(kw_only=True)
@@ -84,88 +72,6 @@ class Acknowledged:
     pins: list[str] = field(default_factory=list)
     mode: str = "auto"
     n_orders: int = 0
-
-
-class Telescope:
-    """The RTC, which nobody kills, and the service of the moment."""
-
-    def __init__(self, directory: Path, seed: int) -> None:
-        self.directory = directory
-        self.port, self.zenoh_port = _free_port(), _free_port()
-        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=10.0)
-        self.truth = TruthFile(directory / "truth.jsonl")
-        self.settings = directory / "settings.toml"
-        self.settings.write_text(_toml(), encoding="utf-8")
-        self.service: subprocess.Popen[bytes] | None = None
-        self.rtc = self._process(
-            "rtc",
-            *("sim_rtc", "--connect", f"tcp/127.0.0.1:{self.zenoh_port}", "--instrument", SMALL),
-            *(f"--alpha={ALPHA}", "--mag", "6", "--n-controlled", str(N_START), "--quiet"),
-            *("--seed", str(seed), "--truth", str(directory / "truth.jsonl")),
-        )
-
-    def start(self) -> float:
-        """Start the service; return the moment."""
-        begun_s = time.monotonic()
-        self.service = self._process(
-            "service",
-            *("service", "run", "--config", str(self.settings), "--instrument", SMALL),
-            *("--listen", f"tcp/127.0.0.1:{self.zenoh_port}", "--port", str(self.port)),
-            *("--data-dir", str(self.directory / "data"), "--mode", "auto"),
-        )
-        return begun_s
-
-    def kill(self) -> None:
-        """Kill the service, and it alone: its worker has to notice."""
-        if self.service is not None:
-            self.service.send_signal(signal.SIGKILL)
-            self.service.wait()
-
-    def end(self) -> None:
-        """End everything."""
-        self.client.close()
-        for process in (self.service, self.rtc):
-            if process is not None:
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-
-    def get(self, path: str) -> Any:  # noqa: ANN401 - JSON
-        """Return the answer of REST."""
-        return self.client.get(path).raise_for_status().json()
-
-    def state(self) -> dict[str, Any] | None:
-        """Return the state; None: the service does not answer."""
-        try:
-            found: dict[str, Any] = self.get("/v1/state")
-        except httpx.HTTPError:
-            return None
-        return found
-
-    def wait(self, begun_s: float, condition: Callable[[dict[str, Any]], object]) -> float | None:
-        """Return how long after ``begun_s`` the state fulfils it; None: not in time."""
-        while (now_s := time.monotonic() - begun_s) < WITHIN_S:
-            state = self.state()
-            if state is not None and condition(state):
-                return now_s
-            time.sleep(0.05)
-        return None
-
-    def in_use(self) -> str | None:
-        """Return the matrix in use, as the RTC itself accounts for it."""
-        self.truth.read()
-        last = self.truth.last
-        return None if last is None else last["cm_id"]
-
-    def _process(self, name: str, *words: str) -> subprocess.Popen[bytes]:
-        with (self.directory / f"{name}.log").open("ab") as log:
-            return subprocess.Popen(
-                [sys.executable, "-m", *words],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-            )
 
 
 class Operator:
@@ -239,30 +145,15 @@ def one_round(telescope: Telescope, told: Acknowledged, number: int, seed: int) 
     found.acknowledged = told.n_orders
     begun_s = telescope.start()
     found.answers_s = telescope.wait(begun_s, lambda _: True)
-    found.tracks_s = telescope.wait(begun_s, _tracks)
+    found.tracks_s = telescope.wait(begun_s, tracks)
     if found.tracks_s is None:
-        found.broken.append(f"does not track within {WITHIN_S:g} s: {_what_it_says(telescope)}")
+        found.broken.append(f"does not track within {WITHIN_S:g} s: {telescope.says()}")
         return found
     _look(telescope, told, found)
     found.window_s = telescope.wait(begun_s, lambda state: state["registration"]["n_windows"] > 0)
     if found.window_s is None:
         found.broken.append(f"no window within {WITHIN_S:g} s")
     return found
-
-
-def _what_it_says(telescope: Telescope) -> str:
-    state = telescope.state()
-    if state is None:
-        return "it does not answer"
-    waits = [wait["text"] for wait in state["waiting_for"]]
-    alarms = [alarm["text"] for alarm in state["alarms"]]
-    return "; ".join([state["ready_reason"], *waits, *alarms])
-
-
-def _tracks(state: dict[str, Any]) -> bool:
-    known, rtc = state["registration"], state["rtc"]
-    heard = state["ready"] and rtc is not None and state["link"]["frames_received"] > 0
-    return bool(heard and known is not None and known["restored_ns_utc"] is not None)
 
 
 def _look(telescope: Telescope, told: Acknowledged, found: Round) -> None:
@@ -306,7 +197,8 @@ def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:
     telescope, told, rounds = Telescope(directory, seed), Acknowledged(), []
     try:
         begun_s = telescope.start()
-        if telescope.wait(begun_s, lambda state: len(_applied(telescope)) > 1) is None:
+        telescope.start_rtc()
+        if telescope.wait(begun_s, lambda state: len(telescope.applied()) > 1) is None:
             raise RuntimeError(f"no matrix was applied within {WITHIN_S:g} s: see {directory}")
         for number in range(n_rounds):
             rounds.append(one_round(telescope, told, number, seed))
@@ -317,11 +209,6 @@ def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:
     finally:
         telescope.end()
     return rounds
-
-
-def _applied(telescope: Telescope) -> list[str]:
-    found = telescope.get("/v1/reconstructors")["reconstructors"]
-    return [one["id"] for one in found if one["state"] in {"applied", "superseded"}]
 
 
 def summary(rounds: list[Round]) -> str:
@@ -341,22 +228,6 @@ def summary(rounds: list[Round]) -> str:
                 f"{sum(s > ASKED_S for s in took)}"
             )
     return "\n".join(lines)
-
-
-def _free_port() -> int:
-
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
-
-
-def _toml() -> str:
-    """Return the settings of the small telescope, one table after the other."""
-    tables: dict[str, list[str]] = {}
-    for name, value in SETTINGS.items():
-        table, key = name.split(".")
-        tables.setdefault(table, []).append(f"{key} = {value!r}")
-    tables["dither"].append("longest_pause_s = 0")
-    return "\n".join(line for name, keys in tables.items() for line in (f"[{name}]", *keys)) + "\n"
 
 
 def main() -> int:

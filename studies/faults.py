@@ -1,0 +1,448 @@
+"""Every fault that a night may bring, one after the other, on real processes over a real link.
+
+Run: ``python -m studies.faults`` (``make faults``), ``--only NAME`` for one, ``--quick`` for those
+that take seconds. A service in ``auto`` and a simulated RTC of the small telescope, a TCP
+connection between them that can be cut. While a fault lasts, and until all is as before, the state
+is asked ten times a second: how soon it names something that it did not name before, how soon the
+next window of telemetry is taken in, and what must never be.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from sim_rtc.faults import FaultKind
+from studies.live import WITHIN_S, Telescope
+
+NAMED_S = 3.0
+"""Within which a fault that stops the telemetry must be named."""
+
+POLL_S = 0.1
+
+Doing = Callable[[Telescope], Iterator[None]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fault:
+    """One fault: what begins it, how long it lasts, and what is expected."""
+
+    name: str
+    seconds: float
+    does: Doing
+    """Begins it, yields, and ends it."""
+
+    named_within_s: float | None = NAMED_S
+    """Of one that keeps the service from its job; None: it costs windows at most."""
+
+    quick: bool = True
+
+    stops_telemetry: bool = False
+    """Whether no frame comes while it lasts: nothing may be published then."""
+
+
+@dataclass(kw_only=True)
+class Outcome:
+    """What came of one."""
+
+    fault: Fault
+    named: str = ""
+    named_s: float | None = None
+    back_s: float | None = None
+    """From its end until a window of telemetry is taken in."""
+
+    lost: int = 0
+    sent: int = 0
+    """Reconstructors published while it lasted."""
+
+    broken: list[str] = field(default_factory=list)
+
+    def line(self) -> str:
+        """Return a row of the table."""
+        named = "-" if self.named_s is None else f"{self.named_s:.1f} s: {self.named}"
+        back = "never" if self.back_s is None else f"{self.back_s:.1f} s"
+        wrong = "; ".join(self.broken) or "-"
+        return f"| {self.fault.name} | {named} | {back} | {self.lost} | {self.sent} | {wrong} |"
+
+
+def _rtc_killed(at: Telescope) -> Iterator[None]:
+    _signal(at.rtc, signal.SIGKILL)
+    yield
+    at.start_rtc()
+
+
+def _rtc_frozen(at: Telescope) -> Iterator[None]:
+    _signal(at.rtc, signal.SIGSTOP)
+    yield
+    _signal(at.rtc, signal.SIGCONT)
+
+
+def _service_killed(at: Telescope) -> Iterator[None]:
+    at.kill()
+    yield
+    at.start()
+
+
+def _service_frozen(at: Telescope) -> Iterator[None]:
+    _signal(at.service, signal.SIGSTOP)
+    yield
+    _signal(at.service, signal.SIGCONT)
+
+
+def _worker_killed(at: Telescope) -> Iterator[None]:
+    for pid in _workers(at):
+        os.kill(pid, signal.SIGKILL)
+    yield
+
+
+def _worker_frozen(at: Telescope) -> Iterator[None]:
+    stopped = _workers(at)
+    for pid in stopped:
+        os.kill(pid, signal.SIGSTOP)
+    yield
+    for pid in stopped:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+
+
+def _link_cut(at: Telescope) -> Iterator[None]:
+    at.cable.cut()
+    yield
+    at.cable.plugged.set()
+
+
+def _link_half_open(at: Telescope) -> Iterator[None]:
+    at.cable.held = True
+    yield
+    at.cable.held = False
+
+
+def _link_delayed(at: Telescope) -> Iterator[None]:
+    at.cable.delay_s = 0.3
+    yield
+    at.cable.delay_s = 0.0
+
+
+def _link_throttled(at: Telescope) -> Iterator[None]:
+    at.cable.bytes_per_s = 100_000.0
+    yield
+    at.cable.bytes_per_s = None
+
+
+def _disk_refuses(at: Telescope) -> Iterator[None]:
+    """No file of the service may grow: as on a full disk, each write is refused."""
+    if at.service is None:
+        raise RuntimeError("no service runs")
+    _prlimit(at.service.pid, "--fsize=0:")
+    yield
+    _prlimit(at.service.pid, "--fsize=unlimited:")
+
+
+def _scheduled(kind: FaultKind) -> Doing:
+    """One that the simulated RTC makes by itself, at its time of the second part of the night."""
+
+    def does(at: Telescope) -> Iterator[None]:
+        begins_s = FIRST_S + EVERY_S * list(SCHEDULE).index(kind)
+        while _loop_s(at) < begins_s:
+            time.sleep(0.02)
+        yield
+
+    return does
+
+
+def _loop_s(at: Telescope) -> float:
+    """Return how long the simulated RTC of now has run, by its truth."""
+    at.truth.read()
+    lines = at.truth.lines
+    begun = max((k for k, line in enumerate(lines) if line["kind"] == "setup"), default=0)
+    times = [line["t_ns_utc"] for line in lines[begun:] if line["kind"] == "truth"]
+    return float(times[-1] - times[0]) / 1e9 if times else 0.0
+
+
+def _second_service(at: Telescope) -> Iterator[None]:
+    other = at.second_service()
+    yield
+    other.send_signal(signal.SIGKILL)
+    other.wait()
+
+
+def _dead_clients(at: Telescope) -> Iterator[None]:
+    """Twenty who ask for the stream and read none of it."""
+    ends = []
+    for _ in range(20):
+        end = socket.create_connection(("127.0.0.1", at.port))
+        end.sendall(b"GET /v1/stream HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        ends.append(end)
+    yield
+    for end in ends:
+        end.close()
+
+
+FIRST_S, EVERY_S = 25.0, 12.0
+"""Of the simulated RTC's time: when its first own fault begins, and from one to the next."""
+
+SCHEDULE = {
+    FaultKind.LOST: "0.05,5",
+    FaultKind.LATE: "0.3,5",
+    FaultKind.DUPLICATED: "0.2,5",
+    FaultKind.REORDERED: "0.2,5",
+    FaultKind.NAN: "0.05,5",
+    FaultKind.FROZEN: "5",
+    FaultKind.GARBAGE: "0.2,5",
+    FaultKind.SHAPE: "5",
+    FaultKind.BASIS: "5",
+    FaultKind.SECOND: "5",
+    FaultKind.STALL: "4",
+    FaultKind.PAUSE: "4",
+    FaultKind.DITHER_LOST: "5",
+    FaultKind.CLOCK: "3600",
+}
+"""Faults of frames on their way, of dither and clock, with their arguments; the clock is last: the
+simulated RTC tells its time by it."""
+
+SILENT = {
+    FaultKind.LOST,
+    FaultKind.LATE,
+    FaultKind.DUPLICATED,
+    FaultKind.REORDERED,
+    FaultKind.NAN,
+    FaultKind.GARBAGE,
+    FaultKind.CLOCK,
+    FaultKind.DITHER_LOST,
+}
+"""Those that cost windows at most, or show at the next window only."""
+
+OF_FRAMES = tuple(
+    Fault(
+        name=f"{kind}: {arguments}",
+        seconds=5.0,
+        does=_scheduled(kind),
+        named_within_s=None if kind in SILENT else NAMED_S,
+        quick=False,
+    )
+    for kind, arguments in SCHEDULE.items()
+)
+
+FAULTS = (
+    Fault(name="RTC killed, 5 s", stops_telemetry=True, seconds=5.0, does=_rtc_killed),
+    Fault(name="RTC frozen, 10 s", stops_telemetry=True, seconds=10.0, does=_rtc_frozen),
+    Fault(name="service killed", seconds=0.0, does=_service_killed, named_within_s=None),
+    Fault(name="service frozen, 10 s", seconds=10.0, does=_service_frozen, named_within_s=None),
+    Fault(name="worker killed", seconds=1.0, does=_worker_killed, named_within_s=None),
+    Fault(
+        name="worker frozen, 30 s",
+        seconds=30.0,
+        does=_worker_frozen,
+        named_within_s=6.0,
+        quick=False,
+    ),
+    Fault(name="link cut, 30 s", stops_telemetry=True, seconds=30.0, does=_link_cut, quick=False),
+    Fault(name="link half open, 10 s", stops_telemetry=True, seconds=10.0, does=_link_half_open),
+    Fault(
+        name="link delayed by 0.3 s, 10 s",
+        seconds=10.0,
+        does=_link_delayed,
+        named_within_s=None,
+        quick=False,
+    ),
+    Fault(name="link throttled to 100 kB/s, 10 s", seconds=10.0, does=_link_throttled),
+    Fault(
+        name="disk refuses every write, 15 s", seconds=15.0, does=_disk_refuses, named_within_s=6.0
+    ),
+    Fault(
+        name="second service, 15 s",
+        seconds=15.0,
+        does=_second_service,
+        named_within_s=None,
+        quick=False,
+    ),
+    Fault(
+        name="20 stream clients that never read, 10 s",
+        seconds=10.0,
+        does=_dead_clients,
+        named_within_s=None,
+    ),
+)
+
+
+def tried(at: Telescope, fault: Fault) -> Outcome:
+    """Let one fault come and go; return what came of it."""
+    outcome, before = Outcome(fault=fault), _looked(at)
+    n_before, lost_before = len(before["shelf"]), before["lost"]
+    with contextmanager(fault.does)(at):
+        begun_s, begun_ns = time.monotonic(), time.time_ns()
+        while time.monotonic() - begun_s < fault.seconds:
+            _watch(at, outcome, before, begun_s)
+    ended_s = time.monotonic()
+    while outcome.back_s is None and time.monotonic() - ended_s < WITHIN_S:
+        state = _watch(at, outcome, before, begun_s)
+        if state is None or state["rtc"] is None or state["registration"] is None:
+            continue
+        taken = state["registration"]["window_age_s"]
+        lasted_s = time.monotonic() - ended_s
+        if taken is not None and taken < lasted_s and state["ready"]:
+            outcome.back_s = lasted_s
+    after = _looked(at)
+    outcome.lost = max(after["lost"] - lost_before, 0)
+    outcome.sent = max(len(after["shelf"]) - n_before, 0)
+    if fault.stops_telemetry:
+        late = begun_ns + NAMED_S * 1e9, begun_ns + fault.seconds * 1e9
+        outcome.broken += [
+            f"{one['id']} was published though no frame came"
+            for one in after["shelf"]
+            if late[0] < (one["published_ns_utc"] or 0) < late[1]
+        ]
+    outcome.broken += _broken(at, outcome)
+    return outcome
+
+
+def _watch(
+    at: Telescope, outcome: Outcome, before: dict[str, Any], begun_s: float
+) -> dict[str, Any] | None:
+    """Look once: note what is named that was not."""
+    state, now_s = at.state(), time.monotonic() - begun_s
+    if state is not None and outcome.named_s is None:
+        fresh = _names(state) - before["names"]
+        if fresh:
+            outcome.named, outcome.named_s = ", ".join(sorted(fresh)), now_s
+    time.sleep(POLL_S)
+    return state
+
+
+def _names(state: dict[str, Any]) -> set[str]:
+    alarms = {alarm["name"] for alarm in state["alarms"]}
+    waits = {wait["name"] for wait in state["waiting_for"]}
+    return alarms | waits - {"window"}
+
+
+def _looked(at: Telescope) -> dict[str, Any]:
+    state = at.state()
+    while state is None:
+        time.sleep(POLL_S)
+        state = at.state()
+    shelf = at.get("/v1/reconstructors")["reconstructors"]
+    return {"names": _names(state), "shelf": shelf, "lost": state["link"]["frames_lost"]}
+
+
+def _broken(at: Telescope, outcome: Outcome) -> list[str]:
+    """Return which rules do not hold now."""
+    broken = []
+    within_s = outcome.fault.named_within_s
+    if within_s is not None and (outcome.named_s is None or outcome.named_s > within_s):
+        when = "never" if outcome.named_s is None else f"after {outcome.named_s:.1f} s"
+        broken.append(f"named {when}, expected {within_s:g} s")
+    if outcome.back_s is None:
+        broken.append(f"no window within {WITHIN_S:g} s: {at.says()}")
+    state, in_use = at.state(), at.in_use()
+    if state is None or state["in_use"] != in_use:
+        said = None if state is None else state["in_use"]
+        broken.append(f"{said} is said to be in use, the RTC has {in_use}")
+    for record in at.get("/v1/reconstructors")["reconstructors"]:
+        used = record["state"] in {"applied", "superseded"} and record["parent"] is not None
+        if used and record["origin"] == "the service's" and not record["gate"]:
+            broken.append(f"{record['id']} was used and never judged")
+    log = (at.directory / "service.log").read_text(encoding="utf-8", errors="replace")
+    if "Traceback" in log:
+        broken.append("a traceback in the service's log")
+    return broken
+
+
+def _workers(at: Telescope) -> list[int]:
+    """Return the service's children that compute: those that were spawned."""
+    if at.service is None:
+        return []
+    found = []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError, IndexError):
+            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if parent == at.service.pid and b"spawn_main" in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
+    return found
+
+
+def _signal(process: subprocess.Popen[bytes] | None, number: signal.Signals) -> None:
+    if process is not None:
+        process.send_signal(number)
+        if number is signal.SIGKILL:
+            process.wait()
+
+
+def _prlimit(pid: int, limit: str) -> None:
+    subprocess.run(["prlimit", f"--pid={pid}", limit], check=True)
+
+
+def _all(at: Telescope, faults: list[Fault]) -> Iterator[Outcome]:
+    for fault in faults:
+        outcome = tried(at, fault)
+        sys.stderr.write(outcome.line() + "\n")
+        with suppress(httpx.HTTPError):
+            at.client.put("/v1/mode", json={"mode": "auto"})
+        yield outcome
+
+
+def report(outcomes: list[Outcome]) -> str:
+    """Return the table."""
+    head = (
+        "| fault | named after | the next window after its end | frames lost | matrices sent | "
+        "broken |\n| --- | --- | --- | --- | --- | --- |"
+    )
+    return "\n".join([head, *(outcome.line() for outcome in outcomes)])
+
+
+def main() -> int:
+    """Run what is asked for; the exit status is 1 if anything was broken."""
+    parser = argparse.ArgumentParser(prog="python -m studies.faults")
+    parser.add_argument("--only", metavar="NAME", help="those whose name has this in it")
+    parser.add_argument("--quick", action="store_true", help="those that take seconds")
+    parser.add_argument("--directory", type=Path, help="data folder and logs, kept afterwards")
+    given = parser.parse_args()
+    chosen, of_frames = (
+        [
+            fault
+            for fault in faults
+            if (given.only or "") in fault.name and (fault.quick or not given.quick)
+        ]
+        for faults in (FAULTS, OF_FRAMES)
+    )
+    outcomes: list[Outcome] = []
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        directory = given.directory or Path(folder)
+        directory.mkdir(parents=True, exist_ok=True)
+        at = Telescope(directory, seed=3)
+        try:
+            begun_s = at.start()
+            at.start_rtc()
+            if at.wait(begun_s, lambda state: len(at.applied()) > 2) is None:
+                raise RuntimeError(f"no matrix was applied within {WITHIN_S:g} s: {at.says()}")
+            outcomes += _all(at, chosen)
+            if of_frames:
+                _signal(at.rtc, signal.SIGKILL)
+                times = (FIRST_S + EVERY_S * k for k in range(len(SCHEDULE)))
+                at.start_rtc(
+                    *(
+                        f"{kind}@{time_s:g}:{arguments}"
+                        for time_s, (kind, arguments) in zip(times, SCHEDULE.items(), strict=True)
+                    )
+                )
+                outcomes += _all(at, of_frames)
+        finally:
+            at.end()
+    sys.stdout.write(report(outcomes) + "\n")
+    return int(any(outcome.broken for outcome in outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

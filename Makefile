@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long fuzz check paper bench soak load clean FORCE
+.PHONY: help setup demo docs test test-long fuzz faults restarts check paper bench soak load clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -38,6 +38,12 @@ test-long: $(STAMP) ## the other tests: what takes minutes of real time
 
 fuzz: $(STAMP) ## a million malformed inputs of every kind; ARGS="--inputs 50000" and the like
 	@$(PY) -m tests.malformed $(ARGS)
+
+faults: $(STAMP) ## every fault that a night may bring, on real processes; eight minutes, ARGS=--quick two
+	@$(PY) -m studies.faults $(ARGS)
+
+restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; half an hour
+	@$(PY) -m studies.restarts $(ARGS)
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .

@@ -1,0 +1,42 @@
+"""What studies.faults and studies.restarts measure at length, in short: it stays so."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.system.night import ROOT
+from tests.system.pace import patience
+
+pytestmark = pytest.mark.long
+
+
+def run(*words):
+    """Run a study; return status and what it printed."""
+    found = subprocess.run(
+        [sys.executable, "-m", *words],
+        capture_output=True,
+        text=True,
+        timeout=patience(240.0),
+        cwd=ROOT,
+        check=False,
+    )
+    return found.returncode, found.stdout + found.stderr
+
+
+@pytest.mark.parametrize("fault", ["RTC killed", "link half open", "disk refuses"])
+def test_a_fault_is_named_and_passes(fault):
+    status, text = run("studies.faults", "--only", fault)
+    # a loaded machine may name it later than asked; nothing else may be broken
+    broken = re.sub(r"named after [0-9.]+ s, expected [0-9.]+ s", "-", text).splitlines()[-1]
+    assert status == 0 or broken.endswith("| - |"), text
+    assert "never" not in broken, text
+
+
+def test_what_was_acknowledged_is_there_after_each_of_six_kills(tmp_path):
+    words = ("--rounds", "6", "--seed", "7", "--output", str(tmp_path / "rounds.jsonl"))
+    status, text = run("studies.restarts", *words)
+    assert status == 0, text
+    assert "6 kills" in text
+    assert "0 broken" in text

@@ -50,6 +50,9 @@ class Fault:
 
     quick: bool = True
 
+    begins_s: float | None = None
+    """Of the simulated RTC's time, where it makes the fault by itself; None: now."""
+
     stops_telemetry: bool = False
     """Whether no frame comes while it lasts: nothing may be published then."""
 
@@ -151,16 +154,9 @@ def _disk_refuses(at: Telescope) -> Iterator[None]:
     _prlimit(at.service.pid, "--fsize=unlimited:")
 
 
-def _scheduled(kind: FaultKind) -> Doing:
-    """One that the simulated RTC makes by itself, at its time of the second part of the night."""
-
-    def does(at: Telescope) -> Iterator[None]:
-        begins_s = FIRST_S + EVERY_S * list(SCHEDULE).index(kind)
-        while _loop_s(at) < begins_s:
-            time.sleep(0.02)
-        yield
-
-    return does
+def _simulated(_: Telescope) -> Iterator[None]:
+    """One that the simulated RTC makes by itself, at its time."""
+    yield
 
 
 def _loop_s(at: Telescope) -> float:
@@ -191,7 +187,7 @@ def _dead_clients(at: Telescope) -> Iterator[None]:
         end.close()
 
 
-FIRST_S, EVERY_S = 25.0, 12.0
+FIRST_S, EVERY_S = 30.0, 30.0
 """Of the simulated RTC's time: when its first own fault begins, and from one to the next."""
 
 SCHEDULE = {
@@ -229,11 +225,12 @@ OF_FRAMES = tuple(
     Fault(
         name=f"{kind}: {arguments}",
         seconds=5.0,
-        does=_scheduled(kind),
+        does=_simulated,
+        begins_s=FIRST_S + EVERY_S * k,
         named_within_s=None if kind in SILENT else NAMED_S,
         quick=False,
     )
-    for kind, arguments in SCHEDULE.items()
+    for k, (kind, arguments) in enumerate(SCHEDULE.items())
 )
 
 FAULTS = (
@@ -280,6 +277,8 @@ FAULTS = (
 
 def tried(at: Telescope, fault: Fault) -> Outcome:
     """Let one fault come and go; return what came of it."""
+    while fault.begins_s is not None and _loop_s(at) < fault.begins_s - POLL_S:
+        time.sleep(0.02)
     outcome, before = Outcome(fault=fault), _looked(at)
     n_before, lost_before = len(before["shelf"]), before["lost"]
     with contextmanager(fault.does)(at):
@@ -384,6 +383,12 @@ def _prlimit(pid: int, limit: str) -> None:
     subprocess.run(["prlimit", f"--pid={pid}", limit], check=True)
 
 
+def _words(fault: Fault) -> str:
+    """Return the simulated RTC's own words for a fault of its: ``KIND@T:ARGUMENTS``."""
+    kind, _, arguments = fault.name.partition(": ")
+    return f"{kind}@{fault.begins_s:g}:{arguments}"
+
+
 def _all(at: Telescope, faults: list[Fault]) -> Iterator[Outcome]:
     for fault in faults:
         outcome = tried(at, fault)
@@ -430,13 +435,7 @@ def main() -> int:
             outcomes += _all(at, chosen)
             if of_frames:
                 _signal(at.rtc, signal.SIGKILL)
-                times = (FIRST_S + EVERY_S * k for k in range(len(SCHEDULE)))
-                at.start_rtc(
-                    *(
-                        f"{kind}@{time_s:g}:{arguments}"
-                        for time_s, (kind, arguments) in zip(times, SCHEDULE.items(), strict=True)
-                    )
-                )
+                at.start_rtc(*(_words(fault) for fault in of_frames))
                 outcomes += _all(at, of_frames)
         finally:
             at.end()

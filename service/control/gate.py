@@ -185,9 +185,12 @@ def _extent(matrix: Coupling) -> NDArray[np.float64]:
     Of many modes they are bounds, about ``ROUNDING`` further out.
     """
     even, odd = (matrix + matrix.T) / 2, (matrix - matrix.T) / 2
-    ends = _ends if len(matrix) < _MANY else _proven_ends
-    low, high = ends(even)
-    turn = np.sqrt(max(ends(odd.T @ odd)[1], 0.0))
+    square = odd.T @ odd
+    if len(matrix) < _MANY:
+        (low, high), (_, most) = _ends(even), _ends(square)
+    else:  # Lanczos hardly finds the least of a square: it takes thousands of steps
+        (low, high), most = _proven_ends(even), _proven_largest(square)
+    turn = np.sqrt(max(most, 0.0))
     slack = ROUNDING * max(abs(low), abs(high), turn)
     return np.array([low - slack, high + slack, turn + slack], dtype=np.float64)
 

@@ -1,12 +1,15 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long fuzz faults restarts check paper bench soak load clean FORCE
+.PHONY: help setup demo docs test test-long fuzz faults restarts check paper bench soak load wheel lock sbom audit clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
 STAMP := .venv/.installed-for
 MANUAL := service/web/manual/index.html
+# What makes lock files, bills of materials and audits: of nobody who runs pyrcal.
+TOOLS := build/tools/bin
+LOCKED := --quiet -c constraints.txt --generate-hashes --universal --python-version 3.11 --no-header --no-annotate
 # A hundred processes that each compile the service anew cost a minute.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(PY) -m pytest
 # A test that hangs where no signal reaches it says where, ends its worker and is tried again.
@@ -62,6 +65,26 @@ soak: $(STAMP) ## an hour at 1 kHz with company, for what grows or is lost; ARGS
 
 load: $(STAMP) ## 50 clients of REST at 1 kHz, then beside 1400 who only wait; ARGS="--seconds 20" and the like
 	@$(PY) -m benchmarks.load $(ARGS)
+
+wheel: ## dist/pyrcal-*.whl, the manual inside, built of locked packages
+	@$(PYTHON) -m venv build/wheel
+	@build/wheel/bin/pip install --quiet --require-hashes -r deploy/build.lock
+	@build/wheel/bin/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+
+lock: $(TOOLS) ## deploy/*.lock anew, of pyproject.toml and constraints.txt: each package with its hashes
+	@$(TOOLS)/uv pip compile $(LOCKED) pyproject.toml -o deploy/requirements.lock
+	@printf 'setuptools\nsphinx\nmyst-parser\n' | $(TOOLS)/uv pip compile $(LOCKED) - -o deploy/build.lock
+
+sbom: $(TOOLS) ## build/sbom.json: what the service runs on, as CycloneDX
+	@$(TOOLS)/cyclonedx-py requirements deploy/requirements.lock --pyproject pyproject.toml \
+	    --output-reproducible --of JSON -o build/sbom.json
+
+audit: $(TOOLS) ## known weaknesses of what the service runs on; it asks pypi.org
+	@$(TOOLS)/pip-audit --strict --disable-pip --require-hashes -r deploy/requirements.lock
+
+$(TOOLS):
+	@$(PYTHON) -m venv build/tools
+	@$(TOOLS)/pip install --quiet uv==0.13.9 cyclonedx-bom==7.5.0 pip-audit==2.10.1 || { rm -r build/tools; exit 1; }
 
 clean: ## remove what make made; never var/, which holds calibration products
 	rm -rf .venv build dist service/web/manual *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis \

@@ -62,7 +62,7 @@ def settings() -> str:
 def instrument() -> str:
     """Return docs/reference/instrument.md: every key of an instrument file."""
     intro = (
-        "A TOML file that describes the telescope, the pyramid, the mirror and how the RTC lists "
+        "A TOML file that describes the telescope, the sensor, the mirror and how the RTC lists "
         "slopes. [Fitting a measured matrix](../integrate/fitting.md) has the smallest one, and "
         "explains orientation. A reference to data is `path:/dataset`, relative to the file. In "
         "brackets: type and default."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 
 import numpy as np
@@ -73,10 +74,7 @@ def _basis(report: FitReport) -> Iterator[str]:
         yield f"{'left out':20s}{sentence}"
     yield f"{'gains':20s}{_gains(fit)}"
     yield f"{'condition number':20s}{fit.condition_number:.2f}"
-    words = ", ".join(
-        f"{k} = {v}" for k, v in orientation_words(fit.orientation, fit.order).items()
-    )
-    yield f"{'slopes':20s}{words}"
+    yield f"{'slopes':20s}{_as_written(fit)}"
     yield from _not_told(fit)
     yield from _alternatives(fit)
     yield f"{'double pass':20s}{'yes' if report.double_pass else 'no'}"
@@ -121,6 +119,14 @@ def _alternatives(fit: Fit) -> Iterator[str]:
             most = max(group, key=lambda one: float(np.max(np.abs(one.moved / sigma))))
             far = float(np.max(np.abs(most.moved / sigma)))
             yield f"{'':20s}{words} {far:.1f} sigma ({most.words})"
+
+
+def _as_written(fit: Fit) -> str:
+    """Return order and orientation as ``[slopes]`` of the instrument file has them."""
+    words = orientation_words(fit.orientation, fit.order)
+    order = words.pop("order")
+    axes = ", ".join(f"{name} = {json.dumps(value)}" for name, value in words.items())
+    return f'order = "{order}", orientation = {{ {axes} }}'
 
 
 def _extras(fit: Fit) -> Iterator[str]:

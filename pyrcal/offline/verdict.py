@@ -128,8 +128,9 @@ def _unsettled(findings: FitFindings) -> str:
     if findings.solution.converged:
         return ""
     return (
-        "the steps did not come to rest: the start is outside the capture range, or the instrument "
-        "file is another's; start closer (--start), or leave the start out"
+        "the steps did not come to rest: the modes (another basis, another order) or the "
+        "instrument file are another's, or the start is outside the capture range: start closer "
+        "(--start), or leave the start out"
     )
 
 

@@ -69,6 +69,7 @@ def test_a_start_from_which_nothing_is_found_is_refused():
     found = fit(matrix(), options=from_here(0.0, 0.0, 60.0, 0.0))
     assert not found.accepted
     assert found.verdict.startswith("refused: the steps did not come to rest")
+    assert "the modes (another basis, another order)" in found.verdict
 
 
 @pytest.mark.parametrize("n_modes", [9, 20])

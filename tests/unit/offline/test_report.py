@@ -1,4 +1,5 @@
 import json
+import tomllib
 
 import numpy as np
 import pytest
@@ -193,6 +194,15 @@ def test_the_four_parameters_are_there_with_unit_and_uncertainty():
     numbers, words = line(text, "magnification").split()[1:4], "the mirror as drawn over the pupil"
     assert numbers == ["0.98000", "0.00100", "0.00010"]
     assert f"ratio, of {words} as described" in line(text, "magnification")
+
+
+def test_the_slopes_are_printed_as_the_instrument_file_takes_them():
+    written = line(table(a_report()), "slopes").removeprefix("slopes").strip()
+    order, orientation = written.split(", ", maxsplit=1)
+    assert tomllib.loads(f"{order}\n{orientation}") == {
+        "order": "yx",
+        "orientation": {"swap_xy": False, "flip_x": True, "flip_y": False, "sign": [1, -1]},
+    }
 
 
 def test_what_was_left_out_is_named():

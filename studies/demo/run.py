@@ -41,15 +41,16 @@ FAR = f"""\
 {PLACE} With that matrix a
 loop of 400 modes diverges, so the RTC begins with 120. WFE is what the simulator knows to be left.
 """
+OTHER_FAR = f"""\
+{PLACE} The RTC begins
+with 120 modes, or with seven tenths of them all where that is fewer. WFE is what the simulator
+knows to be left.
+"""
 LARGE = """\
 This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
 fast as this machine goes: at the highest rate that it holds or, where a dither needs more, in slow
 motion. Until all is ready takes minutes: modes (kept on disk afterwards), D and its derivatives,
 and the simulator's own matrices: some 9 GB beside 6 of the service's.
-"""
-LARGE_FAR = f"""\
-{PLACE} The RTC begins
-with 120 modes. WFE is what the simulator knows to be left.
 """
 
 HELD_GFLOP_S = 30.0
@@ -77,7 +78,7 @@ def run_demo(options: argparse.Namespace) -> int:
     if large is not None:
         _say(LARGE.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
     if _is_far(options):
-        _say(FAR if large is None else LARGE_FAR)
+        _say(_beginning(options))
     commands = {
         "service": ["-m", "service", *service_words],
         "simulator": ["-m", "sim_rtc", *sim_words],
@@ -108,6 +109,11 @@ def _is_far(options: argparse.Namespace) -> bool:
     """Return whether the night begins far away: nothing is said of another telescope or sky."""
     told = any(getattr(options, name) is not None for name in ("alpha", "plant", "scene"))
     return not (told or options.near)
+
+
+def _beginning(options: argparse.Namespace) -> str:
+    """Return what a night that begins far away begins with; 400 modes are FLAO's."""
+    return FAR if options.instrument == OWN else OTHER_FAR
 
 
 class _Large(NamedTuple):

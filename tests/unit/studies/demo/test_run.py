@@ -7,7 +7,7 @@ from service.errors import ConfigurationError
 from sim_rtc.options import parse_options
 from studies.demo.__main__ import main
 from studies.demo.arguments import demo_parser
-from studies.demo.run import _commands, _emptied, _promise, _say, _too_large
+from studies.demo.run import _beginning, _commands, _emptied, _promise, _say, _too_large
 
 ROOT = Path(__file__).parents[4]
 
@@ -50,6 +50,11 @@ def test_the_night_begins_far_away_unless_something_else_is_asked_for():
     assert not begins_far("--alpha", "0.1,0,0,1")
     assert not begins_far("--plant", "diffractive")
     assert not begins_far("--scene", "daytime")
+
+
+def test_what_is_said_of_400_modes_is_said_of_flao_only():
+    assert "loop of 400 modes diverges" in _beginning(options())
+    assert "400 modes" not in _beginning(options("--instrument", "canary"))
 
 
 def test_a_night_that_begins_far_away_must_end_with_much_less_wavefront_error():

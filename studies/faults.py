@@ -345,9 +345,8 @@ def _broken(at: Telescope, outcome: Outcome) -> list[str]:
         broken.append(f"named {when}, expected {within_s:g} s")
     if outcome.back_s is None:
         broken.append(f"no window within {WITHIN_S:g} s: {at.says()}")
-    state, in_use = at.state(), at.in_use()
-    if state is None or state["in_use"] != in_use:
-        said = None if state is None else state["in_use"]
+    said, in_use = at.agreed_in_use()
+    if said != in_use:
         broken.append(f"{said} is said to be in use, the RTC has {in_use}")
     for record in at.get("/v1/reconstructors")["reconstructors"]:
         used = record["state"] in {"applied", "superseded"} and record["parent"] is not None

@@ -128,6 +128,19 @@ class Telescope:
         last = self.truth.last
         return None if last is None else last["cm_id"]
 
+    def agreed_in_use(self) -> tuple[str | None, str | None]:
+        """Return the matrix in use by the service and by the RTC; they get two seconds to agree.
+
+        A service that has just begun, and the truth, which is written twice a second, may be late.
+        """
+        until_s = time.monotonic() + 2.0
+        while True:
+            state, in_use = self.state(), self.in_use()
+            said = None if state is None else state["in_use"]
+            if said == in_use or time.monotonic() > until_s:
+                return said, in_use
+            time.sleep(0.1)
+
     def _process(self, name: str, *words: str) -> subprocess.Popen[bytes]:
         with (self.directory / f"{name}.log").open("ab") as log:
             return subprocess.Popen(

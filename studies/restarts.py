@@ -171,9 +171,9 @@ def _look(telescope: Telescope, told: Acknowledged, found: Round) -> None:
     if state["mode"] != told.mode and state["mode"] != "hold":
         found.broken.append(f"mode {state['mode']}, acknowledged was {told.mode}")
     told.mode = state["mode"]
-    in_use = telescope.in_use()
-    if state["in_use"] != in_use:
-        found.broken.append(f"{state['in_use']} is said to be in use, the RTC has {in_use}")
+    said, in_use = telescope.agreed_in_use()
+    if said != in_use:
+        found.broken.append(f"{said} is said to be in use, the RTC has {in_use}")
     found.broken += _half_products(telescope, shelf)
 
 

@@ -20,3 +20,5 @@ html_copy_source = False
 html_use_index = False
 myst_heading_anchors = 3
 html_sidebars = {"**": ["about.html", "searchfield.html", "navigation.html"]}
+
+exclude_patterns = ["paper"]

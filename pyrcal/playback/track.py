@@ -42,26 +42,37 @@ def main(options: argparse.Namespace) -> int:
     structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
     settings = load_settings(options.config, os.environ)
     instrument = load_instrument(options.instrument)
-    with threadpool_limits(1):
-        track = _followed(options.telemetry, instrument, settings)
+    found = track(options.telemetry, instrument, settings)
     if options.json:
-        print(json.dumps(document(track, options.telemetry), allow_nan=False))
+        print(json.dumps(document(found, options.telemetry), allow_nan=False))
     else:
-        print(table(track))
+        print(table(found))
     if options.output is not None:
-        write_whole(options.output, partial(fill, track=track, source=options.telemetry))
+        write_whole(options.output, partial(fill, track=found, source=options.telemetry))
     if options.plot is not None:
-        plot(track, f"{instrument.name}: {options.telemetry.name}", options.plot)
-    return FOUND if track.entries or track.passive else NOTHING_FOUND
+        plot(found, f"{instrument.name}: {options.telemetry.name}", options.plot)
+    return FOUND if found.entries or found.passive else NOTHING_FOUND
 
 
-def _followed(path: Path, instrument: Instrument, settings: Settings) -> Track:
-    if _is_recording(path):
-        with Recording(path) as recording:
-            return _play(recording.messages(), instrument, settings, recording.system)
-    with opened_arrays(path) as arrays:
-        messages = arrays.messages(instrument)
-        return _play(messages, instrument, settings, instrument.name)
+def track(path: Path, instrument: Instrument, settings: Settings | None = None) -> Track:
+    """Return α over time from recorded telemetry, by the service's own estimators.
+
+    ``path`` is a recording of pyrcal's, or arrays in ``.npz`` or HDF5 (docs/integrate/tracking.md);
+    ``settings`` None: the usual ones.
+
+    Raises
+    ------
+    PyrcalError
+        If the file, the instrument or the settings cannot be used.
+    """
+    settings = settings or load_settings(None, {})
+    with threadpool_limits(1):
+        if _is_recording(path):
+            with Recording(path) as recording:
+                return _play(recording.messages(), instrument, settings, recording.system)
+        with opened_arrays(path) as arrays:
+            messages = arrays.messages(instrument)
+            return _play(messages, instrument, settings, instrument.name)
 
 
 def _is_recording(path: Path) -> bool:

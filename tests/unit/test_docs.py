@@ -187,8 +187,9 @@ def test_a_file_of_the_manual_is_read(text, tmp_path):
 def test_what_the_manual_writes_in_python_runs(text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(text, "the manual", "exec"), {"matrix": np.eye(3)})
-    with h5py.File("im.h5") as file:
-        assert file["interaction_matrix"].shape == (3, 3)
+    if "im.h5" in text:
+        with h5py.File("im.h5") as file:
+            assert file["interaction_matrix"].shape == (3, 3)
 
 
 NEEDS_MORE = {"docker", "git", "pip"}

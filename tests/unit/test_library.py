@@ -1,5 +1,6 @@
 """``import pyrcal``: what there is, and that it costs nothing before it is used."""
 
+import inspect
 import subprocess
 import sys
 
@@ -35,3 +36,35 @@ def test_the_services_own_commands_are_those_of_pyrcal(capsys, command):
         assert ended.value.code == 0
         said.append(capsys.readouterr().out.partition(command)[2].replace(" ", ""))
     assert said[0] == said[1]
+
+
+SIGNATURES = {
+    "dither_sigma": "near, modes, amplitude_m, n_frames, slope_noise",
+    "fit_file": "instrument, path, options, dataset, threads, memory_gb, basis, progress",
+    "arrays_of": "library",
+    "from_oopao": "tel, dm, wfs, calib, M2C, ngs",
+    "interaction_matrix": "instrument, alpha",
+    "load_instrument": "name_or_path",
+    "modal_basis": "instrument",
+    "read_bundle": "path",
+    "read_fit": "path",
+    "reconstruct": "interaction_matrix, recipe",
+    "to_oopao": "alpha, tel, wfs",
+    "track": "path, instrument, settings",
+    "write_bundle": "path, bundle",
+}
+"""Parameters of the functions that may be relied on: docs/integrate/library.md."""
+
+
+def parameters(name):
+    return ", ".join(inspect.signature(getattr(pyrcal, name)).parameters)
+
+
+def test_every_function_has_its_parameters_here():
+    functions = {name for name in pyrcal.__all__ if inspect.isfunction(getattr(pyrcal, name))}
+    assert functions == set(SIGNATURES)
+
+
+@pytest.mark.parametrize("name", SIGNATURES)
+def test_what_may_be_relied_on_is_called_as_before(name):
+    assert parameters(name) == SIGNATURES[name]

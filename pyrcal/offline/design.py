@@ -1,0 +1,79 @@
+"""What a telescope's optics let one know, before anything is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import ModelError
+from service.model.instrument import Instrument
+from service.model.interaction import Linearisation, RtcInteractionModel
+from service.model.misregistration import Misregistration
+from service.model.modes import modal_basis
+
+
+def interaction_matrix(
+    instrument: Instrument, alpha: Misregistration | None = None
+) -> NDArray[np.float32]:
+    """Return the noise-free D(α) of an instrument, ``(n_slopes, n_modes)`` slope per metre of OPD.
+
+    Rows stand as the RTC lists its slopes. Without ``alpha``: of a perfect registration. Who needs
+    many keeps an ``RtcInteractionModel``, which does not begin anew.
+
+    Raises
+    ------
+    ModelError
+        If the optical model cannot work with the instrument.
+
+    References
+    ----------
+    Heritier et al. 2018, equation 6: D = M_WFS M_DM.
+    """
+    model = RtcInteractionModel(instrument, modal_basis(instrument))
+    return np.asarray(model.interaction_matrix(alpha or Misregistration()), np.float32)
+
+
+def dither_sigma(
+    near: Linearisation,
+    modes: Sequence[int],
+    amplitude_m: float,
+    n_frames: int,
+    slope_noise: float,
+) -> NDArray[np.float64]:
+    """Return 1 σ of α by sines on some modes at once, noise alone, ``(4,)``.
+
+    In subapertures, subapertures, radians and units of magnification. Each mode is dithered by a
+    sine of ``amplitude_m`` (RMS, metres of OPD) over ``n_frames`` frames, all at frequencies of
+    their own; slopes have white noise of ``slope_noise`` RMS a frame. The gain of each mode is
+    unknown, too, and is fitted with α: what looks like a gain tells nothing of α. What limits a
+    fit besides noise (turbulence at the lines' frequencies, the model itself) is not in it.
+
+    A column of D read from such a sine has an error of σ_slope / (a √N) in every slope; with J the
+    derivatives of the columns less their part along the columns themselves, the covariance of α is
+    that squared times (Σ JᵀJ)⁻¹.
+
+    Raises
+    ------
+    ModelError
+        If a mode is not one of the linearisation's, or a number is not above 0.
+    """
+    n_modes = near.matrix.shape[1]
+    wrong = [mode for mode in modes if not 0 <= mode < n_modes]
+    if wrong or not len(modes):
+        raise ModelError(f"modes: found {wrong or 'none'}, expected some of 0 to {n_modes - 1}")
+    if min(amplitude_m, n_frames, slope_noise) <= 0.0:
+        raise ModelError(
+            f"found an amplitude of {amplitude_m:g} m, {n_frames} frames, a noise of "
+            f"{slope_noise:g}; expected numbers above 0"
+        )
+    information = np.zeros((4, 4))
+    for mode in modes:
+        column = near.matrix[:, mode].astype(np.float64)
+        column /= np.linalg.norm(column)
+        rates = near.derivatives[:, :, mode].astype(np.float64)
+        rates -= np.outer(rates @ column, column)
+        information += rates @ rates.T
+    error = slope_noise / (amplitude_m * np.sqrt(n_frames))
+    return np.asarray(error * np.sqrt(np.diag(np.linalg.inv(information))))

@@ -1,0 +1,71 @@
+"""The notebooks in examples/ run from top to bottom, in the folder of the sources, and say so.
+
+Cells are plain Python, so they are executed here as a kernel would, without one.
+"""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
+
+
+def cells_of(path):
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    assert notebook["nbformat"] == 4
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def run(path):
+    """Execute all cells in one namespace; return it."""
+    names = {"__name__": "__main__"}
+    for number, cell in enumerate(cells_of(path), start=1):
+        exec(compile("".join(cell["source"]), f"{path.name}, cell {number}", "exec"), names)
+    return names
+
+
+FOUND = {
+    "1": lambda names: names["residual"] < 1e-3,
+    "2": lambda names: (
+        names["fit"].accepted and abs(names["fit"].alpha.shift_x_subap + 0.31) < 0.02
+    ),
+    "3": lambda names: np.all(np.diff(names["sigma"][:, 0]) < 0),
+    "4": lambda names: np.all(
+        np.abs(names["error"]) < 4.0 * names["track"].entries[-1].filtered_sigma
+    ),
+}
+"""What each comes to."""
+
+
+@pytest.fixture(autouse=True)
+def _as_a_reader_would(monkeypatch):
+    pytest.importorskip("matplotlib").use("Agg")
+    monkeypatch.chdir(ROOT)
+
+
+def test_there_are_five():
+    assert [path.stem[0] for path in NOTEBOOKS] == list("12345")
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS[:4], ids=lambda path: path.stem)
+def test_it_runs_from_top_to_bottom(path):
+    names = run(path)
+    assert FOUND[path.stem[0]](names)
+
+
+def test_one_that_asks_a_service_says_where_there_is_none(monkeypatch):
+    from pyrcal.client.rest import UnreachableError
+
+    monkeypatch.setenv("PYRCAL_URL", "http://127.0.0.1:9")
+    with pytest.raises(UnreachableError, match=r"127\.0\.0\.1:9"):
+        run(NOTEBOOKS[4])
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_none_is_kept_with_what_it_printed(path):
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells_of(path))
+    assert os.access(path, os.R_OK)

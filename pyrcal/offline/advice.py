@@ -95,7 +95,7 @@ def recommendation(fit: Fit, grounds: Grounds) -> str:
             )
     if grounds.n_sets < FEWEST_SETS:
         return (
-            f"{Advice.MEASURE_MORE}: {len(fit.modes)} modes are too few to check each other; push "
+            f"{Advice.MEASURE_MORE}: too few modes ({len(fit.modes)}) to check each other; push "
             "six or more"
         )
     if grounds.columns:
@@ -126,10 +126,10 @@ def _of_refused(fit: Fit, grounds: Grounds) -> str:
 
 def _cause(fit: Fit, grounds: Grounds) -> str:
     """Return the likeliest cause of a refusal: what is more definite than the verdict first."""
-    if grounds.columns and grounds.refusal is not Refusal.AXES:
-        return "; ".join(grounds.columns)
     if grounds.refusal in {Refusal.ANOTHER_BASIS, Refusal.ANOTHER_UNIT} and grounds.gains:
         return grounds.gains[0]
+    if grounds.columns and grounds.refusal is not Refusal.AXES:
+        return "; ".join(grounds.columns)
     best = next((one for one in fit.alternatives if one.preferred and one.share is not None), None)
     if best is not None and grounds.refusal in {Refusal.ANOTHER_INSTRUMENT, Refusal.NO_CAUSE}:
         return (

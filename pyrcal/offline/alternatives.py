@@ -90,25 +90,30 @@ def alternatives(
     optics, without
         What was fitted of the instrument, and the fit without where they differ.
     """
-    found = (
+    beside = (_of_pupil(one, others) for one in pupils)
+    found = [
         *map(_of_rival, others),
-        *(_of_pupil(one, others) for one in pupils),
-        *_off_centre(few),
-        *_axes_apart(few),
-        *_uneven_light(few),
-        *_optics(settled, optics, without),
-        *_held(settled),
-        *_wavelength(few),
-        *_weighted(settled),
-        *_some_modes(settled),
-        *_without_border(few),
-    )
-    return tuple(
-        sorted(
-            (one for one in found if one is not None),
-            key=lambda one: (not one.preferred, not one.undecided, _share(one)),
-        )
-    )
+        *(one for one in beside if one is not None),
+        *_that_can(_off_centre(few)),
+        *_that_can(_axes_apart(few)),
+        *_that_can(_uneven_light(few)),
+        *_that_can(_optics(settled, optics, without)),
+        *_that_can(_held(settled)),
+        *_that_can(_wavelength(few)),
+        *_that_can(_weighted(settled)),
+        *_that_can(_some_modes(settled)),
+        *_that_can(_without_border(few)),
+    ]
+    sure = [one for one in found if np.all(np.isfinite(one.moved))]
+    return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, _share(one))))
+
+
+def _that_can(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
+    """Yield rivals as far as what was measured determines a registration under them."""
+    try:
+        yield from rivals
+    except np.linalg.LinAlgError:
+        return
 
 
 def _share(one: Alternative) -> float:
@@ -209,7 +214,7 @@ def _wavelength(few: Few) -> Iterator[Alternative]:
     matrix *= np.linalg.norm(few.own) / np.linalg.norm(matrix)  # the gains take that up
     yield Alternative(
         words=f"wavelength_m = {wfs.wavelength_m:.3g}",
-        share=few.left(matrix) / few.left(few.own),
+        share=_ratio(few.left(matrix), few.left(few.own)),
         moved=few.step(matrix)[:4] - few.step(few.own)[:4],
         undecided=True,
     )
@@ -218,8 +223,13 @@ def _wavelength(few: Few) -> Iterator[Alternative]:
 def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, float, Array]:
     """Return the values of more unknowns, χ² over what is without them, and α's move."""
     step = few.step(few.own, *rates)
-    share = few.left(few.own, *rates) / few.left(few.own)
+    share = _ratio(few.left(few.own, *rates), few.left(few.own))
     return step[-len(rates) :], share, step[:4] - few.step(few.own)[:4]
+
+
+def _ratio(chi: float, own: float) -> float:
+    """Return χ² over the fit's; 1 where that leaves nothing."""
+    return chi / own if own > 0.0 else 1.0
 
 
 # --- what is fitted beside the registration, held
@@ -273,7 +283,7 @@ def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
     step[free] = -np.linalg.solve(
         held[np.ix_(free, free)], held[np.ix_(free, places)] @ step[places]
     )
-    return 1.0 + float(step @ normal @ step) / seen.chi, step[:4]
+    return 1.0 + _ratio(float(step @ normal @ step), seen.chi), step[:4]
 
 
 # --- other weights, modes and slopes

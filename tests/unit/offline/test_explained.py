@@ -18,7 +18,7 @@ from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import lit_subapertures
 from service.model.slopes import SlopeRecipe
-from tests.unit.estimation.bench import ELSEWHERE, fit, instrument, matrix
+from tests.unit.estimation.bench import ELSEWHERE, PLAIN, fit, instrument, matrix
 from tests.unit.offline.test_mistold import MODES, TRUTH, N, bench, masked, sigmas_off, zonal
 
 EXPLAIN = FitOptions(explain=True)
@@ -163,6 +163,12 @@ def test_gains_of_each_axis_are_named(factor, words):
     assert np.all(sigmas_off(found) < 3.0)
 
 
+def test_one_mode_is_explained_too():
+    found = fit(matrix()[:, :1], options=EXPLAIN)
+    assert "too few modes (1) to check each other" in found.recommendation
+    assert not any(one.preferred for one in found.alternatives)
+
+
 # --- what was found rather than told
 
 
@@ -241,6 +247,14 @@ def test_a_unit_of_all_gains_is_named(factor, words):
     found = explained(modal_bench(), factor * modal())
     assert not found.accepted or factor == 4.0
     assert any(words in remark for remark in found.remarks), found.remarks
+
+
+def test_commands_of_the_other_sign_are_named():
+    here = FitOptions(explain=True, start=ELSEWHERE, orientation=PLAIN)
+    found = fit(-matrix(), options=here)
+    assert found.recommendation.startswith(
+        "do not use it: every mode answers with the wrong sign: commands or slopes"
+    )
 
 
 # --- columns

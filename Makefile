@@ -1,7 +1,7 @@
 # Nothing is assumed but make and a Python >= 3.11; everything else goes into .venv.
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo docs test test-long fuzz faults restarts check paper bench soak load wheel lock sbom audit clean FORCE
+.PHONY: help setup demo docs test test-long fuzz faults nights restarts check paper bench soak load wheel lock sbom audit clean FORCE
 
 PYTHON ?= python3
 PY := .venv/bin/python
@@ -44,6 +44,9 @@ fuzz: $(STAMP) ## a million malformed inputs of every kind; ARGS="--inputs 50000
 
 faults: $(STAMP) ## every fault that a night may bring, on real processes; eight minutes, ARGS=--quick two
 	@$(PY) -m studies.faults $(ARGS)
+
+nights: $(STAMP) ## random sequences of faults in simulated time; hours, ARGS="--seeds 0:6 --seconds 100" minutes
+	@$(PY) -m studies.campaign.fault_nights $(ARGS)
 
 restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; half an hour
 	@$(PY) -m studies.restarts $(ARGS)

@@ -236,7 +236,7 @@ class Observatory:
             archive=self._shelf,
             instrument=self.dome.instrument,
             publishing=self._publishing,
-            clock_ns=lambda: self.dome.now_ns,
+            clock_ns=lambda: self.now_ns(),
         )
 
     def _begin(self) -> None:

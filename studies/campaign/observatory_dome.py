@@ -143,6 +143,10 @@ class Dome:
         self.computer.restart()
         self._clock.restart(self.now_ns)
 
+    def step_clock(self, by_ns: int) -> None:
+        """Have the RTC's clock leap."""
+        self._clock.step(by_ns)
+
     def status(self) -> Status:
         """Return what the RTC says of itself, as it comes out of the wire."""
         status = replace(

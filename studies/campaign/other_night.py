@@ -6,18 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from typing_extensions import override
 
-from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from service.runtime.archiving import SAVE_INTERVAL_S, is_unsaved, is_urgent, leave, taken_up
 from service.runtime.worker import Compute, OpticsWorker, Sampling
-from service.tracking.events import Event
-from service.tracking.resume import restored
-from service.tracking.state import MatrixStates, Mode, OperatorState, TrackerState
-from studies.campaign.observatory import Latencies, Observatory
+from service.tracking.state import Mode
+from studies.campaign.kept_night import KeptNight
+from studies.campaign.observatory import Latencies
 from studies.campaign.other_truth import OtherDome, OtherLink, Truth
 
 INSTRUMENT = "tests/system/middle.toml"
@@ -86,109 +82,33 @@ class Plan:
         return OtherDome(self.words, self.truth, calibrated)
 
 
-class OtherNight(Observatory):
+class OtherNight(KeptNight):
     """The service at such a telescope; with a ``folder`` it can be killed and begun again."""
 
     dome: OtherDome
 
     def __init__(self, plan: Plan, folder: Path | None = None) -> None:
         settings = load_settings(None, {}, {"control.n_modes_target": plan.n_target})
-        self._policy, self._folder = policy_of(settings), folder
-        self._archive = None if folder is None else _opened(folder)
-        self._saved: TrackerState | None = None
-        self._saved_s = 0.0
         self.said: dict[tuple[str, str], float] = {}
         """Every text of an alarm, and when it was said first."""
 
         super().__init__(
-            plan.words,
-            self._policy,
+            policy_of(settings),
             Mode.AUTO,
             _bench(plan, settings.compute.working_point_modes),
+            folder,
             latencies=LATENCIES,
-            with_poles=False,
             dome=plan.dome(),
             link=OtherLink,
-            archive=self._archive,
         )
 
     def pass_(self, until_s: float) -> None:
         """Let time pass, and read what is said."""
         while self.time_s < until_s - 1e-9:
             self.advance(0.25)
-            self._save()
+            self.save()
             for alarm in self.state.alarms.active:
                 self.said.setdefault((alarm.name, alarm.text), round(self.time_s, 2))
-
-    def kill(self) -> None:
-        """End the service as ``kill -9`` does; another takes up what is on the disk.
-
-        What was on its way to the RTC arrives; telescope and RTC go on.
-
-        Raises
-        ------
-        ValueError
-            If the night has no folder to begin again from.
-        """
-        if self._archive is None or self._folder is None:
-            raise ValueError("kill: found a night without a folder; expected one that has")
-        self._arrive()
-        self._agenda.clear()
-        self._idle_worker()
-        self._archive.close()
-        begun_s = self.time_s + DOWN_S
-        while self.time_s < begun_s:
-            self.dome.play()
-            for _ in self._link.swapped():
-                self._note_swap()
-        self._archive = self._shelf = _opened(self._folder)
-        self._actions = self._new_actions()
-        state = TrackerState(
-            system=self.state.system,
-            operator=OperatorState(mode=Mode.AUTO),
-            matrices=MatrixStates(reconstructors=restored(self._archive.reconstructors.records())),
-        )
-        self._engine.state = taken_up(self._archive, state, self._policy, self.dome.now_ns)
-        self._engine.begin_anew()
-        self._begin()
-
-    def close(self) -> None:
-        """Close the archive."""
-        if self._archive is not None:
-            self._archive.close()
-
-    @override
-    def stepped(self, before: TrackerState, event: Event) -> None:
-        """Keep what the tracker heard, and write what the service would."""
-        super().stepped(before, event)
-        after = self.state
-        if (
-            self._archive is not None
-            and after.matrices.reconstructors is not before.matrices.reconstructors
-        ):
-            old = {record.id: record for record in before.matrices.reconstructors}
-            news = tuple(r for r in after.matrices.reconstructors if old.get(r.id) is not r)
-            self._archive.record(news, (), ())
-
-    def _save(self) -> None:
-        """Write what the next service needs as seldom as the service does."""
-        archive, state = self._archive, self.state
-        before, due = self._saved, self.time_s >= self._saved_s + SAVE_INTERVAL_S
-        if archive is None:
-            return
-        if before is None or ((due or is_urgent(before, state)) and is_unsaved(before, state)):
-            leave(archive, state, self.dome.now_ns)
-            self._saved, self._saved_s = state, self.time_s
-
-
-DOWN_S = 3.0
-"""From the end of a service until the next one listens."""
-
-
-def _opened(folder: Path) -> Archive:
-    archive = Archive(folder)
-    archive.open()
-    return archive
 
 
 def _bench(plan: Plan, working_point_modes: int | None) -> OpticsWorker:

@@ -1,0 +1,89 @@
+"""Random faults in simulated time: what must hold is looked at, and what does not is said."""
+
+import numpy as np
+import pytest
+
+from service.tracking import commands as cmd
+from service.tracking.state import Mode
+from studies.campaign import fault_nights
+from studies.campaign.fault_nights import AT_ONCE, LASTING, FaultNight, deeds_of, worse
+from studies.campaign.observatory_dome import Moment
+from studies.campaign.trouble import Trouble, strike
+from tests.system.night import INSTRUMENT
+
+WORDS = (f"--instrument={INSTRUMENT}", "--plant=linear", "--n-controlled=45", "--seed=1")
+
+
+@pytest.fixture
+def night(tmp_path):
+    night = FaultNight(WORDS, tmp_path, 1, listening=False)
+    yield night
+    night.close()
+
+
+def moments(nm, closed=True):
+    return [
+        Moment(
+            time_s=k + 0.5,
+            alpha=None,
+            wavefront_nm=value,
+            n_clipped=0,
+            cm_id="cm",
+            n_controlled=1,
+            closed=closed,
+            dither_nm=0.0,
+        )
+        for k, value in enumerate(nm)
+    ]
+
+
+def test_a_wavefront_that_is_worse_for_longer_than_may_be_is_told():
+    without = moments([100.0] * 20)
+    assert worse(moments([100.0] * 4 + [120.0] * 6 + [100.0] * 10), without) == [(4.0, 10.0)]
+    assert worse(moments([100.0] * 4 + [120.0] * 5 + [100.0] * 11), without) == []
+    assert worse(moments([109.0] * 20), without) == []
+    assert worse(moments([100.0] * 12 + [200.0] * 8), without) == [(12.0, 20.0)]
+    assert worse(moments([200.0] * 20, closed=False), without) == []
+
+
+def test_everything_happens_and_whatever_begins_ends():
+    names = [d.name for seed in range(40) for d in deeds_of(np.random.default_rng(seed), 100.0)]
+    assert {*LASTING, *AT_ONCE} <= set(names)
+    for name in LASTING:
+        assert names.count(name) == names.count(f"no {name}")
+
+
+class Deaf(FaultNight):
+    """Hears of the RTC for a second only."""
+
+    def _hear_status(self):
+        if self.time_s < 1.0:
+            super()._hear_status()
+
+
+def test_a_matrix_of_another_name_than_the_rtc_has_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(fault_nights, "AGREE_S", 0.5)
+    night = Deaf(WORDS, tmp_path, 1, listening=True)
+    night.play((), 1.5)
+    assert night.broken == []
+    strike(Trouble.SWAPPED, night.dome.computer)
+    night.play((), 3.0)
+    assert ["is said to be in use" in text for text in night.broken] == [True]
+    night.close()
+
+
+def test_an_order_that_a_kill_loses_is_told(night, monkeypatch):
+    night.play((), 0.5)
+    night.order(cmd.SetMode(mode=Mode.PROPOSE))
+    monkeypatch.setattr(FaultNight, "save", lambda _: None)
+    night.kill_and_look()
+    assert night.broken == ["3.5 s: mode auto after a kill, ordered was propose"]
+
+
+@pytest.mark.long
+def test_ten_faults_and_orders_in_a_hundred_seconds_break_no_rule():
+    row = fault_nights.play(0, str(INSTRUMENT), "linear", 100.0)
+    assert row["broken"] == []
+    assert row["worse"] == []
+    assert row["n_windows"] > 10
+    assert row["n_swaps"] > 0

@@ -40,6 +40,7 @@ from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import MeasureState
 from service.tracking.policy import Policy
+from service.tracking.resume import orders_of
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
 
@@ -184,7 +185,7 @@ class Supervisor:
             command, order_id or ev.new_id(ev.kebab(type(command)), now_ns)
         )
         again = isinstance(command, cmd.SetValue) and not changes_value(state, command, now_ns)
-        if again or isinstance(command, cmd.SetPointing):  # told every second, and changes nothing
+        if again or isinstance(command, cmd.SetPointing):  # every second, and changes nothing
             return await self._result_of(order)
         try:
             await self._writer.ordered(order, actor)
@@ -199,7 +200,7 @@ class Supervisor:
             self._writer.refused(order, actor, error)
             raise
         self._writer.answered(order, actor, answer)
-        if isinstance(command, cmd.StopEverything | cmd.Resume):
+        if orders_of(state) != orders_of(self._engine.state):  # they outlive a kill at once
             await self._writer.keep_orders()
         return answer
 

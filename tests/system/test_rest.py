@@ -168,6 +168,17 @@ def test_on_a_disk_that_refuses_nothing_is_ordered_and_afterwards_all_is_on_reco
 
 
 @pytest.mark.long
+def test_a_mode_that_was_ordered_stays_though_the_service_is_killed_at_once(night):
+    """An order that has been answered outlives the service: by chance it was found not to."""
+    answer = night.client.put("/v1/mode", json={"mode": "propose"})
+    assert answer.status_code == httpx.codes.ACCEPTED, answer.text
+    night.processes.pop().kill()
+    assert answer.json()["text"] == "mode is propose"
+    night.service("hold")
+    assert night.state["mode"] == "propose"
+
+
+@pytest.mark.long
 def test_what_was_stopped_stays_so_though_the_service_is_killed_at_once(night):
     order = {"by": "Ada", "reason": "someone is on the platform"}
     answer = night.client.post("/v1/stop", json=order)

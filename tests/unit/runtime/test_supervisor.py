@@ -567,6 +567,17 @@ async def test_a_refused_order_is_audited_with_the_reason(supervisor, archive):
     assert "unknown reconstructor cm-7" in why
 
 
+@pytest.mark.parametrize("order", [cmd.SetMode(mode=Mode.AUTO), cmd.StopDither()])
+async def test_an_order_is_saved_for_the_next_service_before_it_is_answered(
+    supervisor, archive, order
+):
+    async with running(supervisor):
+        await supervisor.submit(order)
+        saved = archive.tracking.read()
+    assert saved is not None
+    assert saved.orders.mode is Mode.AUTO or saved.orders.dither_stopped
+
+
 async def test_what_the_rtc_refuses_is_audited_too(supervisor, archive):
     async with running(supervisor):
         know(supervisor, rtc=Story(Mode.HOLD).meet().state.loop.rtc)

@@ -47,6 +47,11 @@ class WorkerLoad:
     """Windows that came while another still waited for the worker, and were joined to it."""
 
 
+def in_words(waiting_for: tuple[Prerequisite, ...]) -> str:
+    """Return what the service waits for, or that it is ready."""
+    return "; ".join(f"{wait.responsible}: {wait.text}" for wait in waiting_for) or "ready"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Snapshot:
     """Everything a reader may want to know at one moment."""
@@ -83,6 +88,10 @@ class Snapshot:
 
     archive_waiting: int = 0
     """Lines of the audit trail that are not on the disk yet."""
+
+    instrument_remarks: tuple[str, ...] = ()
+    """What the instrument file leaves out or assumes: petals that no mode can move, a stroke that
+    nobody has given."""
 
     stalled: str = ""
     """Which part of the service stands still, and for how long; empty: none does."""

@@ -30,7 +30,7 @@ from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
 from service.runtime.heartbeat import Heartbeat
-from service.runtime.snapshot import Snapshot
+from service.runtime.snapshot import Snapshot, in_words
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_worker
 from service.tracking import commands as cmd
@@ -131,12 +131,12 @@ class Supervisor:
             started_ns=self._started_ns,
             policy=self.policy,
             ready=not any(wait.blocks for wait in waiting),
-            ready_reason="; ".join(f"{wait.responsible}: {wait.text}" for wait in waiting)
-            or "ready",
+            ready_reason=in_words(waiting),
             waiting_for=waiting,
             worker_load=self._worker_load.worker_load,
             archive_failures=self._writer.failures,
             archive_waiting=self._writer.waiting,
+            instrument_remarks=self.instrument.remarks,
             stalled=self._heartbeat.stalled,
         )
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain, gain_table
@@ -71,6 +72,13 @@ OtherId = Annotated[str, Depends(_other)]
 """Of another one in the same path."""
 
 
+_SLOPES_AT_ONCE = 1024
+"""Of a product in float64."""
+
+_PART_BYTES = 4_000_000
+"""Of a large telescope's matrix, 250 MB, that leaves without being copied whole."""
+
+
 # --- the formats in which its numbers leave
 
 
@@ -127,32 +135,44 @@ async def numbers_of(
         extension = _EXTENSIONS.get(form, form.value)
         headers = {"Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"'}
         if form is MatrixFormat.HDF5:
-            content = file_of(matrix_id)
-        else:
-            numbers = np.ascontiguousarray(matrix_of(matrix_id), "<f4")
-            headers |= {"X-Shape": ",".join(str(n) for n in numbers.shape), "X-Dtype": "<f4"}
-            content = _written(numbers, form, matrix_id)
-        return Response(content, media_type=MEDIA_TYPES[form], headers=headers)
+            return Response(file_of(matrix_id), media_type=MEDIA_TYPES[form], headers=headers)
+        numbers = np.ascontiguousarray(matrix_of(matrix_id), "<f4")
+        headers |= {"X-Shape": ",".join(str(n) for n in numbers.shape), "X-Dtype": "<f4"}
+        if form is MatrixFormat.FITS:
+            content = _as_fits(numbers, matrix_id)
+            return Response(content, media_type=MEDIA_TYPES[form], headers=headers)
+        head = b"" if form is MatrixFormat.RAW else _npy_head(numbers)
+        headers["Content-Length"] = str(len(head) + numbers.nbytes)
+        parts = _parts(head, numbers)
+        return StreamingResponse(parts, media_type=MEDIA_TYPES[form], headers=headers)
 
     return await unless_kept(request, tag_of(matrix_id, form), made)
 
 
-def _written(numbers: Numbers, form: MatrixFormat, matrix_id: str) -> bytes:
+def _parts(head: bytes, numbers: Numbers) -> Iterator[bytes]:
+    """Yield a file's head, and its numbers as they lie in memory."""
+    yield head
+    lying = numbers.reshape(-1).view(np.uint8)
+    for first in range(0, len(lying), _PART_BYTES):
+        yield lying[first : first + _PART_BYTES].tobytes()
+
+
+def _npy_head(numbers: Numbers) -> bytes:
     buffer = io.BytesIO()
-    match form:
-        case MatrixFormat.RAW:
-            return numbers.tobytes()
-        case MatrixFormat.FITS:
-            try:
-                from astropy.io import fits
-            except ImportError:
-                text = "FITS: found no astropy, expected it beside pyrcal: pip install astropy"
-                raise CommandError(text) from None
-            image = fits.PrimaryHDU(numbers)
-            image.header["OBJECT"] = matrix_id
-            image.writeto(buffer)
-        case _:
-            np.save(buffer, numbers, allow_pickle=False)
+    about = np.lib.format.header_data_from_array_1_0(numbers)
+    np.lib.format.write_array_header_1_0(buffer, about)
+    return buffer.getvalue()
+
+
+def _as_fits(numbers: Numbers, matrix_id: str) -> bytes:
+    try:
+        from astropy.io import fits
+    except ImportError:
+        text = "FITS: found no astropy, expected it beside pyrcal: pip install astropy"
+        raise CommandError(text) from None
+    image, buffer = fits.PrimaryHDU(numbers), io.BytesIO()
+    image.header["OBJECT"] = matrix_id
+    image.writeto(buffer)
     return buffer.getvalue()
 
 
@@ -323,14 +343,22 @@ def _singular_values(
     matrix_id: str, matrix: NDArray[np.float32], products: NDArray[np.float32] | None
 ) -> SingularValues:
     """Return those that are not lost in rounding, of a reconstructor and of as many modes."""
-    numbers = matrix.astype(np.float64)
-    power = np.linalg.eigvalsh(numbers @ numbers.T)
+    power = np.linalg.eigvalsh(_products(matrix))
     inverted = power[power > power[-1] * 1e-13] ** -0.5
     nominal = None
     if products is not None:
         modelled = np.linalg.eigvalsh(products[: len(matrix), : len(matrix)].astype(np.float64))
         nominal = _rounded(np.sqrt(np.maximum(modelled[::-1], 0.0)))
     return SingularValues(id=matrix_id, values=_rounded(inverted), nominal=nominal)
+
+
+def _products(matrix: Numbers) -> NDArray[np.float64]:
+    """Return the matrix times its transpose, some slopes at once: in float64 it is large."""
+    found = np.zeros((len(matrix), len(matrix)))
+    for first in range(0, matrix.shape[1], _SLOPES_AT_ONCE):
+        some = matrix[:, first : first + _SLOPES_AT_ONCE].astype(np.float64)
+        found += some @ some.T
+    return found
 
 
 def _rounded(values: NDArray[np.float64]) -> list[float]:
@@ -360,19 +388,19 @@ def _compared(service: Supervisor, matrix_id: str, other: str) -> MatrixComparis
     CommandError
         If they are of different slopes.
     """
-    first, second = (service.matrix(name).astype(np.float64) for name in (matrix_id, other))
+    first, second = (service.matrix(name) for name in (matrix_id, other))
     if first.shape[1] != second.shape[1]:
         raise CommandError(
             f"found {first.shape[1]} slopes in {matrix_id} and {second.shape[1]} in {other}, "
             "expected as many in both"
         )
     n_modes = min(len(first), len(second))
-    first, second = first[:n_modes], second[:n_modes]
-    sizes, others = (np.linalg.norm(rows, axis=1) for rows in (first, second))
+    sums = np.array([_sums(first[mode], second[mode]) for mode in range(n_modes)])
+    sizes, others, between = np.sqrt(sums[:, :3].T)
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = sizes / others
-        cosine = np.sum(first * second, axis=1) / (sizes * others)
-        difference = np.linalg.norm(first - second) / np.linalg.norm(second)
+        cosine = sums[:, 3] / (sizes * others)
+        difference = np.linalg.norm(between) / np.linalg.norm(others)
     return MatrixComparison(
         id=matrix_id,
         other=other,
@@ -381,3 +409,9 @@ def _compared(service: Supervisor, matrix_id: str, other: str) -> MatrixComparis
         cosine=_rounded(cosine),
         difference=float(difference),
     )
+
+
+def _sums(one: Numbers, other: Numbers) -> tuple[float, float, float, float]:
+    """Return the squares of two rows and of their difference, and their product."""
+    a, b = one.astype(np.float64), other.astype(np.float64)
+    return float(a @ a), float(b @ b), float((a - b) @ (a - b)), float(a @ b)

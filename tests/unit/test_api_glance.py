@@ -1,5 +1,6 @@
 """Singular values and slopes over real HTTP messages, with a hand-written service behind them."""
 
+import io
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from service.control.reconstructor import invert
 from service.errors import UnknownIdError
 from service.estimation.frames import FrameBlock
 from service.model.pupil import rtc_valid_subapertures
-from service.web import page
+from service.web import matrices, page
 from tests.unit.test_api_fits import assert_problem
 
 
@@ -47,6 +48,25 @@ async def test_singular_values_are_those_of_the_matrix_it_inverts(client, servic
     assert "max-age" in response.headers["cache-control"], "it never changes"
     unknown = await client.get("/v1/reconstructors/cm-2/singular-values")
     assert_problem(unknown, 404, "unknown-id", "cm-2")
+
+
+async def test_products_are_summed_over_slopes_some_at_a_time(monkeypatch):
+    matrix = np.random.default_rng(5).normal(size=(7, 23)).astype(np.float32)
+    monkeypatch.setattr(matrices, "_SLOPES_AT_ONCE", 5)
+    expected = matrix.astype(float) @ matrix.astype(float).T
+    np.testing.assert_allclose(matrices._products(matrix), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("form", ["raw", "npy"])
+async def test_a_large_matrix_leaves_in_parts_and_is_whole(client, service, monkeypatch, form):
+    monkeypatch.setattr(matrices, "_PART_BYTES", 100)
+    answer = await client.get(f"/v1/reconstructors/cm-1/matrix?format={form}")
+    matrix, file = service.matrix("cm-1"), io.BytesIO()
+    np.save(file, matrix)
+    expected = {"raw": matrix.tobytes(), "npy": file.getvalue()}[form]
+    assert answer.content == expected
+    assert int(answer.headers["content-length"]) == len(expected)
+    assert answer.headers["x-shape"] == "4,12"
 
 
 def frames(slopes, t0_ns_utc=5):

@@ -80,6 +80,13 @@ async def test_it_is_ready_when_the_model_is(supervisor):
         assert log[0].text == "224 slopes, 90 modes"
 
 
+async def test_what_the_instrument_leaves_out_is_known_at_any_moment(supervisor, monkeypatch):
+    said = ("mirror.segments_deg: no mode has a mean step across any of the 6 gaps",)
+    instrument = replace(supervisor.instrument, remarks=said)
+    monkeypatch.setattr(Supervisor, "instrument", instrument)
+    assert supervisor.snapshot().instrument_remarks == said
+
+
 async def test_a_command_changes_the_state_and_enters_the_audit_trail(supervisor, archive):
     text = await supervisor.submit(cmd.SetMode(mode=Mode.AUTO))
     assert text == "mode is auto"

@@ -188,8 +188,17 @@ def _half_products(telescope: Telescope, shelf: dict[str, Any]) -> list[str]:
         matrix = np.load(io.BytesIO(answer.content))
         if matrix.shape[0] != record["n_modes"] or not np.isfinite(matrix).all():
             broken.append(f"{name}: {matrix.shape} of {record['n_modes']} modes")
+    # what it writes at this moment is its own, and the next save takes the place of the last one's
     parts = telescope.directory.glob("data/**/*.part")
-    return broken + [f"{part.name} is left on the disk" for part in parts]
+    left = [one.name for one in parts if one.name != "tracking.json.part" and _is_older(one)]
+    return broken + [f"{name} is left on the disk" for name in left]
+
+
+def _is_older(path: Path) -> bool:
+    """Return whether a file has not been written to for as long as a service needs to begin."""
+    with suppress(FileNotFoundError):
+        return time.time() - path.stat().st_mtime > ASKED_S
+    return False
 
 
 def run(n_rounds: int, seed: int, output: Path, directory: Path) -> list[Round]:

@@ -32,6 +32,8 @@ NAMED_S = 3.0
 """Within which a fault that stops the telemetry must be named."""
 
 POLL_S = 0.1
+TRUTH_S = 0.7
+"""The truth of a simulated RTC may be so old: its own faults are watched for from then on."""
 
 Doing = Callable[[Telescope], Iterator[None]]
 
@@ -277,7 +279,7 @@ FAULTS = (
 
 def tried(at: Telescope, fault: Fault) -> Outcome:
     """Let one fault come and go; return what came of it."""
-    while fault.begins_s is not None and _loop_s(at) < fault.begins_s - POLL_S:
+    while fault.begins_s is not None and _loop_s(at) < fault.begins_s - TRUTH_S:
         time.sleep(0.02)
     outcome, before = Outcome(fault=fault), _looked(at)
     n_before, lost_before = len(before["shelf"]), before["lost"]

@@ -277,8 +277,13 @@ class ArchiveWriter:
                 self.add(entry)
             await asyncio.sleep(REST_S)
 
-    async def keep_orders(self) -> None:
-        """Keep what was ordered for the service after this one now, if the disk lets it."""
+    async def keep_orders(self, before: TrackerState) -> None:
+        """Keep what was ordered since for the service after this one now, if the disk lets it.
+
+        A kill may come as soon as an order is answered.
+        """
+        if orders_of(before) == orders_of(self._state()):
+            return
         try:
             await self._save_now()
         except ArchiveError as error:  # :meth:`save` tries again, and raises the alarm

@@ -40,7 +40,6 @@ from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import MeasureState
 from service.tracking.policy import Policy
-from service.tracking.resume import orders_of
 from service.tracking.state import Level, TrackerState
 from service.tracking.step_context import new_lines
 
@@ -200,8 +199,7 @@ class Supervisor:
             self._writer.refused(order, actor, error)
             raise
         self._writer.answered(order, actor, answer)
-        if orders_of(state) != orders_of(self._engine.state):  # they outlive a kill at once
-            await self._writer.keep_orders()
+        await self._writer.keep_orders(state)
         return answer
 
     async def _result_of(self, order: command_results.GivenCommand) -> str:

@@ -122,6 +122,7 @@ class TestDemandToMoveTheImage:
     async def test_a_write_that_began_before_it_does_not_come_after_it(self, archive, monkeypatch):
         story = a_story()
         states = [changed(story.state, offload=None), story.state]
+        ordered_since = changed(story.state, stopped_because="an operator")
         (asked,) = story.asked(OffloadRequest)
         writing, go_on, written = threading.Event(), threading.Event(), []
 
@@ -133,7 +134,7 @@ class TestDemandToMoveTheImage:
 
         monkeypatch.setattr(archiving, "leave", slowly)
         recorder = ArchiveWriter(archive, lambda: states[0], lambda event: None)
-        first = asyncio.create_task(recorder.keep_orders())
+        first = asyncio.create_task(recorder.keep_orders(ordered_since))
         await asyncio.to_thread(writing.wait, patience(20.0))
         del states[0]
         second = asyncio.create_task(recorder.before(ev.Ask(request=asked)))

@@ -271,7 +271,7 @@ class Actions:
         registration = _registered(state)
         return Conditions(
             alpha=registration.alpha,
-            covariance=registration.total_covariance,
+            covariance=registration.covariance_to_hold_in,
             loop=loop_to_judge(state, gains),
             bound=self._publishing.pole_radius_bound,
         )

@@ -27,7 +27,10 @@ from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
 AlarmTexts = frozenset[tuple[str, str]]
 
 SILENT_S: Final = 3.0
-"""What has not come for so long is waited for."""
+"""A status that has not come for so long is waited for."""
+
+NO_FRAMES_S: Final = 2.0
+"""So are frames, of which tens come a second."""
 
 REVIVED_AFTER_S: Final = 10.0
 """With the RTC's token there and no message, until the link is opened anew for the first time."""
@@ -232,7 +235,7 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             f"{REVIVED_AFTER_S:.0f} s the link is opened anew: a connection may be left over)"
         )
         yield Prerequisite(name="telemetry", responsible=Responsible.RTC, text=text)
-    elif link.frame_age_s is None or link.frame_age_s >= SILENT_S:
+    elif link.frame_age_s is None or link.frame_age_s >= NO_FRAMES_S:
         text = f"it sends statuses and no frames: send them on {where}/tel/frames"
         yield Prerequisite(name="frames", responsible=Responsible.RTC, text=text)
     if link.session_waiting is not None and inputs.frames_come:

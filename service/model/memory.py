@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.model.far_field import DEGREE
+from service.model.far_field import TILE_SUBAP as PLATE_TILE_SUBAP
 from service.model.instrument import Instrument, Mirror
 from service.model.karhunen_loeve import WHOLE_BYTES
 from service.model.local import TILE_SUBAP
@@ -65,7 +67,10 @@ def _of_modes(instrument: Instrument) -> tuple[float, float]:
     surface = mirror_surface(mirror, instrument.subaperture_m)
     local = isinstance(surface, Gaussian)
     kept = (1.0 if local else 2.0) * 8.0 * n_actuators * instrument.modes.n_modes
-    n_points = 9.0 * np.pi / 4 * instrument.wfs.pupil_diameter**2
+    area = np.pi / 4 * instrument.wfs.pupil_diameter**2
+    if not local:
+        kept += 8.0 * 4 * (DEGREE + 1) * instrument.modes.n_modes * area / PLATE_TILE_SUBAP**2
+    n_points = 9.0 * area
     whole = 8.0 * n_points * n_actuators
     if local and whole >= WHOLE_BYTES:
         return kept, kept + _OF_STATISTICS * 8.0 * n_actuators**2

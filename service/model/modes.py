@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.model.far_field import PlateSum
 from service.model.instrument import Instrument, Mirror, TabulatedModes
 from service.model.karhunen_loeve import karhunen_loeve, surface_statistics
 from service.model.kinds import BasisKind
@@ -21,7 +23,7 @@ Array = NDArray[np.float64]
 Indices = Sequence[int] | NDArray[np.integer]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ModalBasis:
     """Modes of an analytic mirror.
 
@@ -51,11 +53,16 @@ class ModalBasis:
 
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""
-        return self.surface.basis(points * [1.0, self.y_sign]) @ self.coefficients
+        at = points * [1.0, self.y_sign]
+        if self._plates is not None:
+            return self._plates.heights(at)
+        return self.surface.basis(at) @ self.coefficients
 
     def render_slope(self, points: Array, direction: Array) -> Array:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
         side = np.array([1.0, self.y_sign])
+        if self._plates is not None:
+            return self._plates.slopes(points * side, direction * side)
         return self.surface.slope(points * side, direction * side) @ self.coefficients
 
     def render_wider(self, points: Array) -> Array:
@@ -66,6 +73,13 @@ class ModalBasis:
         if isinstance(self.surface, Gaussian):
             return self.surface.wider(points * [1.0, self.y_sign]) @ self.coefficients
         return smoothed(self.render, points)
+
+    @cached_property
+    def _plates(self) -> PlateSum | None:
+        """The sum of its plates; None: it has none."""
+        if isinstance(self.surface, Gaussian):
+            return None
+        return PlateSum(surface=self.surface, coefficients=self.coefficients)
 
     @property
     def is_local(self) -> bool:

@@ -7,10 +7,11 @@ speaks two languages.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 import scipy
@@ -124,7 +125,6 @@ class InteractionModel:
     ) -> None:
         self.instrument = instrument
         self._anamorphosis = anamorphosis
-        self.basis = basis
         binning = instrument.binning  # of the finest subapertures, so fine are points and nodes
         pupil = instrument_pupil(instrument, pupil_sampling * binning)
         self.pupil = pupil if illumination is None else pupil.lit_by(illumination)
@@ -140,10 +140,20 @@ class InteractionModel:
         self._map = mapper
         self._dtype = dtype
         self._response: _Last[Response] = _Last()
+        self._take_up(basis)
+
+    def of_modes(self, basis: Basis) -> Self:
+        """Return a model of other modes that shares all optics, and the last response."""
+        other = copy.copy(self)
+        other._take_up(basis)  # noqa: SLF001 - its own kind
+        return other
+
+    def _take_up(self, basis: Basis) -> None:
+        self.basis = basis
         self._modes: _Last[Shapes] = _Last()
         local = isinstance(basis, ModalBasis) and basis.is_local
         self._tiles = tiles_of(self.pupil) if local else ()
-        self._combination = basis.coefficients.astype(dtype) if local else None
+        self._combination = basis.coefficients.astype(self._dtype) if local else None
 
     def forget(self) -> None:
         """Give back the memory of the last response and the last rendered modes."""
@@ -170,7 +180,10 @@ class InteractionModel:
 
     def derivatives(self, alpha: Misregistration) -> Array:
         """Return dD/dα ``(4, n_slopes, n_modes)``: per subaperture, radian, magnification."""
-        _, *rates = self._with_rates(alpha)
+        if self.instrument.stop is Stop.TELESCOPE:
+            rates = self._seen_together(alpha, self._rates_of_modes(alpha))
+        else:
+            _, *rates = self._with_rates(alpha)
         return np.stack([self._as_listed(rate) for rate in rates])
 
     def stretch_derivatives(self, alpha: Misregistration) -> Array:
@@ -279,22 +292,28 @@ class InteractionModel:
 
     def _with_rates(self, alpha: Misregistration) -> list[Array]:
         """Return D and its four derivatives."""
-        rendered = self._rendered(alpha)
-        shapes = [
-            rendered,
-            self._moved(alpha, lambda at: at[:, ::-1] * [1.0, -1.0]),
-            self._moved(alpha, lambda at: -at / alpha.magnification),
+        rendered, rates = self._rendered(alpha), self._rates_of_modes(alpha)
+        if self.instrument.stop is Stop.TELESCOPE:
+            return self._seen_together(alpha, [rendered, *rates])
+        turned = self._seen_together(alpha, rates)
+        return [*self._at(self._image_shift(alpha)).with_shift_rates(rendered), *turned]
+
+    def _rates_of_modes(self, alpha: Misregistration) -> list[Shapes]:
+        """Return how the modes change at the pupil's points with each parameter that moves them.
+
+        With the mirror as stop a shift does not: it moves the pupil's images.
+        """
+        ways: list[Way] = [
+            lambda at: at[:, ::-1] * [1.0, -1.0],
+            lambda at: -at / alpha.magnification,
         ]
-        if self.instrument.stop is Stop.MIRROR:
-            turned = self._seen_together(alpha, shapes[1:])
-            shifted = self._at(self._image_shift(alpha)).with_shift_rates(rendered)
-            return [*shifted, *turned]
-        step_x, step_y = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
-        shapes[1:1] = [
-            self._moved(alpha, lambda at: np.broadcast_to(step_x, at.shape)),
-            self._moved(alpha, lambda at: np.broadcast_to(step_y, at.shape)),
-        ]
-        return self._seen_together(alpha, shapes)
+        if self.instrument.stop is Stop.TELESCOPE:
+            step_x, step_y = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
+            ways[:0] = [
+                lambda at: np.broadcast_to(step_x, at.shape),
+                lambda at: np.broadcast_to(step_y, at.shape),
+            ]
+        return [self._moved(alpha, way) for way in ways]
 
     def _seen_together(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
         """Return the signals of each of some shapes, with one response for all if none is kept."""

@@ -192,6 +192,40 @@ def test_a_linearisation_is_matrix_and_derivatives_at_one_place(stop):
     np.testing.assert_array_equal(linearisation.matrix_at(SOMEWHERE), linearisation.matrix)
 
 
+@pytest.mark.parametrize("stop", Stop)
+def test_single_precision_is_far_better_than_the_model_itself(stop):
+    # 3e-7 of matrix and derivatives of the full instrument; the model is right to 1e-3
+    single, double = (
+        InteractionModel(small_instrument(stop=stop), small_basis(), dtype=dtype)
+        for dtype in (np.float32, np.float64)
+    )
+    found, expected = single.linearise(SOMEWHERE), double.interaction_matrix(SOMEWHERE)
+    assert relative(found.matrix, expected) < 1e-6
+    for rate, exact in zip(found.derivatives, double.derivatives(SOMEWHERE), strict=True):
+        assert relative(rate, exact) < 1e-6
+
+
+def test_far_plates_summed_as_polynomials_move_the_matrix_by_rounding_only():
+    # 2e-9 of the full instrument's, of which float32 rounds each number by 6e-8
+    basis = flao_basis().subset(np.arange(100))
+    points = flao_model().pupil.points @ rotation(0.02)
+    direct = basis.surface.basis(points) @ basis.coefficients
+    model = flao_model().of_modes(basis)
+    seen = model.seen(ALIGNED, basis.render(points).astype(np.float32))
+    assert relative(seen, model.seen(ALIGNED, direct.astype(np.float32))) < 6e-8
+
+
+@pytest.mark.parametrize("stop", Stop)
+def test_a_model_of_other_modes_shares_the_optics_and_nothing_else(stop, work):
+    model = InteractionModel(small_instrument(stop=stop), small_basis())
+    every = model.interaction_matrix(SOMEWHERE)
+    work.clear()
+    few = model.of_modes(model.basis.subset([3, 1]))
+    np.testing.assert_allclose(few.interaction_matrix(SOMEWHERE), every[:, [3, 1]], rtol=1e-4)
+    assert work["optics"] == 0
+    np.testing.assert_array_equal(model.interaction_matrix(SOMEWHERE), every)
+
+
 def test_the_error_of_a_linearisation_is_of_second_order():
     """Half the step, a quarter of the error (within 10 %: third order and quadrature)."""
     alphas = [

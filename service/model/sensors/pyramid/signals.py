@@ -172,9 +172,17 @@ class PyramidResponse:
         sensor = self.sensor
         if sensor.keeps_gradient and not edges:
             return self._gradient.to(shapes, self._product)
+        # one product of all rows where there is room: row by row, each would read the shapes again
+        whole = sensor.keeps_gradient and isinstance(shapes, np.ndarray)
         found = sensor.optics.response(
-            sensor.valid, self.shift, shapes=shapes, mapper=sensor.mapper, **edges
+            sensor.valid,
+            self.shift,
+            shapes=None if whole else shapes,
+            mapper=sensor.mapper,
+            **edges,
         )
+        if whole:
+            found = found.to(shapes, self._product)
         return found if edges else self._as_lit(found)
 
     def _as_lit(self, found: LightGradient) -> LightGradient:

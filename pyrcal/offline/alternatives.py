@@ -212,18 +212,19 @@ def _wavelength(few: Few) -> Iterator[Alternative]:
     wfs = replace(about.wfs, wavelength_m=1.1 * about.wfs.wavelength_m)
     matrix = few.matrix(few.of(replace(about, wfs=wfs)))
     matrix *= np.linalg.norm(few.own) / np.linalg.norm(matrix)  # the gains take that up
+    seen = few.seen(matrix)
     yield Alternative(
         words=f"wavelength_m = {wfs.wavelength_m:.3g}",
-        share=_ratio(few.left(matrix), few.left(few.own)),
-        moved=few.step(matrix)[:4] - few.step(few.own)[:4],
+        share=_ratio(seen.chi_at_best, few.left(few.own)),
+        moved=seen.best_step[:4] - few.step(few.own)[:4],
         undecided=True,
     )
 
 
 def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, float, Array]:
     """Return the values of more unknowns, χ² over what is without them, and α's move."""
-    step = few.step(few.own, *rates)
-    share = _ratio(few.left(few.own, *rates), few.left(few.own))
+    seen = few.seen(few.own, *rates)
+    step, share = seen.best_step, _ratio(seen.chi_at_best, few.left(few.own))
     return step[-len(rates) :], share, step[:4] - few.step(few.own)[:4]
 
 

@@ -136,9 +136,9 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
         if one.explains
     ]
     for change, other in settled.models.other_instruments.items():
-        matrix = few.matrix(other)
-        share, moved = few.left(matrix) / own, np.zeros(4)
-        estimate = few.step(matrix)[:4] - few.step(few.own)[:4]
+        seen = few.seen(few.matrix(other))
+        share, moved = seen.chi_at_best / own, np.zeros(4)
+        estimate = seen.best_step[:4] - few.step(few.own)[:4]
         if change.believed <= share < 1.0 / BETTER:
             there = refine(other, settled.target, solution.alpha, settled.nuisances)
             moved = there.vector - solution.vector if there.converged else moved

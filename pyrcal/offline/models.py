@@ -99,12 +99,16 @@ class FitModels:
     @cached_property
     def low_order(self) -> LowOrder:
         """The smoothest shapes of the modes."""
-        return low_order_of(self.model(coarse_sampling(self.instrument)))
+        return low_order_of(self._coarse)
 
     @cached_property
     def far(self) -> InteractionModel:
         """Leads from afar: the smoothest shapes on the coarse grid."""
-        return self.model(coarse_sampling(self.instrument), self.low_order.shapes)
+        return self._coarse.of_modes(self.low_order.shapes)
+
+    @cached_property
+    def _coarse(self) -> InteractionModel:
+        return self.model(coarse_sampling(self.instrument))
 
     @cached_property
     def cheap(self) -> InteractionModel:

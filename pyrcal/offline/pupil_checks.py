@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.methods import Settled, spread
 from pyrcal.offline.models import BETTER, CHEAP, FitModels
 from pyrcal.offline.solver import nuisances_of
+from service.estimation.solver import Projection
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 
@@ -63,17 +64,19 @@ class PupilNumber:
         rate = (there - few.own) / self.step
         if not few.tells(few.own, rate):
             return self.reported, 1.0, np.zeros(4)
-        step = few.step(few.own, rate)
+        seen = few.seen(few.own, rate)
+        step = seen.best_step
         low, high = (limit**self.power for limit in self.range)
         value = float(np.clip(light + step[-1], low, high)) ** (1.0 / self.power)
-        share = few.left(few.own, rate) / few.left(few.own)
+        share = seen.chi_at_best / few.left(few.own)
         return value, share, step[:4] - few.step(few.own)[:4]
 
     def far(self, few: Few) -> tuple[float, float, Array]:
         """Return the same with D of the value itself."""
         value, matrix = self.found(few)
-        share = few.left(matrix) / few.left(few.own)
-        return value, share, few.step(matrix)[:4] - few.step(few.own)[:4]
+        seen = few.seen(matrix)
+        share = seen.chi_at_best / few.left(few.own)
+        return value, share, seen.best_step[:4] - few.step(few.own)[:4]
 
     def found(self, few: Few) -> tuple[float, Array]:
         """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
@@ -129,7 +132,7 @@ class Few:
     @cached_property
     def model(self) -> InteractionModel:
         """Of the instrument as it is, these modes only."""
-        return self.models.model(CHEAP, self.models.basis.subset(self.modes))
+        return self.models.cheap.of_modes(self.models.basis.subset(self.modes))
 
     @cached_property
     def own(self) -> Array:
@@ -146,7 +149,7 @@ class Few:
 
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, those given by a derivative included."""
-        return float(self.target.project(matrix, self._with(more)).chi_at_best)
+        return float(self.seen(matrix, *more).chi_at_best)
 
     def tells(self, matrix: Array, rate: Array) -> bool:
         """Return whether what was measured depends on a number: it may cut no subaperture."""
@@ -154,7 +157,17 @@ class Few:
 
     def step(self, matrix: Array, *more: Array) -> Array:
         """Return the best step of all of them."""
-        return self.target.project(matrix, self._with(more)).best_step
+        return self.seen(matrix, *more).best_step
+
+    def seen(self, matrix: Array, *more: Array) -> Projection:
+        """Return what was measured against a matrix; of the instrument as it is once for all."""
+        if matrix is self.own and not more:
+            return self._own_seen
+        return self.target.project(matrix, self._with(more))
+
+    @cached_property
+    def _own_seen(self) -> Projection:
+        return self.target.project(self.own, self.derivatives)
 
     def _at_solution(self, model: InteractionModel) -> Array:
         self.models.counter.n += 1

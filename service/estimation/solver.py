@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,9 @@ LIMIT = np.array([4.0, 4.0, np.inf, 0.25])
 
 MAX_FAR_STEPS = 12
 _HALVINGS = 3
+
+_ROWS = 64
+"""Slopes that are weighted at once: a copy of all would not stay in the cache."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +76,8 @@ class Columns:
         gains = np.sum(matrix * measured, axis=0) / power
         if not self.signed:
             gains = np.maximum(gains, 0.0)
-        jacobian = derivatives[:, self.rows].astype(np.float64)
+        # laid out row by row: every product of it would else copy it first
+        jacobian = np.compress(self.rows, derivatives, axis=1).astype(np.float64, copy=False)
         along = np.einsum("ksm,sm->km", jacobian, matrix) / power
         for k, part in enumerate(along):
             jacobian[k] -= matrix * part
@@ -97,7 +102,7 @@ class Columns:
         return float((total - explained) @ self.weights / (total @ self.weights))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Projection:
     """The measurement against the model at one registration, to first order about it."""
 
@@ -123,24 +128,27 @@ class Projection:
         """χ² at the best step to first order."""
         return self.chi - float(self.scores.sum(axis=1) @ self.best_step)
 
-    @property
+    @cached_property
     def best_step(self) -> Array:
         """``(n_unknowns,)`` the step to where least is left, to first order."""
         held = self.normal + 1e-9 * np.diag(np.diag(self.normal))
         return np.linalg.solve(held, self.scores.sum(axis=1))
 
-    @property
+    @cached_property
     def scores(self) -> Array:
         """``(n_unknowns, n_modes)`` what each mode says each unknown should do."""
         along = np.einsum("ksm,sm->km", self.jacobian, self.residual)
         return np.asarray(along * self.weights)
 
-    @property
+    @cached_property
     def normal(self) -> Array:
         """Normal matrix of all modes together, ``(n_unknowns, n_unknowns)``."""
-        picked = self.jacobian * np.sqrt(self.weights)
-        flat = picked.reshape(len(picked), -1)
-        return np.asarray(flat @ flat.T)
+        n_unknowns, n_rows, _ = self.jacobian.shape
+        root, total = np.sqrt(self.weights), np.zeros((n_unknowns, n_unknowns))
+        for start in range(0, n_rows, _ROWS):
+            flat = (self.jacobian[:, start : start + _ROWS] * root).reshape(n_unknowns, -1)
+            total += flat @ flat.T
+        return total
 
     @property
     def normals(self) -> Array:

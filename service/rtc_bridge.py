@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from itertools import chain
 from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
@@ -21,7 +22,8 @@ from numpy.typing import NDArray
 from service import wire
 from service.errors import LinkError, UnknownIdError, WireError
 from service.estimation.frames import FrameBlock
-from service.files.recording import LastTelemetry, Message, RecordedKind, RecordingWriter
+from service.files.last_telemetry import LastTelemetry
+from service.files.recording import Message, RecordedKind, RecordingWriter
 from service.link import session as link
 from service.link.guard import LinkGuard
 from service.link.intake import Intake
@@ -183,14 +185,15 @@ class Bridge:
             if recorder is None:
                 return 0.0
             now_s = time.monotonic()
-            past = self._last.since(before_s) if before_s > 0.0 else []
-            since_s = past[0].time_s if past else now_s
+            past = self._last.since(before_s)
+            since_s = now_s if past.start_s is None else past.start_s
+            first = []
+            if alive:
+                first.append(Message(since_s, RecordedKind.LIVELINESS, b"\x01"))
             if offer is not None:
                 matrix = b"".join(offer.parts)
-                past.insert(0, Message(since_s, RecordedKind.MATRIX, matrix, offer.commit))
-            if alive:
-                past.insert(0, Message(since_s, RecordedKind.LIVELINESS, b"\x01"))
-            recorder.begin_with(past)
+                first.append(Message(since_s, RecordedKind.MATRIX, matrix, offer.commit))
+            recorder.begin_with(chain(first, past), since_s)
             return now_s - since_s
 
     def _record_matrix(self) -> None:

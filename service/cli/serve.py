@@ -30,7 +30,7 @@ from service.config.policy import keeping_of, policy_of
 from service.config.settings import ApiTable
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
-from service.files.recording import LastTelemetry
+from service.files.last_telemetry import LastTelemetry
 from service.link.guard import refusals_of_zenoh
 from service.model.instrument import Instrument, instrument_sha256
 from service.rtc_bridge import Bridge, Endpoint
@@ -52,8 +52,14 @@ from service.tracking.state import (
 )
 from service.web.keys import KeyFile
 
-M_ARENA_MAX = -8
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Of mallopt(3)."""
+
+LARGE_BYTES = 2_500_000
+"""What is larger gets memory of its own, and gives it back at once: seconds of frames, matrices."""
+
+UNUSED_BYTES = 8_000_000
+"""Free at the end of the heap before it is given back."""
 
 END_WITHIN_S = 4.5
 """After this what holds the service up is named, and left behind: five seconds is what operators
@@ -74,10 +80,15 @@ def run(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:
 def share_memory() -> None:
     """Let threads take memory from two pools; each would have its own, and keep what was freed.
 
-    Fifty clients of REST left 250 MB behind in the pools of the threads that had answered them.
+    Fifty clients of REST left 250 MB behind in the pools of the threads that had answered them. By
+    itself the C library would soon take what is large from there, too: 30 MB more lay unused
+    between what stays, and 45 MB more at the most, for 0.006 of a core.
     """
     with contextlib.suppress(OSError, AttributeError):  # only the GNU C library has it
-        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
+        library = ctypes.CDLL(None)
+        library.mallopt(M_ARENA_MAX, 2)
+        library.mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
+        library.mallopt(M_TRIM_THRESHOLD, UNUSED_BYTES)
 
 
 async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool) -> int:

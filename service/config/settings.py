@@ -332,8 +332,8 @@ class ArchiveTable(Table):
     last_telemetry_s: float = Field(default=60.0, ge=0.0, le=3600.0)
     """Telemetry held in memory for recordings that begin before now, seconds."""
 
-    last_telemetry_mb: int = Field(default=256, ge=1, le=1_000_000)
-    """Its largest size, megabytes: half a minute of FLAO at 1 kHz."""
+    last_telemetry_mb: int = Field(default=192, ge=1, le=1_000_000)
+    """Its largest size, megabytes: half a minute of FLAO at 1 kHz, zeros held as bits."""
 
 
 Scalar = bool | float | str

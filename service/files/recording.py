@@ -1,4 +1,4 @@
-"""Recordings of telemetry: write, hold in memory, read back, byte for byte.
+"""Recordings of telemetry: write, read back, byte for byte.
 
 Layout (version 1), HDF5. Everything grows by appending; nothing is ever rewritten::
 
@@ -25,7 +25,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
@@ -61,9 +61,6 @@ _ROW: Final = np.dtype(
         ("attachment_bytes", "<u4"),
     ]
 )
-
-OVERHEAD_BYTES = 200
-"""Of a message in memory, besides what is in it."""
 
 
 class RecordedKind(IntEnum):
@@ -150,46 +147,6 @@ class Recording:
                 )
 
 
-class LastTelemetry:
-    """Holds messages until they are too old, or too many; every method may be called anywhere.
-
-    Messages are held as they came: nothing is copied.
-
-    Parameters
-    ----------
-    seconds
-        Older ones go; 0: none are held.
-    most_bytes
-        Beyond it the oldest go.
-    """
-
-    def __init__(self, seconds: float, max_bytes: int) -> None:
-        self._seconds = seconds
-        self._max_bytes = max_bytes
-        self._held: deque[Message] = deque()
-        self._n_bytes = 0
-        self._lock = threading.Lock()
-
-    def put(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
-        """Take a message that has just come."""
-        if self._seconds <= 0.0:
-            return
-        now = Message(time.monotonic(), kind, payload, attachment)
-        with self._lock:
-            self._held.append(now)
-            self._n_bytes += now.n_bytes + OVERHEAD_BYTES
-            while self._held and (
-                self._n_bytes > self._max_bytes or now.time_s - self._held[0].time_s > self._seconds
-            ):
-                self._n_bytes -= self._held.popleft().n_bytes + OVERHEAD_BYTES
-
-    def since(self, before_s: float) -> list[Message]:
-        """Return those that came at most so many seconds ago, oldest first."""
-        first_s = time.monotonic() - before_s
-        with self._lock:
-            return [one for one in self._held if one.time_s >= first_s]
-
-
 _REFUSED = (OSError, RuntimeError, ValueError)
 """What h5py raises where the disk refuses: of a flush or a close a RuntimeError."""
 
@@ -203,7 +160,7 @@ class RecordingWriter:
         self._path = path
         self._system = system
         self._backlog_bytes = backlog_bytes
-        self._past: deque[Message] = deque()
+        self._past: Iterator[Message] = iter(())
         self._waiting: deque[Message] = deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
@@ -250,12 +207,14 @@ class RecordingWriter:
             self._failed(error)
         _log.info("record.end", file=str(self._path), dropped=self.n_dropped)
 
-    def begin_with(self, past: Sequence[Message]) -> None:
-        """Write these first; call it before anything is put. They need no room in the backlog."""
+    def begin_with(self, past: Iterable[Message], start_s: float) -> None:
+        """Write these first, the first of which came at ``start_s``, monotonic seconds.
+
+        Call it before anything is put. They need no room in the backlog.
+        """
         with self._lock:
-            self._past.extend(past)
-            self._start_s = min([self._start_s, *(one.time_s for one in past[:1])])
-            self.n_bytes += sum(one.n_bytes for one in past)
+            self._start_s = min(self._start_s, start_s)
+            self._past = iter(past)
 
     def put(self, kind: RecordedKind, payload: bytes, attachment: bytes = b"") -> None:
         """Hand over a message that has just been sent, from any thread."""
@@ -286,12 +245,10 @@ class RecordingWriter:
 
     def _write(self) -> None:
         """Append what waits: first of what was there before the recording, bit by bit."""
-        while self._past:
-            part, size = [], 0
-            while self._past and size < PART_BYTES:
-                part.append(self._past.popleft())
-                size += part[-1].n_bytes
-            self._append(part)
+        while part := self._part_of_past():
+            n_bytes = self._append(part)
+            with self._lock:
+                self.n_bytes += n_bytes
         with self._lock:
             messages, self._waiting = list(self._waiting), deque()
             n_dropped = self.n_dropped
@@ -301,6 +258,16 @@ class RecordingWriter:
         n_bytes = self._append(messages)
         with self._lock:
             self._waiting_bytes -= n_bytes
+
+    def _part_of_past(self) -> list[Message]:
+        part: list[Message] = []
+        size = 0
+        for message in self._past:
+            part.append(message)
+            size += message.n_bytes
+            if size >= PART_BYTES:
+                break
+        return part
 
     def _append(self, messages: list[Message]) -> int:
         """Write bytes before the rows that point to them, both to the disk; return how many."""

@@ -22,7 +22,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
@@ -298,9 +297,8 @@ class SlopeSpectra:
         """
         if self.power is None or self.n_segments < MIN_SEGMENTS:
             return ()
-        around = (1, 2 * _NEIGHBOURHOOD + 1)
-        typical = scipy.ndimage.median_filter(self.power, around, mode="mirror")
-        highest = scipy.ndimage.maximum_filter(self.power, (1, 5), mode="constant")
+        typical = np.median(_around(self.power, _NEIGHBOURHOOD), axis=-1)
+        highest = _around(self.power, 2).max(axis=-1)
         peaks = (self.power > LINE_RATIO * typical) & (self.power == highest)
         step = self.frame_rate_hz / SEGMENT_FRAMES
         found = [step * k for k in np.flatnonzero(peaks.any(axis=0)) if k > _NEIGHBOURHOOD]
@@ -455,3 +453,9 @@ class Standstill(Detector):
                 since_ns_utc=t_ns,
             )
         return state
+
+
+def _around(power: Array, n: int) -> Array:
+    """Return every value with its ``n`` neighbours on either side, ``(..., n_bins, 2 n + 1)``."""
+    mirrored = np.pad(power, ((0, 0), (n, n)), mode="reflect")
+    return np.lib.stride_tricks.sliding_window_view(mirrored, 2 * n + 1, axis=-1)

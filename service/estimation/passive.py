@@ -18,7 +18,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from typing_extensions import override
 
@@ -151,8 +150,9 @@ def high_pass(delay_frames: float) -> HighPass:
     taps = np.linalg.solve(noise, signal)
     taps -= taps.mean()
     taps = (taps / np.abs(taps).max()).astype(np.float32)
-    none = np.zeros(BAND_FRAMES - 1, np.float32)
-    band = scipy.linalg.toeplitz([taps[-1], *none], [*taps[::-1], *none])
+    band = np.zeros((BAND_FRAMES, BAND_FRAMES + N_TAPS - 1), np.float32)
+    for k, row in enumerate(band):
+        row[k : k + N_TAPS] = taps[::-1]
     return HighPass(taps=taps, ahead=ahead, band=band)
 
 

@@ -18,7 +18,6 @@ import httpx
 from studies.cable import Cable
 from studies.campaign.small import SETTINGS, SMALL
 from studies.demo.truth import TruthFile
-from studies.machine import Machine
 
 WITHIN_S = 60.0
 """Longer than this is never."""
@@ -39,8 +38,6 @@ class Telescope:
         self.settings = directory / "settings.toml"
         self.settings.write_text(_toml(), encoding="utf-8")
         self.seed = seed
-        self.archive = directory / "data"
-        self.machine = Machine(directory / "machine")
         self.service: subprocess.Popen[bytes] | None = None
         self.rtc: subprocess.Popen[bytes] | None = None
 
@@ -61,8 +58,7 @@ class Telescope:
             "service",
             *("service", "run", "--config", str(self.settings), "--instrument", SMALL),
             *("--listen", f"tcp/127.0.0.1:{self.zenoh_port}", "--port", str(self.port)),
-            *("--data-dir", str(self.archive), "--mode", "auto"),
-            **self.machine.environment,
+            *("--data-dir", str(self.directory / "data"), "--mode", "auto"),
         )
         return begun_s
 
@@ -145,15 +141,14 @@ class Telescope:
                 return said, in_use
             time.sleep(0.1)
 
-    def _process(self, name: str, *words: str, **also: str) -> subprocess.Popen[bytes]:
-        """Start a program of ours; ``also``: of its environment."""
+    def _process(self, name: str, *words: str) -> subprocess.Popen[bytes]:
         with (self.directory / f"{name}.log").open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", *words],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", **also},
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )
 
 

@@ -42,7 +42,7 @@ test-long: $(STAMP) ## the other tests: what takes minutes of real time
 fuzz: $(STAMP) ## a million malformed inputs of every kind; ARGS="--inputs 50000" and the like
 	@$(PY) -m tests.malformed $(ARGS)
 
-faults: $(STAMP) ## every fault that a night may bring, on real processes; eight minutes, ARGS=--quick two
+faults: $(STAMP) ## every fault that a night may bring, on real processes; a quarter of an hour, ARGS=--quick two minutes
 	@$(PY) -m studies.faults $(ARGS)
 
 nights: $(STAMP) ## random sequences of faults in simulated time; hours, ARGS="--seeds 0:6 --seconds 100" minutes

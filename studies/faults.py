@@ -10,14 +10,11 @@ next window of telemetry is taken in, and what must never be.
 from __future__ import annotations
 
 import argparse
-import os
 import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,38 +22,15 @@ from typing import Any
 
 import httpx
 
-from sim_rtc.faults import FaultKind
+from studies.harms import FAULTS, NAMED_S, OF_FRAMES, Fault, send_signal
 from studies.live import WITHIN_S, Telescope
 
-NAMED_S = 3.0
-"""Within which a fault that stops the telemetry must be named."""
-
 POLL_S = 0.1
-TRUTH_S = 0.7
-"""The truth of a simulated RTC may be so old: its own faults are watched for from then on."""
+REST_S = 15.0
+"""So long the alarms of one fault may stand before the next comes."""
 
-Doing = Callable[[Telescope], Iterator[None]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
-    """One fault: what begins it, how long it lasts, and what is expected."""
-
-    name: str
-    seconds: float
-    does: Doing
-    """Begins it, yields, and ends it."""
-
-    named_within_s: float | None = NAMED_S
-    """Of one that keeps the service from its job; None: it costs windows at most."""
-
-    quick: bool = True
-
-    begins_s: float | None = None
-    """Of the simulated RTC's time, where it makes the fault by itself; None: now."""
-
-    stops_telemetry: bool = False
-    """Whether no frame comes while it lasts: nothing may be published then."""
+LEAD_S = 1.0
+"""How long before a fault of the simulated RTC's own the state is looked at as it was."""
 
 
 @dataclass(kw_only=True)
@@ -83,206 +57,34 @@ class Outcome:
         return f"| {self.fault.name} | {named} | {back} | {self.lost} | {self.sent} | {wrong} |"
 
 
-def _rtc_killed(at: Telescope) -> Iterator[None]:
-    _signal(at.rtc, signal.SIGKILL)
-    yield
-    at.start_rtc()
+def _begin_s(at: Telescope, fault: Fault) -> float:
+    """Wait until shortly before a fault; return when it begins, by ``time.monotonic``.
 
-
-def _rtc_frozen(at: Telescope) -> Iterator[None]:
-    _signal(at.rtc, signal.SIGSTOP)
-    yield
-    _signal(at.rtc, signal.SIGCONT)
-
-
-def _service_killed(at: Telescope) -> Iterator[None]:
-    at.kill()
-    yield
-    at.start()
-
-
-def _service_frozen(at: Telescope) -> Iterator[None]:
-    _signal(at.service, signal.SIGSTOP)
-    yield
-    _signal(at.service, signal.SIGCONT)
-
-
-def _worker_killed(at: Telescope) -> Iterator[None]:
-    for pid in _workers(at):
-        os.kill(pid, signal.SIGKILL)
-    yield
-
-
-def _worker_frozen(at: Telescope) -> Iterator[None]:
-    stopped = _workers(at)
-    for pid in stopped:
-        os.kill(pid, signal.SIGSTOP)
-    yield
-    for pid in stopped:
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGCONT)
-
-
-def _link_cut(at: Telescope) -> Iterator[None]:
-    at.cable.cut()
-    yield
-    at.cable.plugged.set()
-
-
-def _link_half_open(at: Telescope) -> Iterator[None]:
-    at.cable.held = True
-    yield
-    at.cable.held = False
-
-
-def _link_delayed(at: Telescope) -> Iterator[None]:
-    at.cable.delay_s = 0.3
-    yield
-    at.cable.delay_s = 0.0
-
-
-def _link_throttled(at: Telescope) -> Iterator[None]:
-    at.cable.bytes_per_s = 100_000.0
-    yield
-    at.cable.bytes_per_s = None
-
-
-def _disk_refuses(at: Telescope) -> Iterator[None]:
-    """No file of the service may grow: as on a full disk, each write is refused."""
-    if at.service is None:
-        raise RuntimeError("no service runs")
-    _prlimit(at.service.pid, "--fsize=0:")
-    yield
-    _prlimit(at.service.pid, "--fsize=unlimited:")
-
-
-def _simulated(_: Telescope) -> Iterator[None]:
-    """One that the simulated RTC makes by itself, at its time."""
-    yield
-
-
-def _loop_s(at: Telescope) -> float:
-    """Return how long the simulated RTC of now has run, by its truth."""
-    at.truth.read()
-    lines = at.truth.lines
-    begun = max((k for k, line in enumerate(lines) if line["kind"] == "setup"), default=0)
-    times = [line["t_ns_utc"] for line in lines[begun:] if line["kind"] == "truth"]
-    return float(times[-1] - times[0]) / 1e9 if times else 0.0
-
-
-def _second_service(at: Telescope) -> Iterator[None]:
-    other = at.second_service()
-    yield
-    other.send_signal(signal.SIGKILL)
-    other.wait()
-
-
-def _dead_clients(at: Telescope) -> Iterator[None]:
-    """Twenty who ask for the stream and read none of it."""
-    ends = []
-    for _ in range(20):
-        end = socket.create_connection(("127.0.0.1", at.port))
-        end.sendall(b"GET /v1/stream HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        ends.append(end)
-    yield
-    for end in ends:
-        end.close()
-
-
-FIRST_S, EVERY_S = 30.0, 30.0
-"""Of the simulated RTC's time: when its first own fault begins, and from one to the next."""
-
-SCHEDULE = {
-    FaultKind.LOST: "0.05,5",
-    FaultKind.LATE: "0.3,5",
-    FaultKind.DUPLICATED: "0.2,5",
-    FaultKind.REORDERED: "0.2,5",
-    FaultKind.NAN: "0.05,5",
-    FaultKind.FROZEN: "5",
-    FaultKind.GARBAGE: "0.2,5",
-    FaultKind.SHAPE: "5",
-    FaultKind.BASIS: "5",
-    FaultKind.SECOND: "5",
-    FaultKind.STALL: "4",
-    FaultKind.PAUSE: "4",
-    FaultKind.DITHER_LOST: "5",
-    FaultKind.CLOCK: "3600",
-}
-"""Faults of frames on their way, of dither and clock, with their arguments; the clock is last: the
-simulated RTC tells its time by it."""
-
-SILENT = {
-    FaultKind.LOST,
-    FaultKind.LATE,
-    FaultKind.DUPLICATED,
-    FaultKind.REORDERED,
-    FaultKind.NAN,
-    FaultKind.GARBAGE,
-    FaultKind.CLOCK,
-    FaultKind.DITHER_LOST,
-}
-"""Those that cost windows at most, or show at the next window only."""
-
-OF_FRAMES = tuple(
-    Fault(
-        name=f"{kind}: {arguments}",
-        seconds=5.0,
-        does=_simulated,
-        begins_s=FIRST_S + EVERY_S * k,
-        named_within_s=None if kind in SILENT else NAMED_S,
-        quick=False,
-    )
-    for k, (kind, arguments) in enumerate(SCHEDULE.items())
-)
-
-FAULTS = (
-    Fault(name="RTC killed, 5 s", stops_telemetry=True, seconds=5.0, does=_rtc_killed),
-    Fault(name="RTC frozen, 10 s", stops_telemetry=True, seconds=10.0, does=_rtc_frozen),
-    Fault(name="service killed", seconds=0.0, does=_service_killed, named_within_s=None),
-    Fault(name="service frozen, 10 s", seconds=10.0, does=_service_frozen, named_within_s=None),
-    Fault(name="worker killed", seconds=1.0, does=_worker_killed, named_within_s=None),
-    Fault(
-        name="worker frozen, 30 s",
-        seconds=30.0,
-        does=_worker_frozen,
-        named_within_s=6.0,
-        quick=False,
-    ),
-    Fault(name="link cut, 30 s", stops_telemetry=True, seconds=30.0, does=_link_cut, quick=False),
-    Fault(name="link half open, 10 s", stops_telemetry=True, seconds=10.0, does=_link_half_open),
-    Fault(
-        name="link delayed by 0.3 s, 10 s",
-        seconds=10.0,
-        does=_link_delayed,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(name="link throttled to 100 kB/s, 10 s", seconds=10.0, does=_link_throttled),
-    Fault(
-        name="disk refuses every write, 15 s", seconds=15.0, does=_disk_refuses, named_within_s=6.0
-    ),
-    Fault(
-        name="second service, 15 s",
-        seconds=15.0,
-        does=_second_service,
-        named_within_s=None,
-        quick=False,
-    ),
-    Fault(
-        name="20 stream clients that never read, 10 s",
-        seconds=10.0,
-        does=_dead_clients,
-        named_within_s=None,
-    ),
-)
+    The simulated RTC writes twice a second how many frames it has computed: its own faults are of
+    that time.
+    """
+    if fault.begins_s is None:
+        return time.monotonic()
+    n_known, begin_s = len(at.truth.lines), None
+    while begin_s is None or time.monotonic() < begin_s - LEAD_S:
+        at.truth.read()
+        fresh, n_known = at.truth.lines[n_known:], len(at.truth.lines)
+        computed = [line["seq"] for line in fresh if line["kind"] == "truth"]
+        if computed:
+            setup = next(line for line in reversed(at.truth.lines) if line["kind"] == "setup")
+            computed_s = (computed[-1] + 1) / setup["frame_rate_hz"]
+            begin_s = time.monotonic() + fault.begins_s - computed_s
+        time.sleep(0.01)
+    return float(begin_s)
 
 
 def tried(at: Telescope, fault: Fault) -> Outcome:
     """Let one fault come and go; return what came of it."""
-    while fault.begins_s is not None and _loop_s(at) < fault.begins_s - TRUTH_S:
-        time.sleep(0.02)
+    _rest(at)
+    begin_s = _begin_s(at, fault)
     outcome, before = Outcome(fault=fault), _looked(at)
     n_before, lost_before = len(before["shelf"]), before["lost"]
+    time.sleep(max(begin_s - time.monotonic(), 0.0))
     with contextmanager(fault.does)(at):
         begun_s, begun_ns = time.monotonic(), time.time_ns()
         while time.monotonic() - begun_s < fault.seconds:
@@ -296,7 +98,7 @@ def tried(at: Telescope, fault: Fault) -> Outcome:
         lasted_s = time.monotonic() - ended_s
         if taken is not None and taken < lasted_s and state["ready"]:
             outcome.back_s = lasted_s
-    after = _looked(at)
+    after = _counted(at)
     outcome.lost = max(after["lost"] - lost_before, 0)
     outcome.sent = max(len(after["shelf"]) - n_before, 0)
     if fault.stops_telemetry:
@@ -329,13 +131,24 @@ def _names(state: dict[str, Any]) -> set[str]:
     return alarms | waits - {"window"}
 
 
-def _looked(at: Telescope) -> dict[str, Any]:
-    state = at.state()
-    while state is None:
+def _rest(at: Telescope) -> None:
+    """Wait until the alarms of the fault before are over."""
+    until_s = time.monotonic() + REST_S
+    while ((state := at.state()) is None or state["alarms"]) and time.monotonic() < until_s:
         time.sleep(POLL_S)
-        state = at.state()
-    shelf = at.get("/v1/reconstructors")["reconstructors"]
-    return {"names": _names(state), "shelf": shelf, "lost": state["link"]["frames_lost"]}
+
+
+def _looked(at: Telescope) -> dict[str, Any]:
+    while (state := at.state()) is None:
+        time.sleep(POLL_S)
+    return _counted(at) | {"names": _names(state)}
+
+
+def _counted(at: Telescope) -> dict[str, Any]:
+    return {
+        "shelf": at.get("/v1/reconstructors")["reconstructors"],
+        "lost": at.get("/v1/state")["link"]["frames_lost"],
+    }
 
 
 def _broken(at: Telescope, outcome: Outcome) -> list[str]:
@@ -358,30 +171,6 @@ def _broken(at: Telescope, outcome: Outcome) -> list[str]:
     if "Traceback" in log:
         broken.append("a traceback in the service's log")
     return broken
-
-
-def _workers(at: Telescope) -> list[int]:
-    """Return the service's children that compute: those that were spawned."""
-    if at.service is None:
-        return []
-    found = []
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError, ValueError, IndexError):
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == at.service.pid and b"spawn_main" in (entry / "cmdline").read_bytes():
-                found.append(int(entry.name))
-    return found
-
-
-def _signal(process: subprocess.Popen[bytes] | None, number: signal.Signals) -> None:
-    if process is not None:
-        process.send_signal(number)
-        if number is signal.SIGKILL:
-            process.wait()
-
-
-def _prlimit(pid: int, limit: str) -> None:
-    subprocess.run(["prlimit", f"--pid={pid}", limit], check=True)
 
 
 def _words(fault: Fault) -> str:
@@ -435,7 +224,7 @@ def main() -> int:
                 raise RuntimeError(f"no matrix was applied within {WITHIN_S:g} s: {at.says()}")
             outcomes += _all(at, chosen)
             if of_frames:
-                _signal(at.rtc, signal.SIGKILL)
+                send_signal(at.rtc, signal.SIGKILL)
                 at.start_rtc(*(_words(fault) for fault in of_frames))
                 outcomes += _all(at, of_frames)
         finally:

@@ -18,6 +18,7 @@ import httpx
 from studies.cable import Cable
 from studies.campaign.small import SETTINGS, SMALL
 from studies.demo.truth import TruthFile
+from studies.machine import Machine
 
 WITHIN_S = 60.0
 """Longer than this is never."""
@@ -38,6 +39,8 @@ class Telescope:
         self.settings = directory / "settings.toml"
         self.settings.write_text(_toml(), encoding="utf-8")
         self.seed = seed
+        self.archive = directory / "data"
+        self.machine = Machine(directory / "machine")
         self.service: subprocess.Popen[bytes] | None = None
         self.rtc: subprocess.Popen[bytes] | None = None
 
@@ -58,7 +61,8 @@ class Telescope:
             "service",
             *("service", "run", "--config", str(self.settings), "--instrument", SMALL),
             *("--listen", f"tcp/127.0.0.1:{self.zenoh_port}", "--port", str(self.port)),
-            *("--data-dir", str(self.directory / "data"), "--mode", "auto"),
+            *("--data-dir", str(self.archive), "--mode", "auto"),
+            **self.machine.environment,
         )
         return begun_s
 
@@ -141,14 +145,15 @@ class Telescope:
                 return said, in_use
             time.sleep(0.1)
 
-    def _process(self, name: str, *words: str) -> subprocess.Popen[bytes]:
+    def _process(self, name: str, *words: str, **also: str) -> subprocess.Popen[bytes]:
+        """Start a program of ours; ``also``: of its environment."""
         with (self.directory / f"{name}.log").open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", *words],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1", **also},
             )
 
 

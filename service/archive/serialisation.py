@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import threading
@@ -161,7 +162,8 @@ class TrackingFile:
         StorageError
             If the disk refuses.
         """
-        text = json.dumps(_kept(saved)).encode()
+        values = _kept(saved)
+        text = json.dumps(values | {"sha256": _sha256(values)}).encode()
         try:
             with self._lock:
                 replace_file(self._path, text)
@@ -181,7 +183,11 @@ class TrackingFile:
             return None
         try:
             text = self._path.read_text(encoding="utf-8")
-            return _saved_of(json.loads(text, object_hook=_with_new_names))
+            values = json.loads(text)
+            expected = values.pop("sha256", None)  # versions before this one wrote none
+            if expected not in {None, _sha256(values)}:
+                raise ValueError(f"found checksum {_sha256(values)}, expected {expected}")
+            return _saved_of(json.loads(json.dumps(values), object_hook=_with_new_names))
         except (OSError, AttributeError, *NOT_UNDERSTOOD) as error:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
@@ -189,6 +195,10 @@ class TrackingFile:
                 f"{self._path}: damaged, now {aside.name}; α is measured anew, mode and dither are "
                 f"as the settings say: {error!s:.200}"
             ) from error
+
+
+def _sha256(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 def _kept(saved: Saved) -> dict[str, Any]:

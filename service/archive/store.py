@@ -203,6 +203,9 @@ class Store(Folder, Generic[Record]):
     ) -> None:
         """Write a product for good; ``fill`` adds what only this kind has.
 
+        One whose file is damaged or missing is written again, if these are its numbers; a damaged
+        file that the index does not know is put aside.
+
         Raises
         ------
         ArchiveError
@@ -221,8 +224,11 @@ class Store(Folder, Generic[Record]):
                 f"expected {sha256} of its record"
             )
         taken = ArchiveError(f"{self.noun} {record.id}: already stored, ids are never reused")
-        if path.exists():
+        known = self._index.checksums(self._table).get(record.id)
+        if self._is_sound(record.id, known) or known not in {None, found}:
             raise taken
+        if known is None and path.exists():
+            path.replace(path.with_suffix(".damaged"))
 
         def whole(file: h5py.File) -> None:
             file[self.dataset] = np.asarray(matrix, "<f4")
@@ -234,8 +240,9 @@ class Store(Folder, Generic[Record]):
             file.attrs["record"] = to_json(record)
 
         write_whole(path, whole)
-        if not self._index.add(self._table, record, found):
+        if not self._index.add(self._table, record, found) and known is None:
             raise taken
+        self._unsound.pop(record.id, None)
 
     def _check_numbers(
         self, record: Record, name: str, values: NDArray[Any], shape: tuple[int, ...]
@@ -266,6 +273,14 @@ class Store(Folder, Generic[Record]):
         if found != expected:
             raise ArchiveError(f"{path}: damaged: found checksum {found}, expected {expected}")
         return matrix
+
+    def _is_sound(self, product_id: str, sha256: str | None) -> bool:
+        """Return whether the file of one is there and holds the numbers that were stored."""
+        try:
+            self._matrix(product_id, sha256)
+        except ArchiveError:
+            return False
+        return True
 
     def _damaged(self, product_ids: Iterable[str]) -> dict[str, str]:
         """Return, by id, what is wrong with files that are missing or cut; none of it is read."""

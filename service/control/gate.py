@@ -82,8 +82,9 @@ def judge(
 ) -> GateVerdict:
     """Return whether the loop would hold everywhere within α ± 3σ.
 
-    Tries the estimate and the eight ends of the axes of its 3σ ellipsoid; ``covariance``
-    ``(4, 4)`` includes the model-error floor. The bound is never tighter than half-way between
+    Tries the estimate and the ends of the axes of its 3σ ellipsoid, eight, or twelve where the
+    anamorphosis is followed: ``covariance`` ``(4, 4)`` or ``(6, 6)`` includes the model-error
+    floor, and ``linearisation`` has as many derivatives. The bound is never tighter than half-way between
     the aligned loop and the edge of stability, or a slow loop could never be served at all. A
     loop that is stable must not let its outer ring slip either (:func:`edge_motion_m`); as many
     modes as hold already may move it a little more, or the noise of α would cost modes. Modes
@@ -93,7 +94,9 @@ def judge(
     reconstructor, linearisation, loop = _moving(reconstructor, linearisation, loop)
     n = len(reconstructor)
     centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
-    slopes = [reconstructor @ derivative[:, :n] for derivative in linearisation.derivatives]
+    rates = linearisation.rates[: len(covariance)]
+    covariance = covariance[: len(rates), : len(rates)]  # of a matrix that knows no stretch
+    slopes = [reconstructor @ rate[:, :n] for rate in rates]
     gains = (loop.gains * loop.optical_gain).astype(np.float32)
     steps = _ellipsoid_ends(covariance).astype(np.float32)
     aligned = float(loop.pole_radius(gains).max())
@@ -123,6 +126,7 @@ def _moving(
         linearisation,
         matrix=linearisation.matrix[:, modes],
         derivatives=linearisation.derivatives[:, :, modes],
+        stretches=None if linearisation.stretches is None else linearisation.stretches[:, :, modes],
     )
     return reconstructor[modes], linearisation, loop.of(modes)
 
@@ -246,7 +250,7 @@ def _largest_on_border(extent: NDArray[np.float64], loop: ControlLoop) -> float:
 
 
 def _ellipsoid_ends(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return one end of each of the 3σ axes, ``(4, 4)``; the other is its negative.
+    """Return one end of each of the 3σ axes, a row each; the other is its negative.
 
     The axes are those of the correlation matrix, so that units play no part.
     """

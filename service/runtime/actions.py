@@ -16,7 +16,7 @@ from service import __version__, wire
 from service.control.gains import gain_table
 from service.control.gate import GateVerdict
 from service.control.loop import ControlLoop
-from service.errors import CommandError, LinkError, UnknownIdError
+from service.errors import ArchiveError, CommandError, LinkError, UnknownIdError
 from service.estimation.description import Description
 from service.estimation.loop import commanded_gains, extended_gains, same_gains
 from service.link.matrices import MeasuredMatrix
@@ -271,7 +271,7 @@ class Actions:
         registration = _registered(state)
         return Conditions(
             alpha=registration.alpha,
-            covariance=registration.total_covariance,
+            covariance=registration.covariance_to_hold_in,
             loop=loop_to_judge(state, gains),
             bound=self._publishing.pole_radius_bound,
         )
@@ -371,10 +371,13 @@ class Actions:
     def _store_foreign(
         self, record: products.ReconstructorRecord, matrix: NDArray[np.float32]
     ) -> None:
-        """Archive the RTC's own matrix, once; another one under the same id is an error."""
+        """Archive the RTC's own matrix, once; another one under the same id is an error.
+
+        It replaces one whose file is damaged: the RTC has the numbers.
+        """
         try:
             same = wire.checksum(self._archive.reconstructors.matrix(record.id)) == record.sha256
-        except UnknownIdError:
+        except (ArchiveError, UnknownIdError):  # damaged, or none of it
             provenance = {"instrument": self.instrument.name, "why": record.reason}
             self._archive.reconstructors.store(record, matrix, None, provenance)
             return

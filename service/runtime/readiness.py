@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -28,7 +27,10 @@ from service.wire import TEXT_LIMIT, AlarmMessage, StateMessage
 AlarmTexts = frozenset[tuple[str, str]]
 
 SILENT_S: Final = 3.0
-"""What has not come for so long is waited for."""
+"""A status that has not come for so long is waited for."""
+
+NO_FRAMES_S: Final = 2.0
+"""So are frames, of which tens come a second."""
 
 REVIVED_AFTER_S: Final = 10.0
 """With the RTC's token there and no message, until the link is opened anew for the first time."""
@@ -59,12 +61,6 @@ LOG_AFTER_NS: Final = 2 * SECOND_NS
 
 LOG_EVERY_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
-
-LOST_S: Final = 5.0
-"""Losses are summed over so long."""
-
-LOST_SHARE: Final = 0.01
-"""Of the frames: more of them lost are an alarm, which half as many do not end."""
 
 COMPLAINTS: Final = (
     alarms.CERTIFICATE_ENDING,
@@ -148,52 +144,6 @@ def _flood(link: LinkStatistics) -> str:
         f"the RTC floods the service with statuses: {rate_hz:.0f} a second, 1 to 10 are expected; "
         f"{taken}: slow them down"
     )
-
-
-class Losses:
-    """Counters of lost frames, second by second."""
-
-    __slots__ = ("_counts", "_raised")
-
-    def __init__(self) -> None:
-        self._counts: deque[tuple[float, LinkStatistics]] = deque()
-        self._raised = False
-
-    def complaint(self, link: LinkStatistics, now_s: float) -> str:
-        """Return what is lost, where it is more than chance; empty: next to nothing.
-
-        ``now_s`` is of a clock that does not leap.
-        """
-        counts = self._counts
-        counts.append((now_s, link))
-        while len(counts) > 1 and now_s - counts[1][0] >= LOST_S:
-            counts.popleft()
-        since_s, before = counts[0]
-        never_came = max(link.frames_lost - before.frames_lost, 0)
-        not_finite = link.frames_nonfinite - before.frames_nonfinite
-        overwritten = link.frames_overwritten - before.frames_overwritten
-        received = link.frames_received - before.frames_received
-        lost = never_came + not_finite + overwritten
-        n_frames = max(received + never_came + not_finite, 1)
-        share = lost / n_frames
-        enough = now_s - since_s >= LOST_S
-        self._raised = share > (0.5 if self._raised else 1.0) * LOST_SHARE and enough
-        if not self._raised:
-            return ""
-        found = [
-            f"{n} {how}"
-            for n, how in (
-                (never_came, "never came"),
-                (not_finite, "are not finite"),
-                (overwritten, "were not read in time"),
-            )
-            if n
-        ]
-        return (
-            f"frames are lost: of {n_frames} in the last {now_s - since_s:.0f} s {', '.join(found)}"
-            f" ({100.0 * share:.1f} %): check the network, the RTC's publisher, and what else "
-            "this machine does"
-        )
 
 
 def detect_link_changes(
@@ -285,7 +235,7 @@ def _for_messages(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
             f"{REVIVED_AFTER_S:.0f} s the link is opened anew: a connection may be left over)"
         )
         yield Prerequisite(name="telemetry", responsible=Responsible.RTC, text=text)
-    elif link.frame_age_s is None or link.frame_age_s >= SILENT_S:
+    elif link.frame_age_s is None or link.frame_age_s >= NO_FRAMES_S:
         text = f"it sends statuses and no frames: send them on {where}/tel/frames"
         yield Prerequisite(name="frames", responsible=Responsible.RTC, text=text)
     if link.session_waiting is not None and inputs.frames_come:

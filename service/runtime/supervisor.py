@@ -30,6 +30,7 @@ from service.runtime.engine import Engine
 from service.runtime.estimates import PendingWindow, fit_passive, fitted, read_own_matrix
 from service.runtime.estimator_bank import EstimatorBank, Fed, process_blocks
 from service.runtime.heartbeat import Heartbeat
+from service.runtime.losses import Losses
 from service.runtime.snapshot import Snapshot, in_words
 from service.runtime.telemetry_recorder import TelemetryRecorder, TrendSampler
 from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_worker
@@ -333,7 +334,7 @@ class Supervisor:
 
     async def _tick(self) -> None:
         alarms: frozenset[tuple[str, str]] = frozenset()
-        told, revival, losses = readiness.ReadinessLog(), readiness.Revival(), readiness.Losses()
+        told, revival, losses = readiness.ReadinessLog(), readiness.Revival(), Losses()
         while True:
             self._heartbeat.beat("the tick")
             link = self._bridge.statistics()

@@ -271,6 +271,18 @@ class Registration:
         return self.covariance + np.diag(self.grown + self.floor**2)
 
     @property
+    def covariance_to_hold_in(self) -> Array:
+        """``(4, 4)`` as :attr:`total_covariance`, or ``(6, 6)`` with the anamorphosis.
+
+        A stretch is a length as a magnification is: the model errs in it as much.
+        """
+        known = self.stretches
+        if known is None:
+            return self.total_covariance
+        own = known.covariance + np.eye(2) * self.floor[3] ** 2
+        return np.block([[self.total_covariance, known.shared.T], [known.shared, own]])
+
+    @property
     def sigma(self) -> Array:
         """``(4,)`` 1 σ now, floor included, numeric units (rotation in radians)."""
         return np.sqrt(np.diag(self.total_covariance))

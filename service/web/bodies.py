@@ -22,9 +22,15 @@ PATIENCE_S = 3.0
 SLOWEST_BYTES_S = 1000
 """Bytes a second that must come from then on."""
 
-MAX_BODIES = 50
+MAX_BODIES = 500
 """Bodies that may be on their way at once; beyond it the one that has been so longest gives way: an
 order finds a place whatever others hold."""
+
+MAX_HELD_BYTES = 50_000_000
+"""Of all of them together; beyond it the same one gives way."""
+
+OnTheirWay = dict[object, tuple[asyncio.Timeout, bytearray]]
+"""By request, oldest first: the time that its body has, and what has come of it."""
 
 STREAMED = ("POST", "/v1/fits")
 """The route that reads its body itself: it goes to the disk, with its own limits."""
@@ -56,12 +62,13 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
     if told.isdecimal() and int(told) > MAX_BODY_BYTES:
         raise _too_large(f"{int(told) / 1e6:.1f} MB")
     body, began_s = bytearray(), asyncio.get_running_loop().time()
-    on_their_way: dict[object, asyncio.Timeout] = request.app.state.bodies
+    on_their_way: OnTheirWay = request.app.state.bodies
     try:
         async with asyncio.timeout_at(began_s + min(PATIENCE_S, BODY_S)) as limit:
             if told or "transfer-encoding" in request.headers:
-                _take_place(on_their_way, request, limit)
+                on_their_way[request] = limit, body
             while True:
+                _make_room(on_their_way)
                 message = await receive()
                 if message["type"] == "http.disconnect":
                     return None
@@ -82,15 +89,14 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
         on_their_way.pop(request, None)
 
 
-def _take_place(
-    on_their_way: dict[object, asyncio.Timeout], request: Request, limit: asyncio.Timeout
-) -> None:
-    """Note a body that is on its way; where there are too many, the oldest has no time left."""
-    if len(on_their_way) >= MAX_BODIES:
-        oldest = on_their_way.pop(next(iter(on_their_way)))
-        if not oldest.expired():
-            oldest.reschedule(asyncio.get_running_loop().time())
-    on_their_way[request] = limit
+def _make_room(on_their_way: OnTheirWay) -> None:
+    """Let those that have been on their way longest have no time left, where there are too many."""
+    held = sum(len(body) for _, body in on_their_way.values())
+    while len(on_their_way) > MAX_BODIES or held > MAX_HELD_BYTES:
+        limit, body = on_their_way.pop(next(iter(on_their_way)))
+        held -= len(body)
+        if not limit.expired():
+            limit.reschedule(asyncio.get_running_loop().time())
 
 
 def _too_large(found: str) -> TooLargeError:

@@ -10,6 +10,8 @@ import asyncio
 import contextlib
 import hashlib
 import re
+import resource
+import socket
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -32,8 +34,18 @@ from service.web.problems import problem
 IDLE_S = 10.0
 """Longest time a request's head may take, seconds, or nothing be taken of an answer."""
 
-MAX_IDLE = 100
-"""Connections that may wait so; beyond it those that have waited longest give way."""
+MAX_IDLE = 2000
+"""Connections that may wait so, half of the descriptors at most; beyond it those that have waited
+longest give way. One that waits costs nothing, one that comes back again and again does."""
+
+MAX_DESCRIPTORS = 8192
+"""That the service asks of the system, where its limit is less."""
+
+AT_ONCE = 20
+"""Connections that are taken, or ended, before others have their turn."""
+
+MAX_PENDING = 2048
+"""Connections that the system holds until they are taken."""
 
 TICK_S = 0.9
 """From one look of the server's at what is idle to the next, besides uvicorn's own 0.1 s."""
@@ -110,6 +122,7 @@ class Server(uvicorn.Server):
             ws="none",
             log_config=None,
             access_log=False,
+            backlog=AT_ONCE,
             timeout_graceful_shutdown=within_s,
             proxy_headers=bool(proxies),
             forwarded_allow_ips=list(proxies),
@@ -117,6 +130,15 @@ class Server(uvicorn.Server):
         super().__init__(config)
         self._over = over
         self._since_s: dict[object, float] = {}
+        self._max_idle = min(MAX_IDLE, _descriptors() // 2)
+
+    @override
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listener in sockets or ():
+            listener.listen(
+                MAX_PENDING
+            )  # asyncio takes ``backlog`` for what it accepts at once, too
 
     @override
     @contextlib.contextmanager
@@ -126,21 +148,34 @@ class Server(uvicorn.Server):
     @override
     async def on_tick(self, counter: int) -> bool:
         over = await super().on_tick(0)  # the date of answers is told anew
-        self._end_idle()
+        await self._end_idle()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TICK_S):
                 await self._over.wait()
         return over or self._over.is_set()
 
-    def _end_idle(self) -> None:
+    async def _end_idle(self) -> None:
         """End what has stood still for too long; of too much, what has done so the longest."""
         now_s = time.monotonic()
         idle = {still: one for one in self.server_state.connections if (still := _stands(one))}
         self._since_s = {still: self._since_s.get(still, now_s) for still in idle}
         by_age = sorted(idle, key=self._since_s.__getitem__)
         late = [still for still in by_age if now_s - self._since_s[still] > IDLE_S]
-        for still in {*late, *by_age[: max(len(by_age) - MAX_IDLE, 0)]}:
-            idle[still].transport.abort()
+        too_many = by_age[: max(len(by_age) - self._max_idle, 0)]
+        for n_ended, still in enumerate({*late, *too_many}):
+            if n_ended % AT_ONCE == 0:
+                await asyncio.sleep(0)
+            if _stands(idle[still]) == still:
+                idle[still].transport.abort()
+
+
+def _descriptors() -> int:
+    """Return how many files and connections the service may hold, once it has asked for more."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(MAX_DESCRIPTORS, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    return wanted if soft == resource.RLIM_INFINITY else max(soft, wanted)
 
 
 def _stands(connection: Any) -> tuple[object, ...]:  # noqa: ANN401 - uvicorn's own

@@ -309,6 +309,34 @@ async def test_slow_bodies_keep_no_order_out_that_comes_in_pieces_itself(
     assert len(service.commands) == 2
 
 
+async def test_bodies_hold_so_many_bytes_together_and_the_oldest_gives_way(service, monkeypatch):
+    monkeypatch.setattr(bodies, "MAX_HELD_BYTES", 1000)
+    large = SLOW_BODY.replace(b"100", b"900") + b" " * 600
+    async with serving(service) as port:
+        reader, writer = await connected(port, large)
+        await asyncio.sleep(0.1)
+        _, second = await connected(port, large)
+        status, _, problem = parts(await asyncio.wait_for(reader.readuntil(b"}"), 2.0))
+        assert (status, problem["type"]) == (408, "urn:pyrcal:problem:too-slow")
+        for line in (writer, second):
+            line.close()
+    assert service.commands == []
+
+
+async def test_the_system_holds_more_connections_than_are_taken_at_once(service):
+    """All say at once what they want: none has to try again."""
+    async with serving(service) as port:
+        lines = await asyncio.gather(
+            *(
+                connected(port, b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                for _ in range(10 * connections.AT_ONCE)
+            )
+        )
+        for reader, writer in lines:
+            assert b"200 OK" in await asyncio.wait_for(reader.readuntil(b"\r\n"), 10.0)
+            writer.close()
+
+
 async def test_a_body_that_trickles_is_ended_long_before_a_large_one_would_be(service, monkeypatch):
     monkeypatch.setattr(bodies, "PATIENCE_S", 0.3)
     async with serving(service) as port:

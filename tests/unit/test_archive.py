@@ -251,6 +251,30 @@ def test_a_missing_file_is_named(archive):
         archive.reconstructors.matrix("cm-1")
 
 
+def test_the_numbers_of_a_damaged_file_may_be_stored_again_and_no_others(archive):
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
+    damage(product(archive))
+    with pytest.raises(ArchiveError, match="ids are never reused"):
+        archive.reconstructors.store(record_of(), MATRIX + 1, None, {})
+    archive.reconstructors.store(record_of(), MATRIX, None, {})
+    np.testing.assert_array_equal(archive.reconstructors.matrix("cm-1"), MATRIX)
+
+
+def test_a_damaged_file_that_no_index_knows_is_put_aside_for_what_comes_under_its_id(tmp_path):
+    archive = Archive(tmp_path)
+    archive.open()
+    with archive:
+        archive.reconstructors.store(record_of(), MATRIX, None, {})
+        damage(product(archive))
+    for leftover in tmp_path.glob("index.sqlite*"):
+        leftover.unlink()
+    archive.open()
+    with archive:
+        archive.reconstructors.store(record_of(), MATRIX, None, {})
+        np.testing.assert_array_equal(archive.reconstructors.matrix("cm-1"), MATRIX)
+        assert product(archive).with_suffix(".damaged").exists()
+
+
 def test_a_lost_index_is_made_anew_from_the_sound_products(tmp_path):
     archive = Archive(tmp_path)
     archive.open()

@@ -1,6 +1,7 @@
 """What outlives a service of its tracking: one file, whole or put aside."""
 
 import json
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def test_a_file_of_before_the_scatter_told_of_the_wind_is_read(file, saved):
     assert saved.registration.biases[0].excess[0] > 0.0
     assert saved.registration.biases[0].loop == loop_numbers(rtc())
     file.write(saved)
-    values = json.loads(file._path.read_text(encoding="utf-8"))
+    values = without_checksum(file._path.read_text(encoding="utf-8"))
     del values["registration"]["biases"][0]["excess"], values["registration"]["biases"][0]["loop"]
     file._path.write_text(json.dumps(values), encoding="utf-8")
     found = file.read().registration.biases[0]
@@ -135,7 +136,7 @@ def test_that_an_operator_ended_one_is_read_as_it_was_written(file, cut_off):
 def test_a_file_from_before_operators_could_hold_one_off_is_read(file, cut_off, tmp_path):
     file.write(cut_off)
     path = tmp_path / "tracking.json"
-    values = json.loads(path.read_text())
+    values = without_checksum(path.read_text())
     del values["acquisition"]["held_off"]
     path.write_text(json.dumps(values))
     assert file.read().acquisition.held_off is False
@@ -144,7 +145,7 @@ def test_a_file_from_before_operators_could_hold_one_off_is_read(file, cut_off, 
 def test_a_file_from_before_acquisitions_were_saved_is_read(file, saved, tmp_path):
     file.write(saved)
     path = tmp_path / "tracking.json"
-    values = json.loads(path.read_text())
+    values = without_checksum(path.read_text())
     del values["acquisition"]
     path.write_text(json.dumps(values))
     assert same(file.read().registration.alpha, saved.registration.alpha)
@@ -163,11 +164,16 @@ def test_a_file_from_before_acquisitions_were_saved_is_read(file, saved, tmp_pat
 def test_a_damaged_acquisition_is_no_acquisition(file, cut_off, tmp_path, values):
     file.write(cut_off)
     path = tmp_path / "tracking.json"
-    found = json.loads(path.read_text())
+    found = without_checksum(path.read_text())
     found["acquisition"] |= values
     path.write_text(json.dumps(found))
     with pytest.raises(ArchiveError, match="damaged"):
         file.read()
+
+
+def without_checksum(text):
+    """What a service of before has written, or a hand."""
+    return {name: value for name, value in json.loads(text).items() if name != "sha256"}
 
 
 ORDERS = Orders(mode=Mode.HOLD, settings_mode=Mode.AUTO, dither_stopped=True)
@@ -188,7 +194,7 @@ def test_orders_alone_are_worth_a_file(file, saved):
 def test_a_file_from_before_orders_were_saved_is_read(file, saved, tmp_path):
     file.write(saved)
     path = tmp_path / "tracking.json"
-    values = json.loads(path.read_text())
+    values = without_checksum(path.read_text())
     del values["orders"]
     path.write_text(json.dumps(values))
     assert file.read().orders is None
@@ -202,7 +208,7 @@ def test_a_file_from_before_orders_were_saved_is_read(file, saved, tmp_path):
 def test_damaged_orders_are_none(file, saved, tmp_path, values):
     file.write(replace(saved, orders=ORDERS))
     path = tmp_path / "tracking.json"
-    found = json.loads(path.read_text())
+    found = without_checksum(path.read_text())
     found["orders"] |= values
     path.write_text(json.dumps(found))
     with pytest.raises(ArchiveError, match="mode and dither are as the settings say"):
@@ -216,16 +222,28 @@ def test_the_newest_replaces_what_was_there(file, saved, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["tracking.json"]
 
 
+@pytest.mark.parametrize(("was", "became"), [('"alpha": [0', '"alpha": [1'), ("HOLD", "AUTO")])
+def test_one_digit_or_word_that_has_changed_is_damage(file, saved, tmp_path, was, became):
+    file.write(replace(saved, orders=ORDERS))
+    path = tmp_path / "tracking.json"
+    text = path.read_text()
+    changed = re.sub(was.replace("[", "\\["), became, text, count=1, flags=re.IGNORECASE)
+    assert changed != text
+    path.write_text(changed)
+    with pytest.raises(ArchiveError, match="found checksum"):
+        file.read()
+
+
 def altered(**values):
     def change(text):
-        return json.dumps({**json.loads(text), **values})
+        return json.dumps({**without_checksum(text), **values})
 
     return change
 
 
 def with_registration(**values):
     def change(text):
-        found = json.loads(text)
+        found = without_checksum(text)
         found["registration"] |= values
         return json.dumps(found)
 

@@ -119,7 +119,10 @@ class Compute:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Conditions(Determination):
-    """Conditions a reconstructor must hold in; the covariance includes the model's error."""
+    """Conditions a reconstructor must hold in.
+
+    The covariance includes the model's error; it is ``(6, 6)`` where an anamorphosis is followed.
+    """
 
     loop: ControlLoop
     """As the gate is to see it."""

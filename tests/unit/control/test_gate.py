@@ -131,6 +131,50 @@ def test_correlated_parameters_are_tried_along_their_own_axes():
     assert found.worst_pole_radius == pytest.approx(max(radii), rel=1e-3)
 
 
+class TestAnamorphosis:
+    """Where it is followed, both ends of what is not known of it are tried, too."""
+
+    @staticmethod
+    def verdict(sigma, correlation=0.0):
+        linearisation = replace(
+            small_linearisation(), stretches=small_model().stretch_derivatives(Misregistration())
+        )
+        covariance = np.diag(np.append(SIGMA, sigma) ** 2)
+        covariance[3, 4] = covariance[4, 3] = correlation * SIGMA[3] * sigma[0]
+        matrix = reconstructor_for(Misregistration())
+        return judge(matrix, linearisation, Misregistration(), covariance, settings(), bound=BOUND)
+
+    def test_what_is_known_of_it_costs_next_to_nothing(self):
+        found = self.verdict([0.0005, 0.0005])
+        assert (found.accepted, found.n_points) == (True, 13)
+        assert found.worst_pole_radius == pytest.approx(verdict().worst_pole_radius, abs=0.02)
+
+    @pytest.mark.parametrize("sigma", [[0.2, 0.0005], [0.0005, 0.2]])
+    def test_one_that_is_hardly_known_is_refused(self, sigma):
+        assert not self.verdict(sigma).accepted
+
+    def test_the_true_matrix_at_the_end_is_as_bad_as_the_gate_says(self):
+        """3 % of stretch, found with D itself and numpy's own eigenvalues."""
+        found = self.verdict([0.01, 1e-9])
+        stretched = Misregistration(anamorphosis=(0.03, 0.0))
+        there = small_model().interaction_matrix(stretched)[:, :N_CONTROLLED]
+        response = np.linalg.eigvals(0.5 * reconstructor_for(Misregistration()) @ there)
+        assert found.worst_pole_radius == pytest.approx(pole_radius(response).max(), abs=0.01)
+
+    def test_a_matrix_that_knows_no_stretch_is_judged_by_the_four(self):
+        covariance = np.diag(np.append(SIGMA, [0.2, 0.2]) ** 2)
+        matrix = reconstructor_for(Misregistration())
+        found = judge(
+            matrix,
+            small_linearisation(),
+            Misregistration(),
+            covariance,
+            settings(),
+            bound=BOUND,
+        )
+        assert (found.accepted, found.n_points) == (True, 9)
+
+
 def test_a_slow_loop_can_be_served_although_its_poles_lie_beyond_the_bound():
     """At a gain of 0.05 the aligned loop itself has a radius of 0.947, of 0.01 one of 0.99."""
     slow = verdict(loop=settings(gain=0.01))

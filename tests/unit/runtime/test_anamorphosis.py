@@ -101,6 +101,7 @@ def test_the_filter_follows_it_beside_the_four(night):
 def test_the_matrix_in_use_was_made_with_it(night):
     (used,) = [r for r in night.state.matrices.reconstructors if r.state is MatrixState.APPLIED]
     assert np.abs(np.array(used.alpha.anamorphosis) - STRETCHES).max() < 0.005
+    assert used.gate.n_points == 13, "at both ends of what is not known of it, too"
 
 
 def test_the_next_service_takes_it_over(night, tmp_path):

@@ -9,7 +9,6 @@ import pytest
 from service.link.statistics import Counters, Disposition, LinkStatistics
 from service.runtime.readiness import (
     COMPLAINTS,
-    Losses,
     ReadinessInputs,
     ReadinessLog,
     Revival,
@@ -328,72 +327,3 @@ def test_the_state_on_the_network_is_short_and_in_boundary_units():
 
 
 # ---------------------------------------------------------------- losses
-
-
-class Counting:
-    """A link at 1 kHz whose counters are looked at once a second; a share of its frames is lost."""
-
-    def __init__(self):
-        self.losses, self.now_s = Losses(), 100.0
-        self.received = self.lost = self.nonfinite = self.overwritten = 0
-
-    def pass_(self, seconds, *, lost=0, nonfinite=0, overwritten=0):
-        said = ""
-        for _ in range(seconds):
-            self.now_s += 1.0
-            self.received += 1000 - lost - nonfinite
-            self.lost += lost
-            self.nonfinite += nonfinite
-            self.overwritten += overwritten
-            counted = link(
-                *WELL,
-                frames_received=self.received,
-                frames_lost=self.lost,
-                frames_nonfinite=self.nonfinite,
-                frames_overwritten=self.overwritten,
-            )
-            said = self.losses.complaint(counted, self.now_s)
-        return said
-
-
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        ({"lost": 20}, "of 5000 in the last 5 s 100 never came (2.0 %)"),
-        ({"nonfinite": 20}, "100 are not finite"),
-        ({"overwritten": 20}, "100 were not read in time"),
-    ],
-)
-def test_more_than_one_frame_in_a_hundred_lost_over_five_seconds_is_named(how, words):
-    counting = Counting()
-    assert not counting.pass_(20)
-    assert words in counting.pass_(5, **how)
-
-
-def test_a_few_lost_frames_are_nothing_and_what_was_recovered_is_not_lost():
-    counting = Counting()
-    assert not counting.pass_(20, lost=9)
-    counting.lost += 200  # a hole, filled before the next look
-    counting.lost -= 200
-    assert not counting.pass_(1)
-    assert not Counting().pass_(4, lost=500), "less than five seconds are no measure"
-
-
-def test_a_complaint_of_losses_ends_only_with_half_as_many():
-    counting = Counting()
-    assert counting.pass_(10, lost=12)
-    assert counting.pass_(20, lost=8), "it does not flicker about the limit"
-    assert not counting.pass_(10, lost=4)
-    assert not counting.pass_(20, lost=8)
-
-
-def test_lost_frames_are_an_alarm_that_ends_by_itself():
-    state = TrackerState(system="small")
-    text = Counting().pass_(10, lost=50)
-    (made,) = detect_link_changes(link(*WELL), state, START_NS, {"frames-lost": text})
-    assert made.name == "frames-lost"
-    alarm = Alarm(name=made.name, since_ns_utc=0, text=made.text, seen_ns_utc=START_NS)
-    state = changed(state, active=(alarm,))
-    assert detect_link_changes(link(*WELL), state, START_NS + 2 * SECOND) == []
-    (over,) = detect_link_changes(link(*WELL), state, START_NS + 4 * SECOND)
-    assert (over.name, over.over) == ("frames-lost", True)

@@ -1,0 +1,113 @@
+"""Frames that are missing, or come ever later: the alarm ``frames-lost``."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from service.link.statistics import LinkStatistics
+
+LOST_S: Final = 5.0
+"""Losses are summed over so long."""
+
+LOST_SHARE: Final = 0.01
+"""Of the frames: more of them lost are an alarm, which half as many do not end."""
+
+SLOW_S: Final = 2.0
+"""Frames that come are counted over so long."""
+
+SLOW_SHARE: Final = 0.25
+"""Of the rate before: fewer are an alarm, which twice as many do not end."""
+
+WHAT_TO_DO: Final = "check the network, the RTC's publisher, and what else this machine does"
+
+Counts = deque[tuple[float, LinkStatistics]]
+"""Moments, and the counters of then."""
+
+
+class Losses:
+    """Counters of frames, second by second."""
+
+    __slots__ = ("_counts", "_raised", "_slowness")
+
+    def __init__(self) -> None:
+        self._counts: Counts = deque()
+        self._raised = False
+        self._slowness = _Slowness()
+
+    def complaint(self, link: LinkStatistics, now_s: float) -> str:
+        """Return what is lost, where it is more than chance; empty: next to nothing.
+
+        ``now_s`` is of a clock that does not leap.
+        """
+        counts = self._counts
+        counts.append((now_s, link))
+        while len(counts) > 1 and now_s - counts[1][0] >= LOST_S:
+            counts.popleft()
+        slow = self._slowness.complaint(counts)
+        return self._lost(*counts[0], link, now_s) or slow
+
+    def _lost(
+        self, since_s: float, before: LinkStatistics, link: LinkStatistics, now_s: float
+    ) -> str:
+        never_came = max(link.frames_lost - before.frames_lost, 0)
+        not_finite = link.frames_nonfinite - before.frames_nonfinite
+        overwritten = link.frames_overwritten - before.frames_overwritten
+        received = link.frames_received - before.frames_received
+        lost = never_came + not_finite + overwritten
+        n_frames = max(received + never_came + not_finite, 1)
+        share = lost / n_frames
+        enough = now_s - since_s >= LOST_S
+        self._raised = share > (0.5 if self._raised else 1.0) * LOST_SHARE and enough
+        if not self._raised:
+            return ""
+        found = [
+            f"{n} {how}"
+            for n, how in (
+                (never_came, "never came"),
+                (not_finite, "are not finite"),
+                (overwritten, "were not read in time"),
+            )
+            if n
+        ]
+        return (
+            f"frames are lost: of {n_frames} in the last {now_s - since_s:.0f} s {', '.join(found)}"
+            f" ({100.0 * share:.1f} %): {WHAT_TO_DO}"
+        )
+
+
+class _Slowness:
+    """Frames that come at a fraction of the rate they came at: nothing is lost yet, all is late."""
+
+    __slots__ = ("_before_hz",)
+
+    def __init__(self) -> None:
+        self._before_hz: float | None = None
+        """The rate before they became slow; None: they are not."""
+
+    def complaint(self, counts: Counts) -> str:
+        """Return how slowly they come; empty: as before, or not at all, which others name."""
+        now_s, now = counts[-1]
+        recent = next((at for at in reversed(counts) if now_s - at[0] >= SLOW_S), None)
+        if recent is None or now.frames_received == counts[-2][1].frames_received:
+            self._before_hz = None
+            return ""
+        rate_hz = _rate_hz(recent, counts[-1])
+        if self._before_hz is not None:
+            slow = rate_hz < 2.0 * SLOW_SHARE * self._before_hz
+        else:
+            self._before_hz = _rate_hz(counts[0], recent)
+            slow = rate_hz < SLOW_SHARE * self._before_hz
+        if not slow:
+            self._before_hz = None
+            return ""
+        return (
+            f"frames come slowly: {rate_hz:.0f} a second in the last {SLOW_S:.0f} s, "
+            f"{self._before_hz:.0f} before, and ever later: {WHAT_TO_DO}"
+        )
+
+
+def _rate_hz(first: tuple[float, LinkStatistics], last: tuple[float, LinkStatistics]) -> float:
+    """Return how many frames came a second; 0 where no time passed."""
+    seconds = last[0] - first[0]
+    return (last[1].frames_received - first[1].frames_received) / seconds if seconds else 0.0

@@ -84,9 +84,9 @@ def judge(
 
     Tries the estimate and the ends of the axes of its 3σ ellipsoid, eight, or twelve where the
     anamorphosis is followed: ``covariance`` ``(4, 4)`` or ``(6, 6)`` includes the model-error
-    floor, and ``linearisation`` has as many derivatives. The bound is never tighter than half-way between
-    the aligned loop and the edge of stability, or a slow loop could never be served at all. A
-    loop that is stable must not let its outer ring slip either (:func:`edge_motion_m`); as many
+    floor, and ``linearisation`` has as many derivatives. The bound is never tighter than half-way
+    between the aligned loop and the edge of stability, or a slow loop could never be served at all.
+    A loop that is stable must not let its outer ring slip either (:func:`edge_motion_m`); as many
     modes as hold already may move it a little more, or the noise of α would cost modes. Modes
     without gain are not in the loop, and have no say: their command only fades.
     """

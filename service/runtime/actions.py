@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -34,8 +35,8 @@ from service.tracking.state import TrackerState
 UNKNOWN_PARENT = "unknown"
 """Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
 
-MATRICES_KEPT = 6
-"""In memory; older ones come from the archive."""
+MATRICES_KEPT = 3
+"""In memory, those asked for last: in use, the one before, a new one. Others are read again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +71,7 @@ class Actions:
         self._publishing = publishing
         self._clock_ns = clock_ns
         self._matrices: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
+        self._guard = threading.Lock()
         self._commanded_modes: int | None = None
         self._judging: set[str] = set()
         self.noisy = estimates.NoisySums(workers=workers, archive=archive, instrument=instrument)
@@ -114,7 +116,9 @@ class Actions:
             If the archive's file is damaged.
         """
         kept = self._matrices.get(matrix_id)
-        return kept if kept is not None else self._archive.reconstructors.matrix(matrix_id)
+        matrix = self._archive.reconstructors.matrix(matrix_id) if kept is None else kept
+        self._remember(matrix_id, matrix)
+        return matrix
 
     async def enter_sensor_mode(self, config_id: str) -> Description:
         """Have the worker model another mode of the sensor, and each worker after it.
@@ -364,9 +368,11 @@ class Actions:
         )
 
     def _remember(self, matrix_id: str, matrix: NDArray[np.float32]) -> None:
-        self._matrices[matrix_id] = matrix
-        while len(self._matrices) > MATRICES_KEPT:
-            self._matrices.popitem(last=False)
+        with self._guard:  # threads ask, too
+            self._matrices[matrix_id] = matrix
+            self._matrices.move_to_end(matrix_id)
+            while len(self._matrices) > MATRICES_KEPT:
+                self._matrices.popitem(last=False)
 
     def _store_foreign(
         self, record: products.ReconstructorRecord, matrix: NDArray[np.float32]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.errors import CommandError, LinkError, UnknownIdError
+from service.errors import ArchiveError, CommandError, LinkError, UnknownIdError
 from service.model.misregistration import Misregistration
 from service.tracking import events as ev
 from service.tracking.products import MatrixState, ReconstructorRecord
@@ -228,6 +228,24 @@ async def test_old_matrices_come_from_the_archive(actions, archive):
     np.testing.assert_array_equal(actions.matrix("cm-old"), BROUGHT)
     with pytest.raises(UnknownIdError):
         actions.matrix("cm-never")
+
+
+async def test_those_asked_for_last_stay_in_memory_whoever_came_last(actions, archive):
+    """The matrix in use is judged all night; the disk has the others."""
+    for k in range(5):
+        row = record(f"cm-{k}", n_modes=N_CONTROLLED, sha256="")
+        archive.reconstructors.store(row, BROUGHT, None, {})
+    in_use = actions.matrix("cm-0")
+    for k in range(1, 5):
+        actions.matrix(f"cm-{k}")
+        assert actions.matrix("cm-0") is in_use
+    first = actions.matrix("cm-1")
+    assert first is not actions.matrix("cm-2")
+    for path in archive.reconstructors.directory.glob("*.h5"):
+        path.unlink()
+    assert actions.matrix("cm-0") is in_use
+    with pytest.raises(ArchiveError):
+        actions.matrix("cm-3")
 
 
 async def test_the_matrix_in_use_is_offered_to_an_rtc_that_comes_late(actions, bridge):

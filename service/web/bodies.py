@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -17,7 +18,8 @@ BODY_S = 20.0
 """Longest time the body of a request may take to come, seconds."""
 
 PATIENCE_S = 3.0
-"""What a body may take whatever its rate: an order crosses a poor network in that, seconds."""
+"""What a body may take whatever its rate: an order crosses a poor network in that, seconds. Up to a
+third more, by chance: bodies that came together are not refused together, with others waiting."""
 
 SLOWEST_BYTES_S = 1000
 """Bytes a second that must come from then on."""
@@ -62,9 +64,10 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
     if told.isdecimal() and int(told) > MAX_BODY_BYTES:
         raise _too_large(f"{int(told) / 1e6:.1f} MB")
     body, began_s = bytearray(), asyncio.get_running_loop().time()
+    patience_s = PATIENCE_S * random.uniform(1.0, 4.0 / 3.0)
     on_their_way: OnTheirWay = request.app.state.bodies
     try:
-        async with asyncio.timeout_at(began_s + min(PATIENCE_S, BODY_S)) as limit:
+        async with asyncio.timeout_at(began_s + min(patience_s, BODY_S)) as limit:
             if told or "transfer-encoding" in request.headers:
                 on_their_way[request] = limit, body
             while True:
@@ -77,7 +80,7 @@ async def _whole(request: Request, receive: Receive) -> bytes | None:
                     raise _too_large("more")
                 if not message.get("more_body", False):
                     return bytes(body)
-                limit_s = min(PATIENCE_S + len(body) / SLOWEST_BYTES_S, BODY_S)
+                limit_s = min(patience_s + len(body) / SLOWEST_BYTES_S, BODY_S)
                 limit.reschedule(began_s + limit_s)
     except TimeoutError as error:
         took_s = asyncio.get_running_loop().time() - began_s

@@ -41,6 +41,10 @@ longest give way. One that waits costs nothing, one that comes back again and ag
 MAX_DESCRIPTORS = 8192
 """That the service asks of the system, where its limit is less."""
 
+LATE_AT_ONCE = 150
+"""Connections that have stood still for too long and are ended in one tick: those that came
+together would come back together, and have others wait."""
+
 AT_ONCE = 20
 """Connections that are taken, or ended, before others have their turn."""
 
@@ -160,9 +164,9 @@ class Server(uvicorn.Server):
         idle = {still: one for one in self.server_state.connections if (still := _stands(one))}
         self._since_s = {still: self._since_s.get(still, now_s) for still in idle}
         by_age = sorted(idle, key=self._since_s.__getitem__)
-        late = [still for still in by_age if now_s - self._since_s[still] > IDLE_S]
+        late = [still for still in by_age if now_s - self._since_s[still] > IDLE_S][:LATE_AT_ONCE]
         too_many = by_age[: max(len(by_age) - self._max_idle, 0)]
-        for n_ended, still in enumerate({*late, *too_many}):
+        for n_ended, still in enumerate(dict.fromkeys([*too_many, *late])):
             if n_ended % AT_ONCE == 0:
                 await asyncio.sleep(0)
             if _stands(idle[still]) == still:

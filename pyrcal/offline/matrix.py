@@ -32,7 +32,7 @@ from pyrcal.offline.methods import (
 from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
 from pyrcal.offline.origins import origins
-from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
+from pyrcal.offline.pupil_checks import LEAST_EXPLAINED, Few, left_by_light, tried_pupils
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
 from pyrcal.offline.solver import nuisances_of
@@ -291,7 +291,8 @@ def _answer(
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
     few = Few(settled)
-    pupils = tried_pupils(few)
+    # less than a pupil would have to explain is of interest to whoever wants to see all that is not
+    pupils = tried_pupils(few) if explain or residual_fraction >= LEAST_EXPLAINED else ()
     others = rivals(settled, few, pupils)
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     noise = None if usable.noise is None else usable.noise / usable.passes

@@ -51,8 +51,9 @@ def structure(residual: Array, power: Array, noise: Array | None) -> float:
 def noise_sigma(matrix: Array) -> float:
     """Return 1 σ of the noise in each element of a matrix that holds structure, too."""
     few, many = sorted(matrix.shape)
-    values = np.linalg.svd(matrix, compute_uv=False)
-    return float(np.median(values) / np.sqrt(many * _median_square(few / many)))
+    wide = matrix if matrix.shape[0] == few else matrix.T
+    squares = np.linalg.eigvalsh(wide @ wide.T)  # precise enough: the median is no small one
+    return float(np.sqrt(max(np.median(squares), 0.0) / (many * _median_square(few / many))))
 
 
 @cache

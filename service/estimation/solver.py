@@ -76,8 +76,9 @@ class Columns:
         gains = np.sum(matrix * measured, axis=0) / power
         if not self.signed:
             gains = np.maximum(gains, 0.0)
+        counted = derivatives if self.rows.all() else np.compress(self.rows, derivatives, axis=1)
         # laid out row by row: every product of it would else copy it first
-        jacobian = np.compress(self.rows, derivatives, axis=1).astype(np.float64, copy=False)
+        jacobian = counted.astype(np.float64, order="C")
         along = np.einsum("ksm,sm->km", jacobian, matrix) / power
         for k, part in enumerate(along):
             jacobian[k] -= matrix * part

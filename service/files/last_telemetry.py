@@ -21,7 +21,7 @@ import numpy as np
 from service.files.recording import Message, RecordedKind
 
 PACK_BYTES: Final = 1_000_000
-"""Of messages that are packed together: it takes a millisecond."""
+"""Of messages that are packed together: it takes less than a millisecond."""
 
 OVERHEAD_BYTES: Final = 200
 """Of a message in memory, besides what is in it."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from service.errors import ModelError
 from service.model.far_field import PlateSum
@@ -80,6 +81,11 @@ class ModalBasis:
         if isinstance(self.surface, Gaussian):
             return None
         return PlateSum(surface=self.surface, coefficients=self.coefficients)
+
+    @override
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out the sums, 26 MB: whoever gets it makes them by himself."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @property
     def is_local(self) -> bool:

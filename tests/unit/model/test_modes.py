@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -164,3 +166,11 @@ def test_every_mode_but_piston_can_be_asked_for():
     basis = karhunen_loeve_basis(small_instrument(n_modes=104))
     assert basis.variance_m2.shape == (104,)
     assert np.all(np.isfinite(basis.coefficients))
+
+
+def test_a_basis_that_is_sent_leaves_its_sums_behind_and_renders_the_same():
+    basis, points = small_basis(), np.array([[0.3, -1.2], [4.0, 2.0]])
+    before = basis.render(points)
+    sent = pickle.dumps(basis)
+    assert len(sent) < 2 * basis.coefficients.nbytes + basis.mode_to_actuator.nbytes
+    np.testing.assert_array_equal(pickle.loads(sent).render(points), before)

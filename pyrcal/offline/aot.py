@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.importers.registration import Dated
 from service.errors import ConfigurationError, WireError
 from service.files.recording import RecordedKind, Recording
 from service.model.instrument import Instrument, Mirror
@@ -23,7 +24,6 @@ from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.slopes import to_conventions
 from service.tracking.policy import SECOND_NS
-from service.tracking.registration import HistoryEntry
 from service.wire import FrameBatch, Manifest, Status, decode, decode_frames
 
 
@@ -96,7 +96,7 @@ def excerpt(path: Path, first_s: float, seconds: float) -> Excerpt:
 
 
 def write_aot(
-    path: Path, instrument: Instrument, estimates: Iterable[HistoryEntry], taken: Excerpt | None
+    path: Path, instrument: Instrument, estimates: Iterable[Dated], taken: Excerpt | None
 ) -> None:
     """Write telemetry and α over time as AOT FITS.
 
@@ -112,7 +112,7 @@ def write_aot(
     instrument
         Of the telemetry.
     estimates
-        α over time, oldest first; only what entered the estimate is written.
+        α over time, oldest first.
     taken
         Telemetry; None: none.
 
@@ -131,7 +131,7 @@ def write_aot(
         ) from error
     if path.exists():
         raise ConfigurationError(f"{path}: exists already; expected a new file")
-    system = _system(aotpy, instrument, tuple(e for e in estimates if e.entered))
+    system = _system(aotpy, instrument, tuple(estimates))
     if taken is not None:
         _add_telemetry(aotpy, system, instrument, taken)
     try:
@@ -143,7 +143,7 @@ def write_aot(
         raise ConfigurationError(f"{path}: cannot be written: {error}") from error
 
 
-def _system(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, ...]) -> Any:  # noqa: ANN401
+def _system(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) -> Any:  # noqa: ANN401
     telescope = aotpy.MainTelescope(
         uid="telescope",
         enclosing_diameter=instrument.diameter_m,
@@ -182,13 +182,13 @@ def _system(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, .
     )
 
 
-def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[HistoryEntry, ...]) -> Any:  # noqa: ANN401
+def _over_time(aotpy: Any, instrument: Instrument, estimates: tuple[Dated, ...]) -> Any:  # noqa: ANN401
     """Return α over time; None: there is no estimate."""
     if not estimates:
         return None
-    seconds = [entry.t_ns_utc / SECOND_NS for entry in estimates]
-    matrices = [affine(entry.filtered, instrument.subaperture_m) for entry in estimates]
-    time = aotpy.Time(uid="time of registration", timestamps=seconds)
+    seconds = [at.t_ns_utc / SECOND_NS for at in estimates if at.t_ns_utc is not None]
+    matrices = [affine(at.alpha, instrument.subaperture_m) for at in estimates]
+    time = aotpy.Time(uid="time of registration", timestamps=seconds) if seconds else None
     return aotpy.Image("registration", np.stack(matrices, axis=-1), time=time)
 
 

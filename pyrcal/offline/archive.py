@@ -160,6 +160,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
 def _aot(options: argparse.Namespace, settings: Settings) -> int:
     """Write what was measured in a night, or beside a recording, as AOT FITS."""
     from pyrcal.offline.aot import excerpt, write_aot
+    from pyrcal.offline.importers.registration import Dated
     from service.config import load_instrument
 
     if (options.night is None) is (options.recording is None):
@@ -176,7 +177,8 @@ def _aot(options: argparse.Namespace, settings: Settings) -> int:
             if night is None:
                 raise UnknownIdError(f"{options.night}: nothing was measured in this night")
             span = (night.since_ns_utc, night.until_ns_utc)
-        estimates = archive.nights.estimates(*span, MAX_DOWNSAMPLED)
+        entries = archive.nights.estimates(*span, MAX_DOWNSAMPLED)
+    estimates = [Dated(t_ns_utc=e.t_ns_utc, alpha=e.filtered) for e in entries if e.entered]
     write_aot(options.output, instrument, estimates, taken)
     n_frames = 0 if taken is None else sum(batch.header.n for batch in taken.batches)
     n_damaged = 0 if taken is None else taken.n_damaged

@@ -14,6 +14,7 @@ from typing import Concatenate, Final, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.importers.registration import Dated
 from service.config.policy import compute_of, policy_of
 from service.config.settings import Settings
 from service.errors import ModelError, UnknownIdError, WireError
@@ -61,6 +62,9 @@ class Track:
 
     noisy: NoisyMatrix | None = None
     """The interaction matrix that the last random dither holds; None: there was none."""
+
+    stated: tuple[Dated, ...] = ()
+    """α that the file itself says, in its order; only AOT files do."""
 
     n_frames: int = 0
     """Used."""

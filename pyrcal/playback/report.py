@@ -15,7 +15,7 @@ from pyrcal.playback.player import Track
 from pyrcal.terminal import table as aligned
 from service.errors import ConfigurationError
 from service.files.container import put_array
-from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, wrapped
 from service.tracking.policy import SECOND_NS
 from service.tracking.registration import HistoryEntry, Source
 from service.tracking.state import Level
@@ -66,12 +66,28 @@ def table(track: Track) -> str:
         last = track.passive[-1]
         rows.append(("ordinary telemetry alone", *_cells(last.alpha.vector * BOUNDARY_SCALE)))
         rows.append(("1 sigma, its bias included", *_cells(last.sigma * BOUNDARY_SCALE)))
+    rows += _stated(track, None if registration is None else registration.alpha.vector)
     lines = [heading, *aligned(rows)]
     if registration is None:
         lines.append(f"alpha was not found: {_why_not(track)}")
     if track.noisy is not None:
         lines.append(f"noisy matrix: {len(track.noisy.modes)} modes, S/N {track.noisy.snr:.1f}")
     return "\n".join([*lines, *_complaints(track)])
+
+
+def _stated(track: Track, found: Array | None) -> list[Sequence[str]]:
+    """Return the file's own last α, if it says one, and how far from it the track ends."""
+    if not track.stated:
+        return []
+    last = track.stated[-1].alpha.vector
+    rows: list[Sequence[str]] = [
+        (f"the file's own, last of {len(track.stated)}", *_cells(last * BOUNDARY_SCALE))
+    ]
+    if found is not None:
+        apart = found - last
+        apart[2] = wrapped(apart[2])
+        rows.append(("found less the file's own", *_cells(apart * BOUNDARY_SCALE)))
+    return rows
 
 
 def _why_not(track: Track) -> str:
@@ -139,6 +155,14 @@ def document(track: Track, source: Path) -> dict[str, Any]:
                 "text": one.text,
             }
             for one in track.passive
+        ],
+        "stated": [
+            {
+                "t_ns_utc": at.t_ns_utc,
+                "alpha": at.alpha.to_boundary(),
+                "anamorphosis": at.alpha.stretches.tolist(),
+            }
+            for at in track.stated
         ],
         "alarms": [{"name": a.name, "text": a.text} for a in track.state.alarms.active],
         "windows": {

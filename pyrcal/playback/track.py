@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,13 +17,15 @@ import structlog
 from threadpoolctl import threadpool_limits
 
 from pyrcal.offline.figures import check_plots
-from pyrcal.playback.arrays import opened_arrays
+from pyrcal.playback.aot import read_telemetry
+from pyrcal.playback.arrays import Arrays, opened_arrays
 from pyrcal.playback.player import Player, Track
 from pyrcal.playback.report import document, fill, plot, table
 from pyrcal.terminal import show_progress
 from service.archive.store import write_whole
 from service.config import load_instrument, load_settings
 from service.config.settings import Settings
+from service.errors import ConfigurationError, say
 from service.files.recording import FORMAT, Message, Recording
 from service.model.instrument import Instrument
 
@@ -57,8 +60,8 @@ def main(options: argparse.Namespace) -> int:
 def track(path: Path, instrument: Instrument, settings: Settings | None = None) -> Track:
     """Return α over time from recorded telemetry, by the service's own estimators.
 
-    ``path`` is a recording of pyrcal's, or arrays in ``.npz`` or HDF5 (docs/integrate/tracking.md);
-    ``settings`` None: the usual ones.
+    ``path`` is a recording of pyrcal's, arrays in ``.npz`` or HDF5, or an AOT file
+    (docs/integrate/tracking.md); ``settings`` None: the usual ones.
 
     Raises
     ------
@@ -70,6 +73,8 @@ def track(path: Path, instrument: Instrument, settings: Settings | None = None) 
         if _is_recording(path):
             with Recording(path) as recording:
                 return _play(recording.messages(), instrument, settings, recording.system)
+        if _is_fits(path):
+            return _play_aot(path, instrument, settings)
         with opened_arrays(path) as arrays:
             messages = arrays.messages(instrument)
             return _play(messages, instrument, settings, instrument.name)
@@ -81,6 +86,29 @@ def _is_recording(path: Path) -> bool:
             return bool(file.attrs.get("format") == FORMAT)
     except (OSError, RuntimeError):  # read as arrays it is refused with the reason
         return False
+
+
+def _is_fits(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(6) == b"SIMPLE"
+    except OSError:  # read as arrays it is refused with the reason
+        return False
+
+
+def _play_aot(path: Path, instrument: Instrument, settings: Settings) -> Track:
+    """Play an AOT file, and keep what it says of α itself."""
+    aot = read_telemetry(path, instrument)
+    if not aot.arrays:
+        raise ConfigurationError(
+            f"{path}: found no slopes with modal commands, expected some; pyrcal import aot reads "
+            "its matrix and its alpha"
+        )
+    if aot.left_out:
+        say(f"{path}: one loop is played; left out: {', '.join(aot.left_out)}")
+    messages = Arrays(path=path, found=aot.arrays, facts={}).messages(instrument)
+    found = _play(messages, instrument, settings, instrument.name)
+    return replace(found, stated=aot.registrations)
 
 
 def _play(

@@ -1,4 +1,4 @@
-"""From an AOT file: telescope, the first sensor, and the loop that has an interaction matrix.
+"""From an AOT file: telescope, sensor and mirror of the loop with an interaction matrix, and α.
 
 Reading one needs ``aotpy``, the extra ``aot``. AOT has no unit of commands: strokes are unknown.
 """
@@ -14,10 +14,35 @@ import numpy as np
 
 from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
+from pyrcal.offline.importers.registration import Registrations, registrations_of
 from service.errors import ConfigurationError, MatrixError
 
 SENSORS = {"Pyramid": "pyramid", "ShackHartmann": "shack-hartmann"}
 """AOT's classes, and kinds of sensors."""
+
+
+def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
+    """Return aotpy's system of a file.
+
+    Raises
+    ------
+    ConfigurationError
+        If ``aotpy`` is not installed.
+    MatrixError
+        If it is no AOT file.
+    """
+    try:
+        import aotpy
+    except ImportError as error:
+        raise ConfigurationError(
+            f"{path}: AOT files need aotpy: pip install 'pyrcal[aot]'"
+        ) from error
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # aotpy warns of whatever a file leaves empty
+            return aotpy.AOSystem.read_from_file(path)
+    except Exception as error:  # aotpy does not export its own class
+        raise MatrixError(f"{path}: found {error}, expected an AOT file") from error
 
 
 def from_aot(path: Path, reported: Reported) -> Imported:
@@ -30,18 +55,7 @@ def from_aot(path: Path, reported: Reported) -> Imported:
     MatrixError
         If the file cannot be read, or has no loop with an interaction matrix.
     """
-    try:
-        import aotpy
-    except ImportError as error:
-        raise ConfigurationError(
-            f"{path}: AOT files need aotpy: pip install 'pyrcal[aot]'"
-        ) from error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # aotpy warns of whatever a file leaves empty
-            system = aotpy.AOSystem.read_from_file(path)
-    except Exception as error:  # aotpy does not export its own class
-        raise MatrixError(f"{path}: found {error}, expected an AOT file") from error
+    system = read_system(path)
     loops = [loop for loop in system.loops if getattr(loop, "interaction_matrix", None)]
     if len(loops) != 1:
         raise MatrixError(
@@ -55,14 +69,18 @@ def from_aot(path: Path, reported: Reported) -> Imported:
             f"{path}: found a {type(sensor).__name__}, expected {' or '.join(SENSORS)} with its "
             "subaperture_mask"
         )
+    places = np.asarray(sensor.subaperture_mask.data)
+    matrix = _by_rows(loop.interaction_matrix.data, places, str(path))
+    notes: list[str] = []
     arrays = {
-        "matrix": _whole(loop.interaction_matrix.data),
-        "valid": np.asarray(sensor.subaperture_mask.data) >= 0,
-        **_mirror(mirror, loop),
+        "matrix": matrix,
+        "valid": places >= 0,
+        **_mirror(mirror, loop, matrix.shape[1], notes),
     }
     telescope = system.main_telescope
     diameter_m = telescope.enclosing_diameter or reported.diameter_m
-    return from_arrays(
+    told = registrations_between(mirror, sensor, diameter_m / max(places.shape), str(path))
+    imported = from_arrays(
         f"AOT, {path}",
         arrays,
         replace(
@@ -73,21 +91,95 @@ def from_aot(path: Path, reported: Reported) -> Imported:
             or reported.obscuration_ratio,
             wavelength_m=sensor.wavelength or reported.wavelength_m,
         ),
-    )
+    ).noted(*notes)
+    if told is None:
+        return imported
+    return replace(
+        imported,
+        tables={**imported.tables, "mirror": {**imported.tables["mirror"], **told.mirror}},
+        arrays={**imported.arrays, **told.arrays},
+    ).noted(told.text)
 
 
-def _mirror(mirror: Any, loop: Any) -> dict[str, Array]:  # noqa: ANN401 - aotpy's own classes
+def registrations_between(
+    mirror: Any,  # noqa: ANN401 - aotpy's own classes
+    sensor: Any,  # noqa: ANN401
+    subaperture_m: float,
+    where: str,
+) -> Registrations | None:
+    """Return α of a mirror on a sensor over time; None: the file has none.
+
+    Raises
+    ------
+    MatrixError
+        If it cannot be read, or the sensor is moved as well.
+    """
+    if mirror.transformation_matrix is None:
+        return None
+    own = sensor.transformation_matrix
+    if own is not None and not np.allclose(
+        np.moveaxis(np.reshape(own.data, (3, 3, -1)), -1, 0), np.eye(3), rtol=0.0, atol=1e-6
+    ):
+        raise MatrixError(
+            f"{where}: found a transformation_matrix of the sensor, too; expected the mirror's "
+            "alone, from its coordinates to the sensor"
+        )
+    return registrations_of(mirror.transformation_matrix, subaperture_m, where)
+
+
+def _mirror(
+    mirror: Any,  # noqa: ANN401 - aotpy's own classes
+    loop: Any,  # noqa: ANN401
+    n_columns: int,
+    notes: list[str],
+) -> dict[str, Array]:
     found: dict[str, Array] = {}
     if mirror.influence_function is not None:
         found["modes"] = np.asarray(mirror.influence_function.data)
     elif mirror.actuator_coordinates:
         found["positions"] = np.array([[at.x, at.y] for at in mirror.actuator_coordinates])
     if loop.modes_to_commands is not None:
-        found["mode_to_actuator"] = np.asarray(loop.modes_to_commands.data)
+        strokes = np.asarray(loop.modes_to_commands.data)
+        if strokes.ndim == 2 and n_columns == len(strokes) != strokes.shape[1]:
+            notes.append("the matrix is of actuators, as the standard has it: modes are left out")
+        else:
+            found["mode_to_actuator"] = strokes
     return found
 
 
-def _whole(values: Any) -> Array:  # noqa: ANN401 - aotpy has no types
-    """Return AOT's matrix ``(2, n_valid, n_modes)`` or flat with all x first."""
+def _by_rows(values: Any, places: Array, where: str) -> Array:  # noqa: ANN401 - aotpy has no types
+    """Return AOT's matrix flat, all x first, subapertures row by row.
+
+    The standard has ``(n_valid, 2, n)``; ``(2, n_valid, n)`` and flat ones are found, too. Where a
+    subaperture is listed, the mask says.
+    """
+    listed = places_of(places, where)
+    n_valid = len(listed)
     matrix = np.asarray(values)
-    return matrix.reshape(-1, matrix.shape[-1]) if matrix.ndim == 3 else matrix
+    if matrix.ndim == 3 and matrix.shape[:2] == (n_valid, 2):
+        matrix = np.moveaxis(matrix, 1, 0)
+    elif matrix.ndim == 2 and len(matrix) == 2 * n_valid:
+        matrix = matrix.reshape(2, n_valid, -1)
+    if matrix.ndim != 3 or matrix.shape[:2] != (2, n_valid):
+        raise MatrixError(
+            f"{where}: interaction_matrix: found shape {matrix.shape}, expected ({n_valid}, 2, n)"
+        )
+    return matrix[:, listed].reshape(2 * n_valid, -1)
+
+
+def places_of(places: Array, where: str) -> Array:
+    """Return where each valid subaperture is listed, row by row, as AOT's mask says.
+
+    Raises
+    ------
+    MatrixError
+        If they are not each of 0 to ``n_valid - 1`` once.
+    """
+    listed = places[places >= 0].ravel()
+    n_valid = len(listed)
+    if places.ndim != 2 or not np.array_equal(np.sort(listed), np.arange(n_valid)):
+        raise MatrixError(
+            f"{where}: subaperture_mask: expected -1 or the place of each valid subaperture, 0 to "
+            f"{n_valid - 1}, once"
+        )
+    return listed.astype(int)

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.offline.aot import affine
+from pyrcal.offline.aot import affine, excerpt, write_aot
+from pyrcal.offline.importers.registration import Dated, registrations_of
+from pyrcal.playback.aot import read_telemetry
 from service.archive import Archive
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, MatrixError
 from service.files.recording import RecordedKind, Recording, RecordingWriter
 from service.model.misregistration import Misregistration
 from service.model.pupil import rtc_valid_subapertures
@@ -214,3 +216,144 @@ def test_a_recording_of_another_version_is_refused(tmp_path):
         file.attrs.update(format="pyrcal-telemetry", version=9)
     with pytest.raises(ConfigurationError, match="expected"), Recording(tmp_path / "x.h5"):
         pass
+
+
+# --- and back
+
+
+def dated(n=4, **more):
+    rng = np.random.default_rng(3)
+    for k in range(n):
+        x, y, turn, size = rng.uniform([-2, -2, -3.1, 0.9], [2, 2, 3.1, 1.1])
+        stretch = tuple(rng.uniform(-0.03, 0.03, 2)) if k % 2 else None
+        alpha = Misregistration(
+            shift_x_subap=x,
+            shift_y_subap=y,
+            rotation_rad=turn,
+            magnification=size,
+            anamorphosis=stretch,
+        )
+        yield Dated(t_ns_utc=NOON + k * SECOND + 123_456_789, alpha=alpha, **more)
+
+
+@pytest.mark.filterwarnings("ignore:.*contains no data")
+def test_telemetry_and_alpha_come_back_and_go_out_again_the_same(night):
+    aotpy = pytest.importorskip("aotpy")
+    given = tuple(dated())
+    write_aot(night / "a.fits", INSTRUMENT, given, excerpt(night / "night.h5", 0.0, 10.0))
+    found = read_telemetry(night / "a.fits", INSTRUMENT)
+    assert found.left_out == ("cm-2",)
+    arrays = found.arrays
+    np.testing.assert_array_equal(arrays["slopes"], ROWS[:100, :N_SLOPES])
+    np.testing.assert_array_equal(arrays["commands_m"], ROWS[:100, N_SLOPES:])
+    np.testing.assert_array_equal(arrays["reconstructor"], MATRIX)
+    np.testing.assert_array_equal(arrays["seq"], 1000 + np.arange(100))
+    assert (arrays["frame_rate_hz"], arrays["delay_frames"]) == (1000.0, 2.0)
+    assert abs(arrays["t0_ns_utc"] - NOON) < 240
+    for before, after in zip(given, found.registrations, strict=True):
+        assert abs(after.t_ns_utc - before.t_ns_utc) < 240
+        np.testing.assert_allclose(after.alpha.vector, before.alpha.vector, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(after.alpha.stretches, before.alpha.stretches, atol=1e-14)
+    write_aot(night / "b.fits", INSTRUMENT, found.registrations, None)
+    once, twice = (aotpy.AOSystem.read_from_file(night / f"{k}.fits") for k in "ab")
+    once, twice = (one.wavefront_correctors[0].transformation_matrix for one in (once, twice))
+    np.testing.assert_allclose(twice.data, once.data, rtol=0, atol=1e-14)
+    assert twice.time.timestamps == once.time.timestamps
+
+
+def image(data, **more):
+    aotpy = pytest.importorskip("aotpy")
+    return aotpy.Image("registration", np.asarray(data, float), **more)
+
+
+def test_a_mirror_that_is_seen_from_behind_has_its_parity():
+    (given,) = dated(1)
+    matrix = affine(given.alpha, 0.4) @ np.diag([1.0, -1.0, 1.0])
+    found = registrations_of(image(matrix), 0.4, "it")
+    assert found.parity == -1
+    assert found.mirror["parity"] == -1
+    np.testing.assert_allclose(found.over_time[0].alpha.vector, given.alpha.vector, atol=1e-14)
+    assert found.over_time[0].t_ns_utc is None
+    assert "registration_t_ns_utc" not in found.arrays
+
+
+def test_a_shear_is_a_stretch_of_the_turned_image():
+    matrix = np.eye(3)
+    matrix[0, 1] = 0.02
+    (at,) = registrations_of(image(matrix), 0.4, "it").over_time
+    np.testing.assert_allclose(affine(at.alpha, 0.4), matrix, atol=1e-14)
+    assert at.alpha.rotation_rad == pytest.approx(-0.01, abs=1e-6)
+
+
+EYES = np.stack([np.eye(3)] * 4, axis=-1)
+MIRRORED_ONCE = EYES * 1.0
+MIRRORED_ONCE[1, 1, 2] = -1.0
+MOVED = np.eye(3) + np.outer([1.0, 0.0, 0.0], [0.0, 0.0, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("data", "more", "said"),
+    [
+        (EYES, {"unit": "mm"}, "found the unit mm, expected metres"),
+        (np.moveaxis(EYES, -1, 0), {}, r"found shape \(4, 3, 3\), expected \(3, 3, t\)"),
+        (EYES * np.nan, {}, "not finite"),
+        (MOVED.T, {}, r"last row \[0.3, 0.0, 1.0\], expected 0 0 1"),
+        (MIRRORED_ONCE, {}, "expected one parity"),
+        (np.diag([1.0, 0.0, 1.0]), {}, "leaves no image"),
+        (np.diag([1.0, 0.5, 1.0]), {}, "stretched by 0.33, expected at most 0.2"),
+    ],
+)
+def test_matrices_that_no_alpha_is_are_refused_in_one_line(data, more, said):
+    with pytest.raises(MatrixError, match=said) as refused:
+        registrations_of(image(data, **more), 0.4, "it")
+    assert "\n" not in str(refused.value)
+
+
+def test_another_number_of_times_is_refused():
+    aotpy = pytest.importorskip("aotpy")
+    time = aotpy.Time(uid="t", timestamps=[1.0, 2.0])
+    with pytest.raises(MatrixError, match="found 2 times of 4 matrices"):
+        registrations_of(image(EYES, time=time), 0.4, "it")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: setattr(s.wavefront_sensors[0].measurements, "unit", "rad"), "the unit rad"),
+        (lambda s: setattr(s.loops[0].modal_coefficients, "unit", "V"), "the unit V"),
+        (lambda s: setattr(s.loops[0], "framerate", None), "found no framerate"),
+        (lambda s: setattr(s.wavefront_sensors[0], "subaperture_mask", None), "no subaperture"),
+        (lambda s: s.loops[0].modal_coefficients.time.frame_numbers.clear(), "0 frame numbers"),
+    ],
+)
+def test_telemetry_that_is_of_something_else_is_refused(night, monkeypatch, change, said):
+    aotpy = pytest.importorskip("aotpy")
+    write_aot(night / "a.fits", INSTRUMENT, (), excerpt(night / "night.h5", 0.0, 10.0))
+    system = aotpy.AOSystem.read_from_file(night / "a.fits")
+    change(system)
+    monkeypatch.setattr("pyrcal.playback.aot.read_system", lambda _: system)
+    with pytest.raises(MatrixError, match=said):
+        read_telemetry(night / "a.fits", INSTRUMENT)
+
+
+def test_what_others_list_and_scale_otherwise_is_read_the_same(night, monkeypatch):
+    """Subapertures in another order, which the mask says; commands in nanometres."""
+    aotpy = pytest.importorskip("aotpy")
+    write_aot(night / "a.fits", INSTRUMENT, (), excerpt(night / "night.h5", 0.0, 10.0))
+    expected = read_telemetry(night / "a.fits", INSTRUMENT).arrays
+    system = aotpy.AOSystem.read_from_file(night / "a.fits")
+    (sensor,) = system.wavefront_sensors
+    mask = sensor.subaperture_mask.data
+    order = np.random.default_rng(4).permutation(N_SLOPES // 2)  # what was k is listed at order[k]
+    mask = np.where(mask >= 0, order[mask], -1)
+    sensor.subaperture_mask.data = mask
+    back = np.argsort(order)
+    sensor.measurements.data = sensor.measurements.data[..., back]
+    control, commands = system.loops[0].measurements_to_modes, system.loops[0].modal_coefficients
+    control.data = control.data[..., back]
+    commands.data, commands.unit = commands.data.astype(float) * 1e9, "nm"
+    monkeypatch.setattr("pyrcal.playback.aot.read_system", lambda _: system)
+    found = read_telemetry(night / "a.fits", INSTRUMENT).arrays
+    for name in ("slopes", "reconstructor", "seq"):
+        np.testing.assert_array_equal(found[name], expected[name])
+    np.testing.assert_allclose(found["commands_m"], expected["commands_m"], rtol=1e-12)

@@ -265,10 +265,14 @@ def test_a_loop_of_cacao_has_modes_of_actuators_without_a_unit(tmp_path):
         from_cacao(tmp_path, REPORTED)
 
 
-def aot_file(path, **loop):
+def aot_file(path, listed=None, moved=None, sensor_moved=None, **loop):
     aotpy = pytest.importorskip("aotpy")
     places = np.full(VALID.shape, -1, dtype=np.int32)
-    places[VALID] = np.arange(VALID.sum())
+    places[VALID] = np.arange(VALID.sum()) if listed is None else listed
+    moved, sensor_moved = (
+        None if one is None else aotpy.Image(name, one)
+        for name, one in (("moved", moved), ("sensor moved", sensor_moved))
+    )
     sensor = aotpy.Pyramid(
         uid="sensor",
         n_sides=4,
@@ -276,6 +280,7 @@ def aot_file(path, **loop):
         n_valid_subapertures=int(VALID.sum()),
         subaperture_mask=aotpy.Image("mask", places),
         wavelength=750e-9,
+        transformation_matrix=sensor_moved,
     )
     telescope = aotpy.MainTelescope(uid="t", enclosing_diameter=2.0, obstruction_diameter=0.4)
     mirror = aotpy.DeformableMirror(
@@ -283,6 +288,7 @@ def aot_file(path, **loop):
         telescope=telescope,
         n_valid_actuators=5,
         influence_function=aotpy.Image("functions", CUBE),
+        transformation_matrix=moved,
     )
     matrices = {name: aotpy.Image(name, values) for name, values in loop.items()}
     control = aotpy.ControlLoop(
@@ -302,7 +308,9 @@ def aot_file(path, **loop):
         system.write_to_file(path, "fits")
 
 
-@pytest.mark.parametrize("listed", [MATRIX, MATRIX.reshape(2, -1, 5)])
+@pytest.mark.parametrize(
+    "listed", [MATRIX, MATRIX.reshape(2, -1, 5), MATRIX.reshape(2, -1, 5).swapaxes(0, 1)]
+)
 def test_an_aot_file_says_telescope_and_wavelength_itself(listed, tmp_path):
     aot_file(tmp_path / "it.fits", interaction_matrix=listed)
     words = ["import", "aot", str(tmp_path / "it.fits"), "--diameter-m", "99"]
@@ -321,6 +329,56 @@ def test_an_aot_file_without_a_matrix_and_what_is_none_are_refused(tmp_path):
         from_aot(tmp_path / "it.fits", REPORTED)
     with pytest.raises(MatrixError, match="expected an AOT file"):
         from_aot(SPECULA[0], REPORTED)
+
+
+def test_subapertures_of_an_aot_file_are_where_its_mask_says(tmp_path):
+    listed = np.random.default_rng(5).permutation(int(VALID.sum()))
+    matrix = MATRIX.reshape(2, -1, 5)[:, np.argsort(listed)].swapaxes(0, 1)
+    aot_file(tmp_path / "it.fits", listed=listed, interaction_matrix=matrix)
+    imported = from_aot(tmp_path / "it.fits", replace(REPORTED, unit=None))
+    np.testing.assert_array_equal(imported.arrays["interaction_matrix"], MATRIX)
+    aot_file(tmp_path / "two.fits", listed=0 * listed, interaction_matrix=matrix)
+    with pytest.raises(MatrixError, match="expected -1 or the place of each"):
+        from_aot(tmp_path / "two.fits", REPORTED)
+
+
+def test_a_matrix_of_actuators_leaves_modes_of_an_aot_file_out(tmp_path):
+    strokes = np.eye(5)[:, :3]
+    aot_file(tmp_path / "it.fits", interaction_matrix=MATRIX, modes_to_commands=strokes)
+    imported = from_aot(tmp_path / "it.fits", REPORTED)
+    assert "mode_to_actuator" not in imported.arrays
+    assert "modes are left out" in " ".join(imported.notes)
+
+
+def test_alpha_of_an_aot_file_starts_the_fit_and_is_said(tmp_path, capsys):
+    turn, subaperture_m = np.deg2rad([20.0, 30.0]), 2.0 / N
+    matrices = np.zeros((3, 3, 2))
+    for k, angle in enumerate(turn):
+        matrices[:2, :2, k] = 1.01 * np.array(
+            [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        )
+        matrices[:, 2, k] = 0.2 * subaperture_m, -0.1 * subaperture_m, 1.0
+    aot_file(tmp_path / "it.fits", interaction_matrix=MATRIX, moved=matrices)
+    words = ["import", "aot", str(tmp_path / "it.fits"), "--diameter-m", "2"]
+    assert main([*words, "--output", str(tmp_path / "bench")]) == 0
+    said = "the file's own alpha: 2 times, last (+0.20, -0.10 subap, +30.00 deg, 1.0100); a fit"
+    assert said in capsys.readouterr().out
+    instrument = pyrcal.load_instrument(tmp_path / "bench" / "instrument.toml")
+    assert instrument.mirror.nominal_rotation_rad == pytest.approx(turn[1])
+    assert instrument.mirror.parity == 1
+    with pyrcal.offline.recorded.opened(tmp_path / "bench" / "matrix.h5") as file:
+        found = file.find("registration").read()
+    np.testing.assert_allclose(found, [[0.2, -0.1, 20, 1.01], [0.2, -0.1, 30, 1.01]], rtol=1e-12)
+
+
+def test_an_aot_file_that_moves_its_sensor_too_is_refused(tmp_path):
+    eye = np.eye(3)[..., np.newaxis]
+    moved = {"interaction_matrix": MATRIX, "moved": eye}
+    aot_file(tmp_path / "plain.fits", sensor_moved=eye, **moved)
+    assert "registration" in from_aot(tmp_path / "plain.fits", REPORTED).arrays
+    aot_file(tmp_path / "it.fits", sensor_moved=np.diag([1.0, -1.0, 1.0])[..., np.newaxis], **moved)
+    with pytest.raises(MatrixError, match="transformation_matrix of the sensor, too"):
+        from_aot(tmp_path / "it.fits", REPORTED)
 
 
 @given(cut=st.integers(0, 3000), flipped=st.integers(0, 3000))

@@ -215,3 +215,42 @@ def test_other_files_are_refused_in_one_line(tmp_path, capsys, fill):
     assert str(path) in err
     assert "Traceback" not in err
     assert err.count("\n") == 1
+
+
+def test_an_aot_file_is_played_and_its_own_alpha_is_compared(telemetry, tmp_path, capsys):
+    pytest.importorskip("aotpy")
+    from pyrcal.offline.aot import Excerpt, write_aot
+    from pyrcal.offline.importers.registration import Dated
+    from pyrcal.playback.aot import read_telemetry
+    from service.model.misregistration import Misregistration
+    from service.wire import FrameBatch, FrameHeader
+
+    n, instrument = 400, load_instrument(SMALL)
+    slopes, commands_m = (telemetry[name][:n] for name in ("slopes", "commands_m"))
+    header = FrameHeader(
+        session="s",
+        seq0=7,
+        n=n,
+        t0_ns=1_790_000_000_000_000_000,
+        dt_ns=1_000_000,
+        n_slopes=slopes.shape[1],
+        n_modes=commands_m.shape[1],
+        dither=False,
+        cm_id="cm",
+        basis_id="",
+        config_id="",
+    )
+    control = telemetry["reconstructor"].astype(np.float32)
+    rows = np.hstack([slopes, commands_m]).astype(np.float32)
+    taken = Excerpt(batches=[FrameBatch(header=header, rows=rows)], matrices={"cm": control})
+    told = Dated(t_ns_utc=header.t0_ns, alpha=Misregistration.from_boundary(TRUE))
+    path = tmp_path / "night.fits"
+    write_aot(path, instrument, [told], taken)
+    np.testing.assert_array_equal(read_telemetry(path, instrument).arrays["slopes"], slopes)
+    _, found, _ = tracked(capsys, path)
+    assert found["n_frames"] == n
+    assert found["stated"][0]["alpha"] == pytest.approx(TRUE)
+    write_aot(tmp_path / "alpha.fits", instrument, [told], None)
+    status, _, said = tracked(capsys, tmp_path / "alpha.fits")
+    assert status == 2
+    assert "found no slopes with modal commands" in said

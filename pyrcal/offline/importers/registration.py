@@ -1,0 +1,163 @@
+"""α over time from the ``TRANSFORMATION_MATRIX`` of a mirror in an AOT file.
+
+The standard has matrices ``(3, 3, t)`` that act on ``(x, y, 1)`` of the mirror, metres in the
+pupil. Any of them that does not mirror is an α of six numbers: what is sheared is stretched, then
+turned. One that mirrors is the same with ``parity = -1``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.errors import MatrixError
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
+
+LARGEST_STRETCH = 0.2
+"""What an instrument file takes as an anamorphosis."""
+
+NO_STRETCH = 1e-6
+"""Below it is the rounding of the standard's numbers."""
+
+SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dated:
+    """α at a time."""
+
+    t_ns_utc: int | None
+    """None: the file does not say when."""
+
+    alpha: Misregistration
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registrations:
+    """What a file says of a mirror's registration."""
+
+    over_time: tuple[Dated, ...]
+    """In the file's order, at least one."""
+
+    parity: int
+    """-1: the mirror is seen from behind, all the time."""
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return α ``(t, 4)`` in boundary units, stretches ``(t, 2)``, and the times if told."""
+        told = {
+            "registration": np.array([at.alpha.vector for at in self.over_time]) * BOUNDARY_SCALE,
+            "registration_anamorphosis": np.array([at.alpha.stretches for at in self.over_time]),
+        }
+        times = [at.t_ns_utc for at in self.over_time if at.t_ns_utc is not None]
+        if times:
+            told["registration_t_ns_utc"] = np.array(times, np.int64)
+        return told
+
+    @property
+    def mirror(self) -> dict[str, Any]:
+        """Return the keys of ``[mirror]`` that start a fit as the last α is turned."""
+        alpha = self.over_time[-1].alpha
+        return {
+            "nominal_rotation_deg": float(np.rad2deg(alpha.rotation_rad)),
+            "parity": self.parity,
+        }
+
+    @property
+    def text(self) -> str:
+        """Return what was read, one sentence."""
+        last = self.over_time[-1].alpha
+        stretch = (
+            ""
+            if last.anamorphosis is None
+            else ", anamorphosis {:+.4f}, {:+.4f}".format(*last.anamorphosis)
+        )
+        behind = "; it is mirrored (parity = -1)" if self.parity < 0 else ""
+        times = f"{len(self.over_time)} times, last " if len(self.over_time) > 1 else ""
+        return f"the file's own alpha: {times}{last}{stretch}{behind}; a fit starts at its rotation"
+
+
+def registrations_of(image: Any, subaperture_m: float, where: str) -> Registrations:  # noqa: ANN401
+    """Return α over time of aotpy's image of the matrices.
+
+    Parameters
+    ----------
+    image
+        ``aotpy.Image`` with data ``(3, 3, t)`` or ``(3, 3)``, metres, and perhaps a time.
+    subaperture_m
+        Width of a subaperture in the pupil.
+    where
+        What the messages begin with.
+
+    Raises
+    ------
+    MatrixError
+        If it is no such matrix, or none that an α can be: what was found and expected.
+    """
+    where = f"{where}: transformation_matrix"
+    if image.unit not in {None, "", "m"}:
+        raise MatrixError(f"{where}: found the unit {image.unit}, expected metres")
+    found = np.asarray(image.data)
+    if found.ndim == 2:
+        found = found[..., np.newaxis]
+    if found.ndim != 3 or found.shape[:2] != (3, 3) or not found.size:
+        raise MatrixError(f"{where}: found shape {found.shape}, expected (3, 3, t)")
+    each = np.moveaxis(found.astype(np.float64), -1, 0)
+    if not np.isfinite(each).all():
+        raise MatrixError(f"{where}: found a number that is not finite, expected none")
+    if not np.allclose(each[:, 2], [0.0, 0.0, 1.0], rtol=0.0, atol=1e-6):
+        raise MatrixError(
+            f"{where}: found the last row {each[0, 2].tolist()}, expected 0 0 1: transposed, or of "
+            "row vectors?"
+        )
+    signs = np.sign(np.linalg.det(each[:, :2, :2]))
+    if not (np.all(signs == 1.0) or np.all(signs == -1.0)):
+        raise MatrixError(
+            f"{where}: found matrices that mirror and such that do not, or one that leaves no "
+            "image; expected one parity"
+        )
+    times = _times(image.time, len(each), where)
+    parity = int(signs[0])
+    alphas = [_alpha(matrix, parity, subaperture_m, where) for matrix in each]
+    dated = (Dated(t_ns_utc=t, alpha=a) for t, a in zip(times, alphas, strict=True))
+    return Registrations(over_time=tuple(dated), parity=parity)
+
+
+def _alpha(
+    matrix: NDArray[np.float64], parity: int, subaperture_m: float, where: str
+) -> Misregistration:
+    """Return the α of one matrix ``(3, 3)``: a symmetric stretch times a rotation."""
+    linear = matrix[:2, :2] * [1.0, parity]
+    turn = np.arctan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
+    size = np.hypot(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1]) / 2.0
+    stretch = linear @ rotation(-turn) / size
+    along, askew = (stretch[0, 0] - stretch[1, 1]) / 2.0, (stretch[0, 1] + stretch[1, 0]) / 2.0
+    if np.hypot(along, askew) > LARGEST_STRETCH:
+        raise MatrixError(
+            f"{where}: found an image stretched by {np.hypot(along, askew):.2f}, expected at most "
+            f"{LARGEST_STRETCH}"
+        )
+    shift_x, shift_y = matrix[:2, 2] / subaperture_m
+    stretched = max(abs(along), abs(askew)) > NO_STRETCH
+    return Misregistration(
+        shift_x_subap=float(shift_x),
+        shift_y_subap=float(shift_y),
+        rotation_rad=float(turn),
+        magnification=float(size),
+        anamorphosis=(float(along), float(askew)) if stretched else None,
+    )
+
+
+def _times(time: Any, n: int, where: str) -> Sequence[int | None]:  # noqa: ANN401 - aotpy's own
+    """Return UTC nanoseconds; what was written from nanoseconds comes back to the same double."""
+    stamps = [] if time is None else list(time.timestamps)
+    if not stamps:
+        return [None] * n
+    if len(stamps) != n or not np.isfinite(stamps).all():
+        raise MatrixError(f"{where}: found {len(stamps)} times of {n} matrices, expected one each")
+    return [round(Fraction(float(stamp)) * SECOND_NS) for stamp in stamps]

@@ -6,6 +6,7 @@ from collections import deque
 from typing import Final
 
 from service.link.statistics import LinkStatistics
+from service.tracking.alarms import FRAMES_LOST
 
 LOST_S: Final = 5.0
 """Losses are summed over so long."""
@@ -35,8 +36,8 @@ class Losses:
         self._raised = False
         self._slowness = _Slowness()
 
-    def complaint(self, link: LinkStatistics, now_s: float) -> str:
-        """Return what is lost, where it is more than chance; empty: next to nothing.
+    def complaint(self, link: LinkStatistics, now_s: float) -> dict[str, str]:
+        """Return, by alarm, what is lost, where it is more than chance; empty: next to nothing.
 
         ``now_s`` is of a clock that does not leap.
         """
@@ -45,7 +46,7 @@ class Losses:
         while len(counts) > 1 and now_s - counts[1][0] >= LOST_S:
             counts.popleft()
         slow = self._slowness.complaint(counts)
-        return self._lost(*counts[0], link, now_s) or slow
+        return {FRAMES_LOST: self._lost(*counts[0], link, now_s) or slow}
 
     def _lost(
         self, since_s: float, before: LinkStatistics, link: LinkStatistics, now_s: float

@@ -37,7 +37,7 @@ from service.runtime.workers import WorkerLoadMeter, WorkerPool, with_another_wo
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.alarm_rules import changes_value
-from service.tracking.alarms import CLOCK_LEAPT, FRAMES_LOST, Prerequisite
+from service.tracking.alarms import CLOCK_LEAPT, Prerequisite
 from service.tracking.events import Effect, Event
 from service.tracking.operation_records import MeasureState
 from service.tracking.policy import Policy
@@ -348,7 +348,7 @@ class Supervisor:
                 self._post(trouble)
             now_ns = self._clock.now_ns()
             lost = losses.complaint(link, time.monotonic())
-            also = {FRAMES_LOST: lost, CLOCK_LEAPT: self._clock.complaint()}
+            also = {**lost, CLOCK_LEAPT: self._clock.complaint()}
             for event in readiness.detect_link_changes(link, self._engine.state, now_ns, also):
                 self._post(event)
             waiting = self._waiting_for(link)

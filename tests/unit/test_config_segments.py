@@ -13,6 +13,7 @@ from tests.unit.test_config import ABOUT, MIRROR, WFS, refusal, write
 __all__ = ["write"]
 
 
+@pytest.mark.long
 def test_the_packaged_instruments_of_the_elt_are_what_their_sources_say():
     """Of Deo et al. 2021, table 2, 6020 valid subapertures: 3 % more than behind our spider."""
     metis, micado = load_instrument("metis-elt"), load_instrument("micado-elt")

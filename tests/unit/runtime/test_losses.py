@@ -33,7 +33,7 @@ class Counting:
                 frames_nonfinite=self.nonfinite,
                 frames_overwritten=self.overwritten,
             )
-            said = self.losses.complaint(counted, self.now_s)
+            said = self.losses.complaint(counted, self.now_s)["frames-lost"]
         return said
 
 

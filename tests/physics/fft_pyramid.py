@@ -14,6 +14,9 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+Paths = list[tuple[NDArray[np.complex128], NDArray[np.complex128]]]
+"""Of y and of x, ``(n_detector, n)``."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FftPyramid:
@@ -53,16 +56,13 @@ class FftPyramid:
 
         Side 0 is the one at negative detector coordinates. ``shift`` (x, y) moves the images.
         """
-        to_y, weights = self._detector_transform(shift[1])
-        to_x, _ = self._detector_transform(shift[0])
-        n_padded = self.sampling * self.padded_subap
-        focus = scipy.fft.fft(np.eye(len(self.amplitude)), n=n_padded, axis=0)
-        roof = self.roof()[:, None]
-        seen_y, seen_x = to_y @ (roof * focus), to_x @ (roof * focus)
+        return self._images(opd_m, self._paths(shift))
+
+    def _images(self, opd_m: NDArray[np.float64], paths: Paths) -> NDArray[np.float64]:
         field = self.amplitude * np.exp(2j * np.pi * opd_m / self.wavelength_m)
-        intensity = np.zeros((len(to_y), len(to_x)))
-        for tilt in self._modulation():
-            intensity += np.abs(seen_y @ (field * tilt) @ seen_x.T) ** 2
+        intensity = sum(np.abs(on_y @ field @ on_x.T) ** 2 for on_y, on_x in paths)
+        _, weights = np.polynomial.legendre.leggauss(self.n_nodes)
+        weights = weights / 2
         n, nd = self.n_subapertures, self.n_nodes
         nodes = intensity.reshape(2, n, nd, 2, n, nd) / self.n_modulation
         return np.asarray(np.einsum("iyaJxb,a,b->iyJx", nodes, weights, weights))
@@ -74,7 +74,12 @@ class FftPyramid:
         shift: tuple[float, float] = (0.0, 0.0),
     ) -> NDArray[np.float64]:
         """Return ``[all Sx; all Sy]`` of the valid subapertures, over their mean flux."""
-        images = self.images(opd_m, shift)
+        return self._slopes(opd_m, valid, self._paths(shift))
+
+    def _slopes(
+        self, opd_m: NDArray[np.float64], valid: NDArray[np.bool_], paths: Paths
+    ) -> NDArray[np.float64]:
+        images = self._images(opd_m, paths)
         flux = images.sum(axis=(0, 2))[valid].mean()
         across_x = (images[:, :, 0] - images[:, :, 1]).sum(axis=0)
         across_y = (images[0] - images[1]).sum(axis=1)
@@ -91,8 +96,12 @@ class FftPyramid:
 
         The stroke must be small: 1e-8 m is already 0.2-0.6 % non-linear.
         """
+        paths = self._paths(shift)
         columns = [
-            (self.slopes(stroke_m * opd, valid, shift) - self.slopes(-stroke_m * opd, valid, shift))
+            (
+                self._slopes(stroke_m * opd, valid, paths)
+                - self._slopes(-stroke_m * opd, valid, paths)
+            )
             / (2 * stroke_m)
             for opd in opds
         ]
@@ -114,21 +123,25 @@ class FftPyramid:
         tilted = np.exp(1j * np.pi * self.image_separation_subap * np.abs(self._frequencies))
         return tilted.astype(np.complex128)
 
-    def _modulation(self) -> list[NDArray[np.complex128]]:
+    def _paths(self, shift: tuple[float, float]) -> Paths:
+        """Return, for every point of the modulation, what leads a pupil axis to the detector's."""
+        n_padded = self.sampling * self.padded_subap
+        focus = scipy.fft.fft(np.eye(len(self.amplitude)), n=n_padded, axis=0)
+        to_focus = self.roof()[:, None] * focus
+        seen_y = self._detector_transform(shift[1]) @ to_focus
+        seen_x = self._detector_transform(shift[0]) @ to_focus
         angle = 2 * np.pi * (np.arange(self.n_modulation) + 0.5) / self.n_modulation
         k = 2 * np.pi * self.modulation_lambda_over_d / self.n_subapertures
-        u = self.coordinates
-        return [np.exp(1j * k * (u * np.cos(t) + u[:, None] * np.sin(t))) for t in angle]
+        u = 1j * k * self.coordinates
+        return [(seen_y * np.exp(u * np.sin(t)), seen_x * np.exp(u * np.cos(t))) for t in angle]
 
-    def _detector_transform(
-        self, shift: float
-    ) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-        """Inverse Fourier sum at the detector points of one axis, and the weights of its nodes."""
-        nodes, weights = np.polynomial.legendre.leggauss(self.n_nodes)
+    def _detector_transform(self, shift: float) -> NDArray[np.complex128]:
+        """Inverse Fourier sum at the detector points of one axis."""
+        nodes, _ = np.polynomial.legendre.leggauss(self.n_nodes)
         side = np.array([-0.5, 0.5]) * self.image_separation_subap
         centre = np.arange(self.n_subapertures) - (self.n_subapertures - 1) / 2
         x = (side[:, None, None] + centre[:, None] + nodes / 2 - shift).ravel()
         nu = self._frequencies
         start = self.coordinates[0]  # the transform takes the first pupil point for the origin
         transform = np.exp(2j * np.pi * np.outer(x - start, nu)) / len(nu)
-        return transform.astype(np.complex128), weights / 2
+        return transform.astype(np.complex128)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.alternatives import Alternative, moved_words, preference
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import left_over
-from pyrcal.offline.verdict import MOST_STRUCTURE, Refusal
+from pyrcal.offline.verdict import CANNOT_TELL, MOST_STRUCTURE, Refusal
 
 Array = NDArray[np.float64]
 
@@ -132,6 +132,8 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
         return "; ".join(grounds.columns)
     best = next((one for one in fit.alternatives if one.preferred and one.share is not None), None)
     if best is not None and grounds.refusal in {Refusal.ANOTHER_INSTRUMENT, Refusal.NO_CAUSE}:
+        if CANNOT_TELL in fit.verdict:
+            return fit.verdict.rpartition("better: ")[2]
         return (
             f"with {best.words} the misfit is {best.share:.0%} of what it is; correct that and fit "
             "again"

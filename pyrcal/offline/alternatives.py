@@ -108,6 +108,13 @@ def alternatives(
     return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, _share(one))))
 
 
+def off_centre(few: Few, others: tuple[Rival, ...]) -> Alternative | None:
+    """Return a pupil off the middle that the matrix prefers, if a rival moves the pupil as well."""
+    if not any(one.believed and "stop" in one.change.words for one in others):
+        return None
+    return next((one for one in _that_can(_off_centre(few)) if one.preferred), None)
+
+
 def _that_can(rivals: Iterator[Alternative]) -> Iterator[Alternative]:
     """Yield rivals as far as what was measured determines a registration under them."""
     try:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
-from pyrcal.offline.alternatives import alternatives
+from pyrcal.offline.alternatives import alternatives, off_centre
 from pyrcal.offline.columns import displaced_columns, strange_columns
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.gain_causes import gain_causes
@@ -322,6 +322,7 @@ def _answer(
         uncertainty=sure,
         landing=found.landing,
         rivals=others,
+        off_centre=off_centre(few, others),
         optics=optics,
         as_told=without,
         axes=untold,
@@ -356,8 +357,11 @@ def _answer(
         valid=target.valid,
         gain_map=nuisances.gain_map(solution.nuisances, target.valid),
         anamorphosis_sigma=nuisances.stretch_sigma(sure.nuisance_sigma),
-        optics=optics,
-        origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains),
+        # what noise determines is no finding
+        optics=optics if findings.explained else (),
+        origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains)
+        if findings.explained
+        else (),
         paper_table=found.table,
     )
     grounds = Grounds(

@@ -35,7 +35,7 @@ def remarks(
     found: SlopeRecipe,
     about: Instrument,
 ) -> tuple[str, ...]:
-    """Return the notes on a fit, one sentence each.
+    """Return the notes on a fit, one sentence each; none of what noise has made.
 
     Parameters
     ----------
@@ -46,6 +46,8 @@ def remarks(
     about
         The instrument of the file.
     """
+    if not findings.explained:
+        return ()
     return (
         *_order(reported.order, found.order),
         *_mirrored(reported, found),

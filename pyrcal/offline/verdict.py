@@ -15,6 +15,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
 from pyrcal.offline.methods import Landing
 from pyrcal.offline.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
@@ -43,6 +44,11 @@ LARGEST_SIGMA = np.array([0.3, 0.3, np.deg2rad(3.0), 0.06])
 STRANGEST = 3.0
 """Distance of such a logarithm from the file's, over its usual one, that no file is wrong by."""
 
+ALIKE = 2.0
+"""Misfits of two rivals within this factor leave open which is right: to first order each."""
+
+CANNOT_TELL = "the matrix cannot tell which"
+
 _PASSES = 0.12
 """By which gains are off a factor of two, and scatter, that is forgotten in all of them."""
 
@@ -66,6 +72,9 @@ class FitFindings:
     rivals: tuple[Rival, ...]
     """Other instruments, the one that explains the matrix best first."""
 
+    off_centre: Alternative | None
+    """A pupil off the subapertures' middle, where a rival is believed that moves the pupil, too."""
+
     optics: tuple[FoundOptic, ...]
     """What was found of the instrument itself."""
 
@@ -79,6 +88,11 @@ class FitFindings:
     """How often the light is said to have met the mirror."""
 
     stroke_known: bool
+
+    @property
+    def explained(self) -> bool:
+        """Whether the model explains enough for anything that was fitted to be a finding."""
+        return self.residual_fraction <= MAX_RESIDUAL
 
 
 class Refusal(StrEnum):
@@ -127,8 +141,9 @@ def _quality(findings: FitFindings) -> str:
 def _unsettled(findings: FitFindings) -> str:
     if findings.solution.converged:
         return ""
+    noise = "" if findings.explained else "there is too much noise, "
     return (
-        "the steps did not come to rest: the modes (another basis, another order) or the "
+        f"the steps did not come to rest: {noise}the modes (another basis, another order) or the "
         "instrument file are another's, or the start is outside the capture range: start closer "
         "(--start), or leave the start out"
     )
@@ -146,7 +161,7 @@ def _undetermined(findings: FitFindings) -> str:
 
 
 def _unexplained(findings: FitFindings) -> str:
-    if findings.residual_fraction <= MAX_RESIDUAL:
+    if findings.explained:
         return ""
     return (
         f"the model leaves {findings.residual_fraction:.0%} of the signal unexplained, expected at "
@@ -169,10 +184,7 @@ def _another_minimum(findings: FitFindings) -> str:
 def _another_instrument(findings: FitFindings) -> str:
     for rival in findings.rivals:
         if rival.believed:
-            return (
-                f"another instrument explains the matrix better: with {rival.change.words} the "
-                f"misfit is {rival.share:.0%} of what it is now; correct the instrument file"
-            )
+            return f"another instrument explains the matrix better: {_which(findings, rival)}"
     for optic in findings.optics:
         usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
         if abs(optic.change) > STRANGEST * usual:
@@ -181,6 +193,23 @@ def _another_instrument(findings: FitFindings) -> str:
                 "mirror, the sensor or the modes are not those of the instrument file"
             )
     return ""
+
+
+def _which(findings: FitFindings, rival: Rival) -> str:
+    """Return the other instrument, or the two that the matrix cannot tell apart."""
+    of_rival = f"with {rival.change.words} the misfit is {rival.share:.0%} of what it is now"
+    off = findings.off_centre
+    if off is None or off.share is None or off.share > ALIKE * rival.share:
+        return f"{of_rival}; correct the instrument file"
+    if rival.share > ALIKE * off.share:
+        return (
+            f"with {off.words} the misfit is {off.share:.0%} of what it is now; centre the pupil, "
+            "or correct the mask of valid subapertures"
+        )
+    return (
+        f"{of_rival}, with {off.words} {off.share:.0%}: {CANNOT_TELL}; look where the pupil "
+        "lies and correct that"
+    )
 
 
 def _another_basis(findings: FitFindings) -> str:

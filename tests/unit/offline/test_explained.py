@@ -320,6 +320,27 @@ def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():
     assert "is noise; average more" in noisy.recommendation
 
 
+@pytest.mark.parametrize("unknown", [(), ("wfs.modulation_lambda_over_d",)])
+def test_of_pure_noise_nothing_is_called_found(unknown):
+    noise = np.random.default_rng(2).normal(size=modal().shape) * modal().std()
+    found = explained(replace(modal_bench(), unknown=unknown), noise)
+    assert not found.accepted
+    assert "there is too much noise" in found.verdict
+    assert found.optics == found.origins == found.remarks == ()
+    assert not any(one.preferred for one in found.alternatives)
+
+
+@pytest.mark.parametrize("off", [(0.5, 0.0), pytest.param((0.35, -0.35), marks=pytest.mark.long)])
+def test_a_pupil_far_off_the_middle_is_not_called_another_stop(off):
+    """A stop at the mirror would move the pupil by the shift, (0.31, -0.22)."""
+    found = explained(modal_bench(), zonal(TRUTH, off) @ MODES)
+    assert not found.accepted
+    for said in (found.verdict, found.recommendation):
+        assert "off the sensor's middle" in said
+        assert ("the matrix cannot tell which" in said) == (off != (0.5, 0.0))
+        assert ('stop = "mirror"' in said) == (off != (0.5, 0.0))
+
+
 def test_a_fit_that_nobody_asked_to_explain_is_advised_all_the_same():
     found = fit(matrix(noise=0.05), instrument())
     assert found.alternatives == ()

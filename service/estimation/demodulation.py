@@ -29,6 +29,9 @@ MIN_SEGMENT = 16
 FAINTEST_SHAPE = 1e-7
 """Of the strongest: what weaker ones have in a bin is rounding."""
 
+_AT_ONCE = 256
+"""Columns that are added at once: products of all would take twice the memory of their sums."""
+
 _BESIDE_HZ = np.unique(np.abs(SIDE_OFFSETS_HZ))
 _N_SHAPES = 1 + 2 * len(_BESIDE_HZ)
 
@@ -53,21 +56,31 @@ class DemodulationBank:
         cuts = [place, *range(place // length * length + length, end, length), end]
         stretches = [_segment(self, first // length) for first in cuts[:-1]]
         bins = np.hstack([stretch.bins for stretch in stretches])
-        found = np.empty((len(stretches), len(stretches[0].lines), columns.shape[1]), np.float32)
-        for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
-            here = slice(first % length, first % length + stop - first)
-            np.matmul(stretch.lines[:, here], columns[first - place : stop - place], out=part)
-        sums += (bins @ found.reshape(bins.shape[1], -1)).reshape(sums.shape)
+        n_columns = columns.shape[1]
+        for start in range(0, n_columns, _AT_ONCE):
+            some = slice(start, min(start + _AT_ONCE, n_columns))
+            width = some.stop - start
+            found = np.empty((len(stretches), len(stretches[0].lines), width), np.float32)
+            for stretch, (first, stop), part in zip(stretches, pairwise(cuts), found, strict=True):
+                here = slice(first % length, first % length + stop - first)
+                frames = columns[first - place : stop - place, some]
+                np.matmul(stretch.lines[:, here], frames, out=part)
+            sums[:, :, some] += (bins @ found.reshape(bins.shape[1], -1)).reshape(
+                len(sums), -1, width
+            )
 
     def at_bins(self, sums: Array) -> Array:
         """Return ``(n_lines, 1 + n_side, n_columns)`` sums of ``h_k x_k exp(-i w k)``."""
-        real, imaginary = np.split(sums, 2, axis=1)
-        shapes = (real + 1j * imaginary).astype(np.complex64)
-        cosines, sines = np.split(shapes[1:], 2)
+        n_lines, n_columns = sums.shape[1] // 2, sums.shape[2]
         which = np.searchsorted(_BESIDE_HZ, np.abs(SIDE_OFFSETS_HZ))
-        turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None, None]
-        sides = cosines[which] - turning * sines[which]
-        return np.asarray(np.concatenate([shapes[:1], sides]).transpose(1, 0, 2))
+        turning = (1j * np.sign(SIDE_OFFSETS_HZ)).astype(np.complex64)[:, None]
+        found = np.empty((n_lines, 1 + len(which), n_columns), np.complex64)
+        for line, bins in enumerate(found):
+            shapes = sums[:, line] + np.complex64(1j) * sums[:, n_lines + line]
+            cosines, sines = np.split(shapes[1:], 2)
+            bins[0] = shapes[0]
+            bins[1:] = cosines[which] - turning * sines[which]
+        return found
 
     def at_lines(self, columns: Array, place: int) -> Array:
         """Return ``(2 * n_lines, n_columns)`` sums at the lines: real parts, imaginary ones."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,26 +198,28 @@ def compared(
     slow = len(parts) >= SLOW_PARTS
     whole = _residual(before, parts, modes)
     lost = before.level is not None and before.level.lost(_residuals(parts))
-    worse = (
-        rings
-        or lost
-        or (len(parts) >= MIN_PARTS and whole is not None and whole[0] > whole[1])
-        or common > np.log(COMMON_WORSE)
-        or (slow and slopes > np.log(SLOPES_WORSE))
-        or (slow and ring is not None and ring > np.log(RING_WORSE))
-    )
     rms = [float(np.exp(0.5 * x)) for x in (single[worst], limit, common, slopes)]
     ring_rms = None if ring is None else float(np.exp(0.5 * ring))
-    text = (
-        f"mode {moving[worst]} moves {rms[0]:.2f} times as much as with {before.id}, against all "
-        f"modes ({rms[1]:.2f} is worse), the median mode {rms[2]:.2f} "
-        f"({np.sqrt(COMMON_WORSE):.1f}), all slopes {rms[3]:.2f} ({np.sqrt(SLOPES_WORSE):.1f})"
-    )
     whole_rms = (None, None) if whole is None else tuple(float(np.sqrt(x)) for x in whole)
+    grounds = [
+        _Ground(
+            bool(rings),
+            f"mode {moving[worst]} moves {rms[0]:.2f} times as much, against all modes,",
+            rms[0] / rms[1],
+            rms[1],
+        ),
+        _ground("the median mode moves {:.2f} times as much", rms[2], COMMON_WORSE),
+        _ground("all slopes are {:.2f} times as large", rms[3], SLOPES_WORSE, tells=slow),
+    ]
     if whole is not None:
-        text += f", the residual {whole_rms[0]:.2f}, seeing taken out ({whole_rms[1]:.2f})"
+        words = "the residual, seeing taken out, is {:.2f} times as large"
+        tells = len(parts) >= MIN_PARTS
+        grounds.append(_ground(words, float(np.sqrt(whole[0])), whole[1], tells=tells))
     if ring_rms is not None:
-        text += f", the outer ring {ring_rms:.2f} ({np.sqrt(RING_WORSE):.1f})"
+        words = "the outer ring moves {:.2f} times as much"
+        grounds.append(_ground(words, ring_rms, RING_WORSE, tells=slow))
+    worse = lost or any(ground.worse for ground in grounds)
+    text = _in_words(grounds, before.id, lost=lost)
     return ProbationFinding(
         verdict=Verdict.WORSE if worse else Verdict.AS_GOOD,
         before=before.id,
@@ -232,6 +235,36 @@ def compared(
         residual_limit=whole_rms[1],
         ring_ratio=ring_rms,
     )
+
+
+class _Ground(NamedTuple):
+    """One number that a verdict rests on; all of them are kept in the finding."""
+
+    worse: bool
+    words: str
+    beyond: float
+    """Over its limit."""
+
+    limit: float
+    """RMS."""
+
+
+def _ground(words: str, rms: float, power_limit: float, *, tells: bool = True) -> _Ground:
+    """Return an RMS against its limit, a power."""
+    limit = float(np.sqrt(power_limit))
+    return _Ground(tells and rms > limit, words.format(rms), rms / limit, limit)
+
+
+def _in_words(grounds: list[_Ground], before: str, *, lost: bool) -> str:
+    """Return the one number that an operator needs: the farthest beyond its limit, or nearest."""
+    worse = [ground for ground in grounds if ground.worse]
+    one = max(worse or grounds, key=lambda ground: ground.beyond)
+    text = f"{one.words} as with {before} ({one.limit:.2f} is too much)"
+    if lost:
+        return f"the loop is lost: {text}" if worse else "the loop is lost: it corrects nothing"
+    if worse:
+        return text
+    return f"as good: at most, {text}" if one.beyond <= 1.0 else f"as good: {text}, did not last"
 
 
 def _lasts(before: Before, parts: tuple[Part, ...], mode: int, common: float) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy
@@ -79,6 +81,11 @@ def test_a_few_modes_at_the_edge_of_stability_are_found(turns):
     assert 40 <= found.mode < 44
     assert found.after_s < 2.0
     assert found.common_ratio == pytest.approx(1.0, abs=0.1)
+    assert re.fullmatch(
+        rf"mode {found.mode} moves [\d.]+ times as much, against all modes, as with a "
+        rf"\({found.limit:.2f} is too much\)",
+        found.text,
+    )
 
 
 def test_all_modes_running_away_together_are_found_at_once():
@@ -87,6 +94,7 @@ def test_all_modes_running_away_together_are_found_at_once():
     found = judged([("a", residual(rng, BEFORE_S)), ("b", residual(rng, 1.0) * grown)])
     assert found.verdict is Verdict.WORSE
     assert found.after_s <= 0.4
+    assert len(found.text) < 110
 
 
 def test_a_matrix_after_a_bad_one_is_not_blamed_for_what_has_become_calm():
@@ -99,6 +107,8 @@ def test_the_verdict_comes_within_three_seconds_and_no_sooner_if_all_is_well():
     rng = np.random.default_rng(5)
     found = judged([("a", residual(rng, BEFORE_S)), ("b", residual(rng, AFTER_S))])
     assert WITHIN_S - 0.15 < found.after_s <= WITHIN_S
+    assert found.text.startswith("as good: at most, ")
+    assert len(found.text) < 110
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -153,4 +163,6 @@ def test_a_burst_in_one_mode_right_after_the_swap_is_turbulence():
     rng = np.random.default_rng(8)
     after = residual(rng, AFTER_S)
     after[30:130, 35] *= 3.0
-    assert judged([("a", residual(rng, BEFORE_S)), ("b", after)]).verdict is Verdict.AS_GOOD
+    found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
+    assert found.verdict is Verdict.AS_GOOD
+    assert found.text.endswith("did not last") == (found.mode_ratio > found.limit)

@@ -20,6 +20,9 @@ from service.errors import ConfigurationError, MatrixError
 SENSORS = {"Pyramid": "pyramid", "ShackHartmann": "shack-hartmann"}
 """AOT's classes, and kinds of sensors."""
 
+_HEADER = 20 * 2880
+"""Bytes in which the version must stand."""
+
 
 def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
     """Return aotpy's system of a file.
@@ -37,12 +40,26 @@ def read_system(path: Path) -> Any:  # noqa: ANN401 - aotpy has no types
         raise ConfigurationError(
             f"{path}: AOT files need aotpy: pip install 'pyrcal[aot]'"
         ) from error
+    _check(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # aotpy warns of whatever a file leaves empty
             return aotpy.AOSystem.read_from_file(path)
     except Exception as error:  # aotpy does not export its own class
         raise MatrixError(f"{path}: found {error}, expected an AOT file") from error
+
+
+def _check(path: Path) -> None:
+    """Refuse what is no AOT file in our own words: aotpy's name options that nobody has here."""
+    try:
+        with path.open("rb") as file:
+            begins = file.read(_HEADER)
+    except OSError as error:
+        raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not begins.startswith(b"SIMPLE"):
+        raise MatrixError(f"{path}: found no FITS, expected an AOT file")
+    if b"AOT-VERS" not in begins:
+        raise MatrixError(f"{path}: found FITS without AOT-VERS, expected an AOT file")
 
 
 def from_aot(path: Path, reported: Reported) -> Imported:

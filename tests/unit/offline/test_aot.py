@@ -357,3 +357,22 @@ def test_what_others_list_and_scale_otherwise_is_read_the_same(night, monkeypatc
     for name in ("slopes", "reconstructor", "seq"):
         np.testing.assert_array_equal(found[name], expected[name])
     np.testing.assert_allclose(found["commands_m"], expected["commands_m"], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "it.fits: cannot be read: No such file or directory"),
+        (b"hello", "it.fits: found no FITS, expected an AOT file"),
+        (
+            b"SIMPLE  =                    T",
+            "it.fits: found FITS without AOT-VERS, expected an AOT",
+        ),
+    ],
+)
+def test_what_is_no_aot_file_is_said_in_a_few_words(tmp_path, content, said):
+    pytest.importorskip("aotpy")
+    if content is not None:
+        (tmp_path / "it.fits").write_bytes(content)
+    with pytest.raises(MatrixError, match=said):
+        read_telemetry(tmp_path / "it.fits", INSTRUMENT)

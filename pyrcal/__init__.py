@@ -11,7 +11,6 @@ from service.errors import PyrcalError
 
 if TYPE_CHECKING:
     from pyrcal.client.rest import Service
-    from pyrcal.offline.bundle import Bundle, read_bundle, write_bundle
     from pyrcal.offline.design import dither_sigma, interaction_matrix
     from pyrcal.offline.fit_file import fit_file
     from pyrcal.offline.importers.oopao import from_oopao, to_oopao
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from pyrcal.playback.track import track
     from service.config.instrument import load_instrument
     from service.control.reconstructor import Recipe, reconstruct
+    from service.files.bundle import Bundle, read_bundle, write_bundle
     from service.model.arrays import arrays_of
     from service.model.interaction import RtcInteractionModel
     from service.model.misregistration import Misregistration
@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Bundle": "pyrcal.offline.bundle",
+    "Bundle": "service.files.bundle",
     "FitOptions": "pyrcal.offline.matrix",
     "Misregistration": "service.model.misregistration",
     "Recipe": "service.control.reconstructor",
@@ -66,12 +66,12 @@ _HOMES = {
     "interaction_matrix": "pyrcal.offline.design",
     "load_instrument": "service.config.instrument",
     "modal_basis": "service.model.modes",
-    "read_bundle": "pyrcal.offline.bundle",
+    "read_bundle": "service.files.bundle",
     "read_fit": "pyrcal.offline.report",
     "reconstruct": "service.control.reconstructor",
     "to_oopao": "pyrcal.offline.importers.oopao",
     "track": "pyrcal.playback.track",
-    "write_bundle": "pyrcal.offline.bundle",
+    "write_bundle": "service.files.bundle",
 }
 
 

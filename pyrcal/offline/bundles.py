@@ -12,11 +12,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
 from service.archive import Archive
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.config import Settings, load_instrument, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
+from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import ModalBasis, modal_basis

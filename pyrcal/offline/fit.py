@@ -16,9 +16,9 @@ from pyrcal.offline.light_rotation import Arms
 from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.report import document, fill_fit
 from pyrcal.terminal import show_progress
-from service.archive.store import write_whole
 from service.config import load_instrument
 from service.errors import ConfigurationError, say
+from service.files.durable import write_whole
 from service.model.instrument import Instrument
 from service.model.kinds import Method
 

@@ -23,9 +23,9 @@ from pyrcal.offline.system_file import load_system
 from pyrcal.offline.system_fit import SystemFit, fit_system
 from pyrcal.offline.system_report import SystemReport, document, fill_system, table
 from pyrcal.terminal import show_progress
-from service.archive.store import write_whole
 from service.errors import MatrixError, PyrcalError
 from service.files.container import DATASET, opened
+from service.files.durable import write_whole
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 

@@ -26,12 +26,12 @@ from pyrcal.offline.report import (
     read_fit,
 )
 from pyrcal.terminal import show_progress
-from service.archive.store import write_whole
 from service.config import load_instrument
 from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
+from service.files.durable import write_whole
 from service.model.arrays import arrays_of
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel

@@ -22,10 +22,10 @@ from pyrcal.playback.arrays import Arrays, opened_arrays
 from pyrcal.playback.player import Player, Track
 from pyrcal.playback.report import document, fill, plot, table
 from pyrcal.terminal import show_progress
-from service.archive.store import write_whole
 from service.config import load_instrument, load_settings
 from service.config.settings import Settings
 from service.errors import ConfigurationError, say
+from service.files.durable import write_whole
 from service.files.recording import FORMAT, Message, Recording
 from service.model.instrument import Instrument
 

@@ -16,7 +16,7 @@ from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
-from service.files.durable import flush
+from service.files.durable import write_whole
 from service.wire import checked_id, checksum
 
 Provenance = str | int | float | bool | NDArray[Any]
@@ -292,29 +292,6 @@ class Store(Folder, Generic[Record]):
             except ArchiveError as error:
                 wrong[name] = str(error)
         return wrong
-
-
-def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
-    """Write a file that is complete or absent, and read-only.
-
-    It is written under another name, flushed to the disk, then given its own name.
-
-    Raises
-    ------
-    StorageError
-        If the disk refuses.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        with h5py.File(part, "w") as file:
-            fill(file)
-        part.chmod(0o444)
-        flush(part)
-        part.rename(path)
-        flush(path.parent)
-    except (OSError, RuntimeError) as error:
-        part.unlink(missing_ok=True)
-        raise StorageError(f"{path}: cannot be written: {error}") from error
 
 
 @contextlib.contextmanager

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from service.archive.products import _write_beside
-from service.archive.store import write_whole
 from service.errors import StorageError
-from service.files.durable import replace_file
+from service.files.durable import replace_file, write_whole
 from service.web.keys import KeyFile, KeyScope
 
 

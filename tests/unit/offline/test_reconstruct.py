@@ -9,9 +9,9 @@ from pyrcal.arguments import command_line, with_negative_numbers
 from pyrcal.offline.arguments import check_files
 from pyrcal.offline.reconstruct import SAMPLING, main
 from pyrcal.offline.report import document, fill_fit
-from service.archive.store import write_whole
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
+from service.files.durable import write_whole
 from service.model.instrument import instrument_sha256
 from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder

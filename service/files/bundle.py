@@ -21,10 +21,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.archive.store import write_whole
 from service.errors import ConfigurationError, MatrixError, StorageError
 from service.files.container import opened
-from service.files.durable import flush
+from service.files.durable import flush, write_whole
 
 Array = NDArray[Any]
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.offline.bundle import DESCRIBED, Bundle, read_bundle, write_bundle
 from service.archive import Archive
 from service.errors import ConfigurationError, MatrixError
+from service.files.bundle import DESCRIBED, Bundle, read_bundle, write_bundle
 from service.model.misregistration import Misregistration
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.wire import checksum

@@ -17,6 +17,7 @@ import zenoh.ext
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from cacao_bridge.bundles import apply, roll_back
 from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
@@ -56,6 +57,17 @@ def arguments_parser() -> argparse.ArgumentParser:
         metavar="ID",
         help="let the matrix that waits be written into cacao's streams, and end",
     )
+    parser.add_argument(
+        "--bundle",
+        type=Path,
+        metavar="FILE",
+        help="have a bundle brought into cacao, all of it or nothing, and end",
+    )
+    parser.add_argument(
+        "--rollback",
+        action="store_true",
+        help="have what was in use before brought back, all of it, and end",
+    )
     parser.add_argument("--seconds", type=float, help="end after so long")
     return parser
 
@@ -73,6 +85,10 @@ def _run(options: argparse.Namespace, stopped: threading.Event) -> int:
     if options.apply is not None:
         applied = consent(settings, options.apply)
         print_lines([f"{applied}: the bridge writes it; restart cacao's loop"])
+        return 0
+    if options.bundle is not None or options.rollback:
+        ordered = roll_back(settings) if options.rollback else apply(settings, options.bundle)
+        print_lines([f"{ordered}: the bridge writes it; restart cacao's loop"])
         return 0
     bridge = Bridge(settings)
     if options.seconds is not None:

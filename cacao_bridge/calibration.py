@@ -2,11 +2,14 @@
 
 cacao copies its modes when the process that multiplies them starts, and looks at the streams no
 more. So a matrix is in use when that process is another one than it was when the streams were
-written, and not before. Which it is lies in a folder, and outlives this program.
+written, and not before. Which it is lies in a folder, and outlives this program. What acts at once
+and belongs to it (:mod:`cacao_bridge.parts`) follows then; a program that ends in between does the
+rest when it runs again.
 """
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any, Final
@@ -16,9 +19,11 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from cacao_bridge.parts import Parts
 from cacao_bridge.settings import Settings, load_index, load_modes
 from cacao_bridge.streams import Stream, StreamError, create, path_of
 from service.errors import ConfigurationError
+from service.files.durable import replace_file
 from service.wire import Manifest, checksum, decode, encode
 from sim_rtc.computer.telemetry import Identity, Reconstructor
 
@@ -27,6 +32,9 @@ _log = structlog.get_logger("cacao")
 
 _STATE: Final = "state.json"
 _CONSENT: Final = "apply"
+_ORDER: Final = "order"
+"""Which matrix of the folder an operator wants, with all that is kept with it."""
+
 _KEYWORD: Final = "PYRCAL"
 
 
@@ -39,6 +47,7 @@ class Calibration:
         self._unit = np.float32(settings.loop.metre_per_unit)
         self.index, self.dm_modes = load_index(settings), load_modes(settings)
         self._folder = Path(settings.calibration.folder)
+        self._parts = Parts(settings, self.index)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._known: dict[str, Any] = json.loads((self._folder / _STATE).read_text("utf-8"))
@@ -59,8 +68,8 @@ class Calibration:
         name = matrix.manifest.id
         if self.waiting not in {None, name}:
             _log.warning("matrix.superseded", id=self.waiting, by=name)
-        self._keep(matrix)
-        self._know(waiting=name, written=False)
+        keep(self._folder, matrix)
+        self._know(waiting=name, written=False, ordered=None)
         if self._settings.calibration.interlock == "operator":
             _log.warning("matrix.waits", id=name, text=f"pyrcal cacao --config FILE --apply {name}")
 
@@ -79,24 +88,59 @@ class Calibration:
         StreamError
             If the streams of cacao's modes cannot be read or written.
         """
+        self._obey()
         restarted = process != self._known["process"]
         if restarted or self.in_use is None:
             before = self._known["in_use"]
             self.in_use = self._found(restarted=restarted)
             name = self.in_use.manifest.id
-            done = name == self.waiting
-            self._know(process=process, in_use=name, **({"waiting": None} if done else {}))
+            self._take_up(name, before, process)
             if name != before:
-                _log.warning("matrix.taken-up", id=name, before=before, process=process)
+                self._set_parts()
                 return name
+        self._set_parts()
         if self.waiting is not None and not self._known["written"] and self._may():
             self._write(self._kept(self.waiting), shape)
             self._know(written=True)
             _log.warning("matrix.written", id=self.waiting, text="restart cacao's loop to use it")
         return None
 
+    def _take_up(self, name: str, before: str | None, process: int) -> None:
+        """Know that a matrix is in use; what the one before ran with is kept first."""
+        news: dict[str, Any] = {"waiting": None} if name == self.waiting else {}
+        if name != before and before is not None:
+            _log.warning("matrix.taken-up", id=name, before=before, process=process)
+            ordered = self._known.get("ordered") == name
+            if ordered:
+                self._parts.keep_now(before)
+            news |= {"before": before, "owed": name if ordered else None, "ordered": None}
+        self._know(process=process, in_use=name, **news)
+
+    def _set_parts(self) -> None:
+        """Set what belongs to the matrix in use, if that is still to be done."""
+        owed = self._known.get("owed")
+        if owed is not None:
+            self._parts.set(owed)
+            self._know(owed=None)
+            _log.warning("parts.set", id=owed)
+
+    def _obey(self) -> None:
+        """Let the matrix that an operator wants wait, its consent given."""
+        path = self._folder / _ORDER
+        if not path.exists():
+            return
+        name = path.read_text("utf-8").strip()
+        if name == self._known["in_use"]:
+            _log.warning("matrix.in-use-already", id=name)
+        else:
+            self._kept(name)
+            self._know(waiting=name, written=False, ordered=name)
+        path.unlink()
+
     def _may(self) -> bool:
         if self._settings.calibration.interlock == "restart":
+            return True
+        if self._known.get("ordered") == self.waiting:
             return True
         consent = self._folder / _CONSENT
         if not consent.exists():
@@ -129,7 +173,7 @@ class Calibration:
         matrix = np.ascontiguousarray(cube[:, self.index] * self._unit)
         name = f"own-{checksum(matrix)[:12]}"
         own = Reconstructor.own(name, matrix, self._identity, created_ns=0)
-        self._keep(own)
+        keep(self._folder, own)
         return own
 
     def _slices(self, of: Reconstructor, n_values: int) -> Array32:
@@ -149,13 +193,6 @@ class Calibration:
     def _path(self, name: str) -> Path:
         return path_of(name, self._settings.streams.directory)
 
-    def _keep(self, matrix: Reconstructor) -> None:
-        """Write the numbers, and their sources beside them."""
-        data = encode(matrix.manifest)
-        name = self._folder / matrix.manifest.id
-        np.save(f"{name}.npy", matrix.matrix, allow_pickle=False)
-        Path(f"{name}.json").write_text(json.dumps(msgpack.unpackb(data), indent=1), "utf-8")
-
     def _kept(self, name: str) -> Reconstructor:
         try:
             manifest = json.loads((self._folder / f"{name}.json").read_text("utf-8"))
@@ -166,9 +203,36 @@ class Calibration:
 
     def _know(self, **what: Any) -> None:  # noqa: ANN401  as JSON has them
         self._known |= what
-        fresh = self._folder / f"{_STATE}.new"
-        fresh.write_text(json.dumps(self._known), "utf-8")
-        fresh.replace(self._folder / _STATE)
+        replace_file(self._folder / _STATE, json.dumps(self._known).encode())
+
+
+def keep(folder: Path, matrix: Reconstructor) -> None:
+    """Write the numbers, and their sources beside them."""
+    numbers, name = io.BytesIO(), matrix.manifest.id
+    np.save(numbers, matrix.matrix, allow_pickle=False)
+    replace_file(folder / f"{name}.npy", numbers.getvalue())
+    told = json.dumps(msgpack.unpackb(encode(matrix.manifest)), indent=1)
+    replace_file(folder / f"{name}.json", told.encode())
+
+
+def order(folder: Path, name: str) -> None:
+    """Have the bridge, now or when it runs, bring a matrix of the folder into cacao's streams."""
+    replace_file(folder / _ORDER, name.encode())
+
+
+def known(folder: Path) -> dict[str, Any]:
+    """Return what the bridge knows of its matrices.
+
+    Raises
+    ------
+    ConfigurationError
+        If it has not run on this folder.
+    """
+    try:
+        found: dict[str, Any] = json.loads((folder / _STATE).read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"calibration.folder: {folder}: {error}") from error
+    return found
 
 
 def consent(settings: Settings, name: str) -> str:
@@ -180,10 +244,7 @@ def consent(settings: Settings, name: str) -> str:
         If none waits, or another.
     """
     folder = Path(settings.calibration.folder)
-    try:
-        waiting = json.loads((folder / _STATE).read_text("utf-8"))["waiting"]
-    except (OSError, ValueError, KeyError) as error:
-        raise ConfigurationError(f"calibration.folder: {folder}: {error}") from error
+    waiting = known(folder).get("waiting")
     if waiting is None or name not in {"waiting", waiting}:
         raise ConfigurationError(f"--apply: found {name}, expected {waiting or 'none: none waits'}")
     (folder / _CONSENT).write_text(waiting, "utf-8")

@@ -63,6 +63,9 @@ class StreamsTable(Table):
     gains: Optional = "aol1_mgain"
     """Gain of each mode; empty: ``[loop] gain``."""
 
+    reference: Optional = ""
+    """What is subtracted from the slopes, like ``aol1_wfsrefc``; empty: it is nobody's here."""
+
     factors: Optional = "aol1_mmult"
     """What each mode's command is multiplied by in every frame; empty: ``[loop] leak``."""
 
@@ -93,6 +96,8 @@ class LoopTable(Table):
     """How the modal filter integrates: that of today's cacao, or the one of before."""
 
     gain: Annotated[float, Field(ge=0.0)] = 0.0
+    """Of every mode where there is no stream of gains; and what a bundle's factors multiply."""
+
     leak: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
     max_dither_m: Annotated[float, Field(ge=0.0)] = 50e-9
     """Most that is played on one mode, metres RMS."""

@@ -132,6 +132,74 @@ def read_bundle(path: Path) -> Bundle:
     return bundle
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Place:
+    """A loop that a bundle is to be applied to: what it runs with, and what it has a place for."""
+
+    system: str
+    """Name of the instrument."""
+
+    config_id: str
+    n_slopes: int
+    modes: Array
+    """``(n_modes, n_actuators)`` strokes of the loop's basis, in any unit."""
+
+    takes: frozenset[str] = frozenset()
+    """Of ``gain_factor`` and ``reference_slopes`` those that can be set."""
+
+
+def why_not(bundle: Bundle, place: Place) -> str:
+    """Return why a loop cannot take all of a bundle, what was found and expected; empty: it can.
+
+    Half of a calibration is another loop: what has no place is a reason, unless it changes nothing.
+    """
+    n_modes, n_slopes = bundle.arrays[RECONSTRUCTOR].shape
+    told = bundle.facts.get("instrument")
+    config_id = (bundle.facts.get("record") or {}).get("config_id")
+    if told not in {None, place.system}:
+        return f"found a bundle of {told}, expected one of {place.system}"
+    if config_id not in {None, place.config_id}:
+        return f"found a bundle of configuration {config_id}, expected {place.config_id}"
+    if n_slopes != place.n_slopes or n_modes > len(place.modes):
+        found = f"a reconstructor of {n_modes} modes, {n_slopes} slopes"
+        return f"found {found}, expected at most {len(place.modes)}, and {place.n_slopes}"
+    factors = bundle.arrays.get("gain_factor", np.ones(n_modes))
+    if len(factors) < n_modes or factors.min() < 0.0:
+        found = f"{len(factors)} gain factors, the least {factors.min():.3g}"
+        return f"found {found}, expected {n_modes}, none below 0"
+    if not np.all(factors == 1.0) and "gain_factor" not in place.takes:
+        return "found gain factors of the modes, expected none: this loop has no place for them"
+    reference = bundle.arrays.get("reference_slopes")
+    if reference is not None and "reference_slopes" not in place.takes:
+        return "found reference slopes, expected none: this loop has no place for them"
+    if reference is not None and reference.shape != (n_slopes,):
+        return f"found {len(reference)} reference slopes, expected {n_slopes}"
+    return _other_basis(bundle.arrays.get("mode_to_actuator"), place.modes[:n_modes])
+
+
+SAME_MODE = 0.999
+"""Least cosine between the strokes of a mode and of the same mode elsewhere."""
+
+
+def _other_basis(mode_to_actuator: Array | None, modes: Array) -> str:
+    """Return which mode is another one; a basis may be in another unit, not of other signs."""
+    if mode_to_actuator is None:
+        return ""
+    theirs = mode_to_actuator.T[: len(modes)].astype(np.float64)
+    if theirs.shape != modes.shape:
+        found = "modes of {1} actuators".format(*theirs.shape)
+        return f"found {len(theirs)} {found}, expected {len(modes)} of {modes.shape[1]}"
+    length = np.linalg.norm(theirs, axis=1) * np.linalg.norm(modes, axis=1)
+    along = np.einsum("ma,ma->m", theirs, modes) / np.where(length > 0.0, length, np.inf)
+    k = int(np.argmin(along))
+    if along[k] < SAME_MODE:
+        return (
+            f"found another basis: mode {k} has a cosine of {along[k]:.3f} with the loop's, "
+            f"expected {SAME_MODE} or more"
+        )
+    return ""
+
+
 def _read_manifest(path: Path, stored: Array) -> dict[str, Any]:
     refused = MatrixError(f"{path}: manifest is not as it was written")
     if stored.ndim != 1 or stored.dtype.itemsize != 1 or len(stored) > _LARGEST_MANIFEST:

@@ -41,7 +41,8 @@ def apply(settings: Settings, path: Path) -> str:
     )
     why = why_not(bundle, place)
     if why:
-        raise ConfigurationError(f"{path}: {why}; nothing was changed")
+        hint = " ([streams] gains and [loop] gain, [streams] reference)" * ("no place" in why)
+        raise ConfigurationError(f"{path}: {why}{hint}; nothing was changed")
     folder = Path(settings.calibration.folder)
     if name == known(folder)["in_use"]:
         raise ConfigurationError(f"{path}: {name} is in use already; nothing was changed")

@@ -29,7 +29,9 @@ def residual_nm(bench, matrix, gain, seed, n_frames):
 def main():
     parser = argparse.ArgumentParser(prog="python -m examples.pyrtc", description=__doc__)
     parser.add_argument(
-        "folder", type=Path, help="where oopao.toml is written; start the service on it"
+        "folder",
+        type=Path,
+        help="where oopao.toml is written; start the service on it; bundle.h5 there is applied",
     )
     parser.add_argument("--connect", help="its endpoint, default tcp/127.0.0.1:7447")
     parser.add_argument("--config", type=Path, help="settings of a secured link: rtc.toml")
@@ -56,7 +58,7 @@ def main():
         )
         bench.begin(asked.seed)
         bridge = Bridge(bench, "oopao", nominal)
-        bridge.run(router_of(asked.config, asked.connect), asked.frames)
+        bridge.run(router_of(asked.config, asked.connect), asked.frames, asked.folder)
         used = bridge.reconstructor
         found = {"id": used.manifest.id, "alpha": used.manifest.alpha, "sigma": used.manifest.sigma}
         if asked.compare:

@@ -148,8 +148,13 @@ class Bench:
         self.context.remove_atmosphere()
         self.camera.expose()
         self.slopes.compute_signal()
+        self.set_reference(self.slopes.read(False))
+
+    def set_reference(self, signal):
+        """Subtract ``signal`` ``(n_slopes,)`` from the slopes from now on."""
+        self.reference = np.array(signal, np.float32)
         flat = np.zeros(self.slopes.ref_slopes.shape, np.float32)
-        self.slopes.set_ref_slopes(self.slopes.compute_signal_2d(self.slopes.read(False), out=flat))
+        self.slopes.set_ref_slopes(self.slopes.compute_signal_2d(signal, out=flat))
 
     def measured_by_oopao(self, mirror):
         """Return OOPAO's own interaction matrix of a mirror ``(n_slopes, n_modes)``, noise-free."""

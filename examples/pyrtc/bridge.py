@@ -5,6 +5,8 @@ import time
 
 import numpy as np
 
+from service.errors import ConfigurationError, PyrcalError
+from service.files.bundle import Place, read_bundle, why_not
 from service.wire import (
     DitherRequest,
     DitherStatus,
@@ -48,6 +50,8 @@ class Bridge:
         name = f"own-{checksum(matrix)[:12]}"
         self.reconstructor = Reconstructor.own(name, matrix, self.identity, created_ns=now_ns)
         self.staged, self.swaps, self.dither, self.n_next = None, [], None, len(matrix)
+        self.modal_gains, self.reference = np.ones(bench.n_modes), bench.reference
+        self.before, self.wanted = None, None
         self.session, self.seq, self.start_ns = new_session(), 0, time.time_ns()
         bench.use(matrix)
 
@@ -118,7 +122,7 @@ class Bridge:
         if asked.gains is not None:
             if len(asked.gains) != self.bench.n_modes:
                 return f"range: {len(asked.gains)} gains, expected {self.bench.n_modes}"
-            loop.set_modal_gains(np.array(asked.gains) / loop.gain)
+            self._set_gains(np.array(asked.gains) / loop.gain)
         self.n_next = asked.n_controlled or self.n_next
         if asked.loop is Loop.OPEN and loop.running:  # that begins a session
             loop.stop()
@@ -127,6 +131,54 @@ class Bridge:
         elif asked.loop is Loop.CLOSED:
             loop.start()
         return ""
+
+    def _set_gains(self, modal_gains):
+        self.modal_gains = modal_gains
+        self.bench.loop.set_modal_gains(modal_gains)
+
+    def apply(self, path):
+        """Have a bundle applied between two frames, all of it or nothing; return its id."""
+        bundle, takes = read_bundle(path), frozenset({"gain_factor", "reference_slopes"})
+        place = Place(
+            system=self.identity.system,
+            config_id=self.identity.config_id,
+            n_slopes=self.bench.loop.signal_size,
+            modes=self.bench.modes.T,
+            takes=takes,
+        )
+        why = why_not(bundle, place)
+        if why:
+            raise ConfigurationError(f"{path}: {why}; nothing was changed")
+        matrix, now_ns = bundle.arrays["reconstructor"].astype(np.float32), time.time_ns()
+        own = Reconstructor.own(bundle.id, matrix, self.identity, created_ns=now_ns)
+        gains = np.ones(self.bench.n_modes)
+        if "gain_factor" in bundle.arrays:
+            gains[: len(matrix)] = bundle.arrays["gain_factor"][: len(matrix)]
+        self.wanted = {
+            "reconstructor": own,
+            "modal_gains": gains,
+            "reference": bundle.arrays.get("reference_slopes", self.reference),
+        }
+        return bundle.id
+
+    def roll_back(self):
+        """Have what ran before a bundle back between two frames, all of it; return its id."""
+        if self.before is None:
+            raise ConfigurationError("found no calibration before the one in use")
+        self.wanted = self.before
+        return self.wanted["reconstructor"].manifest.id
+
+    def _calibrate(self, wanted):
+        """Run with matrix, gains and reference of one calibration; that of before is kept."""
+        parts = ("reconstructor", "modal_gains", "reference")
+        self.before = {name: getattr(self, name) for name in parts}
+        self.reconstructor, self.reference = wanted["reconstructor"], wanted["reference"]
+        self.bench.use(self.reconstructor.matrix)
+        self._set_gains(wanted["modal_gains"])
+        if self.reference is not self.before["reference"]:
+            self.bench.set_reference(self.reference)
+        self.n_next = len(self.reconstructor.matrix)
+        self.swaps.append((self.reconstructor.manifest.id, self.seq))
 
     def status(self):
         loop, n_controlled = self.bench.loop, len(self.reconstructor.matrix)
@@ -172,6 +224,9 @@ class Bridge:
                 self.reconstructor, self.staged = self.staged, None
                 self.bench.use(self.reconstructor.matrix)
                 self.swaps.append((self.reconstructor.manifest.id, self.seq))
+            if self.wanted is not None:
+                wanted, self.wanted = self.wanted, None
+                self._calibrate(wanted)
             header = FrameHeader(
                 session=self.session,
                 seq0=self.seq,
@@ -190,7 +245,19 @@ class Bridge:
             self.seq += BATCH
         return header, np.array(rows, dtype=np.float32)
 
-    def run(self, router, n_frames):
+    def hear(self, folder):
+        """Do what lies in a folder: ``bundle.h5`` or ``bundle.fits``, or ``rollback``."""
+        for path in (folder / name for name in ("bundle.h5", "bundle.fits", "rollback")):
+            if path.exists():
+                try:
+                    done = self.roll_back() if path.name == "rollback" else self.apply(path)
+                    path.replace(path.with_name(f"{path.name}.taken"))
+                    print(f"{path.name}: {done}", flush=True)
+                except PyrcalError as error:
+                    path.replace(path.with_name(f"{path.name}.refused"))
+                    print(error, flush=True)
+
+    def run(self, router, n_frames, folder):
         """Be an RTC of the service at ``router``, which may be late, for so many frames."""
         keys, signed = Keys(self.identity.system), Signatures(router.secret, Role.RTC)
         with open_session(router, threading.Event()) as session:
@@ -200,6 +267,7 @@ class Bridge:
             matrices = Matrices(session, keys, self, signatures=signed)
             with matrices, Token(session, keys, None):
                 while self.seq < n_frames:
+                    self.hear(folder)
                     payload, attachment = encode_frames(*self.batch())
                     frames.put(payload, attachment=signed.sign(keys.frames, attachment, payload))
                     if self.swaps:

@@ -1,13 +1,16 @@
 """A loop of cacao's, on streams alone, is registered through the bridge and takes up a matrix."""
 
 import os
+import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from service.files.bundle import read_bundle, write_bundle
 from service.link.session import Endpoint, open_session, subscribe_frames
 from service.wire import decode_frames
 from tests.system import night as nights
@@ -34,6 +37,7 @@ delay_frames = 2.0
 n_slopes = {n_slopes}
 n_modes = {n_modes}
 metre_per_unit = {unit}
+gain = {gain}
 [calibration]
 folder = "{folder}/matrices"
 dm_modes = "{folder}/modes.npy"
@@ -56,7 +60,7 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
             f"n_modes_target = {N_TARGET}", f"n_modes_target = {N_START}"
         )
         night.settings.write_text(same, encoding="utf-8")
-        sizes = {"n_slopes": n_slopes, "n_modes": n_modes, "unit": UNIT, "hz": HZ}
+        sizes = {"n_slopes": n_slopes, "n_modes": n_modes, "unit": UNIT, "hz": HZ, "gain": GAIN}
         config = folder / "cacao.toml"
         config.write_text(SETTINGS.format(zenoh=night.zenoh, folder=folder, **sizes))
         night.service("auto")
@@ -78,10 +82,37 @@ def test_the_loop_is_registered_and_takes_up_a_matrix_and_what_is_wrong_is_said(
         assert status["gains"][0] == first
         assert not night.alarms.keys() & {"loop-law", "columns-misaligned", "response-mismatch"}
 
+        goes_back_and_forth(night, config)
+
         Milk(path_of(folder, "aol1_imWFS2"), (7, 1))  # made anew by somebody, of another size
         told = f"aol1_imWFS2: found 7 values, expected {n_slopes}"
         said = lambda: [one["text"] for one in night.state["waiting_for"]]  # noqa: E731
         wait_for(lambda: told in said(), 10.0, lambda: (said(), bridge.log))
+
+
+def goes_back_and_forth(night, config):
+    """To the matrix before by one command, and by another to the bundle of the one in use."""
+    night.client.put("/v1/mode", json={"mode": "hold"}).raise_for_status()
+    in_use, folder = night.state["in_use"], night.directory
+    bundle = folder / "tonight.fits"
+    words = ["--data-dir", str(night.directory / "data"), "--instrument", str(nights.INSTRUMENT)]
+    pyrcal("bundle", "write", "in-use", str(folder / "all.h5"), *words)
+    whole = read_bundle(folder / "all.h5")
+    arrays = {name: one for name, one in whole.arrays.items() if name != "mode_to_actuator"}
+    write_bundle(bundle, replace(whole, arrays=arrays))  # this loop's mirror is its modes
+    own = pyrcal("cacao", "--config", str(config), "--rollback").partition(":")[0]
+    assert own.startswith("own-")
+    wait_for(lambda: night.state["in_use"] == own, 10.0, lambda: night.state["in_use"])
+    assert pyrcal("cacao", "--config", str(config), "--bundle", str(bundle)).startswith(in_use)
+    wait_for(lambda: night.state["in_use"] == in_use, 10.0, lambda: night.state["in_use"])
+
+
+def pyrcal(*words):
+    done = subprocess.run(
+        [sys.executable, "-m", "pyrcal", *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.slow
@@ -104,7 +135,7 @@ def test_no_frame_is_lost_or_taken_for_another(tmp_path, hz, n_slopes, most_of_a
         came["bad"] += not whole or seq[0] != came["next"]
         came["n"], came["next"] = came["n"] + len(seq), int(seq[-1]) + 1
 
-    sizes = {"n_slopes": n_slopes, "n_modes": n_modes, "unit": 1.0, "hz": float(hz)}
+    sizes = {"n_slopes": n_slopes, "n_modes": n_modes, "unit": 1.0, "hz": float(hz), "gain": 0.0}
     config = folder / "cacao.toml"
     text = SETTINGS.format(zenoh=endpoint, folder=folder, **sizes).replace('"dm01disp05"', '""')
     text = text.replace("[streams]", '[streams]\ngains = ""\nfactors = ""')

@@ -13,10 +13,10 @@ sigma from every estimator, the filtered alpha, alarms, and the noisy matrix of 
 """
 
 _EPILOG = """
-TELEMETRY is a recording (pyrcal record, pyrcal sim --record), an AOT file, or an HDF5 file or .npz
-with the arrays slopes (n_frames, n_slopes) and commands_m (n_frames, n_modes), the number
-frame_rate_hz, and what else docs/integrate/tracking.md lists. Exit status: 0 alpha was measured, 1
-it was not (the table says why), 2 input that cannot be used.
+TELEMETRY is a recording (pyrcal record, pyrcal sim --record), an AOT file, a folder of pyRTC's
+recorder, or an HDF5 file or .npz with the arrays slopes (n_frames, n_slopes) and commands_m
+(n_frames, n_modes), the number frame_rate_hz, and what else docs/integrate/tracking.md lists. Exit
+status: 0 alpha was measured, 1 it was not (the table says why), 2 input that cannot be used.
 """
 
 
@@ -28,7 +28,7 @@ def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own
     add(
         track,
         words("instrument INSTRUMENT", "TOML file, or a packaged name"),
-        words("telemetry TELEMETRY", "recording, AOT, HDF5 or .npz", type=Path),
+        words("telemetry TELEMETRY", "recording, AOT, session of pyRTC, HDF5 or .npz", type=Path),
         words("--config FILE", "the service's settings, TOML", type=Path),
         words("--json", "print one JSON object, not a table"),
         words("--plot FILE.png", "draw alpha over time", type=Path),

@@ -20,6 +20,7 @@ from pyrcal.offline.figures import check_plots
 from pyrcal.playback.aot import read_telemetry
 from pyrcal.playback.arrays import Arrays, opened_arrays
 from pyrcal.playback.player import Player, Track
+from pyrcal.playback.pyrtc import is_session, read_session
 from pyrcal.playback.report import document, fill, plot, table
 from pyrcal.terminal import show_progress
 from service.config import load_instrument, load_settings
@@ -60,7 +61,7 @@ def main(options: argparse.Namespace) -> int:
 def track(path: Path, instrument: Instrument, settings: Settings | None = None) -> Track:
     """Return α over time from recorded telemetry, by the service's own estimators.
 
-    ``path`` is a recording of pyrcal's, arrays in ``.npz`` or HDF5, or an AOT file
+    ``path`` is a recording of pyrcal's, arrays in ``.npz`` or HDF5, an AOT file or pyRTC's session
     (docs/integrate/tracking.md); ``settings`` None: the usual ones.
 
     Raises
@@ -75,6 +76,9 @@ def track(path: Path, instrument: Instrument, settings: Settings | None = None) 
                 return _play(recording.messages(), instrument, settings, recording.system)
         if _is_fits(path):
             return _play_aot(path, instrument, settings)
+        if is_session(path):
+            session = Arrays(path=path, found=read_session(path, instrument), facts={})
+            return _play(session.messages(instrument), instrument, settings, instrument.name)
         with opened_arrays(path) as arrays:
             messages = arrays.messages(instrument)
             return _play(messages, instrument, settings, instrument.name)

@@ -1,4 +1,4 @@
-"""Frames that are missing, or come ever later: the alarm ``frames-lost``."""
+"""Frames that are missing, come ever later, or stay away: alarms ``frames-lost``, ``no-frames``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections import deque
 from typing import Final
 
 from service.link.statistics import LinkStatistics
-from service.tracking.alarms import FRAMES_LOST
+from service.tracking.alarms import FRAMES_LOST, NO_FRAMES
+from service.wire import Status
 
 LOST_S: Final = 5.0
 """Losses are summed over so long."""
@@ -20,10 +21,24 @@ SLOW_S: Final = 2.0
 SLOW_SHARE: Final = 0.25
 """Of the rate before: fewer are an alarm, which twice as many do not end."""
 
+NO_FRAMES_S: Final = 2.0
+"""Frames, of which tens come a second, are missed after so long."""
+
 WHAT_TO_DO: Final = "check the network, the RTC's publisher, and what else this machine does"
 
 Counts = deque[tuple[float, LinkStatistics]]
 """Moments, and the counters of then."""
+
+
+def silence(rtc: Status | None, frame_age_s: float | None) -> dict[str, str]:
+    """Return, by alarm, that frames stay away though the loop is closed; empty: they come.
+
+    A matrix made of what was known before is not sent then.
+    """
+    if rtc is None or not rtc.in_loop or frame_age_s is None or frame_age_s < NO_FRAMES_S:
+        return {NO_FRAMES: ""}
+    text = f"no frame could be used for {frame_age_s:.0f} s, though the RTC's loop is closed"
+    return {NO_FRAMES: f"{text}: nothing is made or sent until frames come; {WHAT_TO_DO}"}
 
 
 class Losses:

@@ -12,6 +12,7 @@ from service.link.guard import ending_in_words, refused_in_words
 from service.link.intake import COALESCED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, LinkStatistics
 from service.model.misregistration import at_boundary
+from service.runtime.losses import NO_FRAMES_S, silence
 from service.tracking import alarms
 from service.tracking import events as ev
 from service.tracking.alarms import Alarm, Interlock, Prerequisite, Responsible, alarm_blocks
@@ -28,9 +29,6 @@ AlarmTexts = frozenset[tuple[str, str]]
 
 SILENT_S: Final = 3.0
 """A status that has not come for so long is waited for."""
-
-NO_FRAMES_S: Final = 2.0
-"""So are frames, of which tens come a second."""
 
 REVIVED_AFTER_S: Final = 10.0
 """With the RTC's token there and no message, until the link is opened anew for the first time."""
@@ -69,6 +67,7 @@ COMPLAINTS: Final = (
     alarms.FRAMES_UNUSED,
     alarms.LINK_REFUSED,
     alarms.MESSAGES_REFUSED,
+    alarms.NO_FRAMES,
     alarms.STATUS_FLOOD,
 )
 """Names of the alarms that are made here."""
@@ -155,6 +154,8 @@ def detect_link_changes(
     One that differs in its numbers alone keeps its text: that is no news.
     """
     made, found = complaints(link), []
+    if not any(f.outcome in NAMED_ELSEWHERE and f.age_s < RECENT_S for f in link.dispositions):
+        also = silence(state.loop.rtc, link.frame_age_s) | dict(also)
     made |= {name: text for name, text in also.items() if text}
     raised = {alarm.name: alarm for alarm in state.alarms.active if alarm.name in COMPLAINTS}
     for name, text in made.items():

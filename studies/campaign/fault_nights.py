@@ -29,6 +29,7 @@ from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import LinkError, PyrcalError
 from service.estimation.frames import FrameBlock
+from service.runtime.losses import silence
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.dither_request import DitherPhase
@@ -46,6 +47,9 @@ from studies.campaign.trouble import Trouble, troubled
 
 STEP_S = 0.25
 """From one look at what must hold to the next."""
+
+LOOK_S = 1.0
+"""From one look of the service at its link to the next."""
 
 STALE_S = 3.0
 """Without telemetry for so long, nothing may be sent."""
@@ -134,6 +138,7 @@ class FaultNight(KeptNight):
             link=CutLink,
         )
         self._link.watch = self._sent
+        self._looked_s = 0.0
 
     @override
     def now_ns(self) -> int:
@@ -153,6 +158,15 @@ class FaultNight(KeptNight):
                     self._heard_s = self.time_s
                 self._engine.feed(arrived)
             self._acknowledged()
+            if self.time_s >= self._looked_s + LOOK_S:
+                self._looked_s = self.time_s
+                self._miss_frames()
+
+    def _miss_frames(self) -> None:
+        """Complain of frames that stay away, as the service does of its link."""
+        (name, text) = next(iter(silence(self.state.loop.rtc, self.time_s - self._heard_s).items()))
+        if text or self.state.alarm(name) is not None:
+            self._hear(ev.ConditionChanged(name=name, text=text or "over", over=not text))
 
     def _arriving(self, blocks: list[FrameBlock]) -> Iterator[FrameBlock]:
         if self.burst:

@@ -2,13 +2,13 @@
 
 import pytest
 
-from service.runtime.losses import Losses
+from service.runtime.losses import Losses, silence
 from service.runtime.readiness import detect_link_changes
 from service.tracking.alarms import Alarm
 from service.tracking.state import TrackerState
 from tests.states import changed
-from tests.unit.runtime.test_waiting import SECOND, WELL, link
-from tests.unit.tracking.situations import START_NS
+from tests.unit.runtime.test_waiting import SECOND, WELL, disposition, link
+from tests.unit.tracking.situations import START_NS, rtc
 
 
 class Counting:
@@ -102,3 +102,32 @@ def test_what_is_lost_goes_before_how_slowly_it_comes():
     counting = Counting()
     assert not counting.pass_(20)
     assert "never came" in counting.pass_(5, come=1077, lost=1000)
+
+
+@pytest.mark.parametrize(
+    ("status", "age_s", "named"),
+    [
+        (rtc(), 2.4, True),
+        (rtc(), 1.9, False),
+        (rtc(), None, False),
+        (rtc(loop="open"), 60.0, False),
+        (None, 60.0, False),
+    ],
+)
+def test_frames_that_stay_away_from_a_closed_loop_are_named(status, age_s, named):
+    (text,) = silence(status, age_s).values()
+    assert bool(text) is named
+    assert not named or "no frame could be used for 2 s" in text
+
+
+def test_it_is_an_alarm_that_ends_with_the_frames_and_is_not_made_beside_what_names_them():
+    state = changed(TrackerState(system="small"), rtc=rtc())
+    stays_away = link(*WELL, frame_age_s=5.0)
+    (made,) = detect_link_changes(stays_away, state, START_NS)
+    assert (made.name, made.over) == ("no-frames", False)
+    alarm = Alarm(name=made.name, since_ns_utc=0, text=made.text, seen_ns_utc=START_NS)
+    state = changed(state, active=(alarm,))
+    (over,) = detect_link_changes(link(*WELL), state, START_NS + 4 * SECOND)
+    assert (over.name, over.over) == ("no-frames", True)
+    other = link(disposition("basis", 100), frame_age_s=5.0)
+    assert not detect_link_changes(other, changed(state, active=()), START_NS)

@@ -8,6 +8,7 @@ from service.tracking.state import Mode
 from studies.campaign import fault_nights
 from studies.campaign.fault_nights import AT_ONCE, LASTING, FaultNight, deeds_of, worse
 from studies.campaign.observatory_dome import Moment
+from studies.campaign.small import latencies_of
 from studies.campaign.trouble import Trouble, strike
 from tests.system.night import INSTRUMENT
 
@@ -87,3 +88,17 @@ def test_ten_faults_and_orders_in_a_hundred_seconds_break_no_rule():
     assert row["worse"] == []
     assert row["n_windows"] > 10
     assert row["n_swaps"] > 0
+
+
+def test_a_matrix_that_was_under_way_when_the_frames_stopped_is_not_sent(night):
+    """The worker is slow: it is made and judged when nobody knows any more where the mirror is."""
+    night.latencies = latencies_of(4.0)
+    night.play((), 5.0)
+    night.burst = True
+    night.play((), 14.0)
+    assert night.broken == []
+    assert night.state.alarm("no-frames") is not None
+    night.burst = False
+    night.play((), 26.0)
+    assert night.state.alarm("no-frames") is None
+    assert night.broken == []

@@ -18,7 +18,7 @@ from pyrcal.offline.report import document, fill_fit
 from pyrcal.terminal import show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError, say
-from service.files.durable import write_whole
+from service.files.whole import write_whole
 from service.model.instrument import Instrument
 from service.model.kinds import Method
 

@@ -25,7 +25,7 @@ from pyrcal.offline.system_report import SystemReport, document, fill_system, ta
 from pyrcal.terminal import show_progress
 from service.errors import MatrixError, PyrcalError
 from service.files.container import DATASET, opened
-from service.files.durable import write_whole
+from service.files.whole import write_whole
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 

@@ -31,7 +31,7 @@ from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
-from service.files.durable import write_whole
+from service.files.whole import write_whole
 from service.model.arrays import arrays_of
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel

@@ -26,8 +26,8 @@ from pyrcal.terminal import show_progress
 from service.config import load_instrument, load_settings
 from service.config.settings import Settings
 from service.errors import ConfigurationError, say
-from service.files.durable import write_whole
 from service.files.recording import FORMAT, Message, Recording
+from service.files.whole import write_whole
 from service.model.instrument import Instrument
 
 FOUND, NOTHING_FOUND = 0, 1

@@ -16,7 +16,7 @@ from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
-from service.files.durable import write_whole
+from service.files.whole import write_whole
 from service.wire import checked_id, checksum
 
 Provenance = str | int | float | bool | NDArray[Any]

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError, MatrixError, StorageError
 from service.files.container import opened
-from service.files.durable import flush, write_whole
+from service.files.durable import flush
+from service.files.whole import write_whole
 
 Array = NDArray[Any]
 

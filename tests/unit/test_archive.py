@@ -615,7 +615,7 @@ DIE = "import os, signal\ndie = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\
 @pytest.mark.parametrize(
     ("death", "found"),
     [
-        ("import service.files.durable as d; d.flush = die\n", []),
+        ("import service.files.whole as w; w.flush = die\n", []),
         ("import service.archive.index as i; i.Index.add = die\n", ["cm-000000"]),
         ("import service.archive.index as i; i.Index.record = die\n", ["cm-000000"]),
     ],

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.config.instrument import load_instrument
 from service.errors import MatrixError, StorageError
 from service.files.container import DATASET
-from service.files.durable import write_whole
+from service.files.whole import write_whole
 from service.model.instrument import Instrument
 from service.model.pupil import rtc_valid_subapertures
 

@@ -11,7 +11,8 @@ import pytest
 
 from service.archive.products import _write_beside
 from service.errors import StorageError
-from service.files.durable import replace_file, write_whole
+from service.files.durable import replace_file
+from service.files.whole import write_whole
 from service.web.keys import KeyFile, KeyScope
 
 

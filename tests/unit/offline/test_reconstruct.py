@@ -11,7 +11,7 @@ from pyrcal.offline.reconstruct import SAMPLING, main
 from pyrcal.offline.report import document, fill_fit
 from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
-from service.files.durable import write_whole
+from service.files.whole import write_whole
 from service.model.instrument import instrument_sha256
 from service.model.interaction import InteractionModel
 from service.model.kinds import SlopeOrder

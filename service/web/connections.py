@@ -41,12 +41,12 @@ longest give way. One that waits costs nothing, one that comes back again and ag
 MAX_DESCRIPTORS = 8192
 """That the service asks of the system, where its limit is less."""
 
-LATE_AT_ONCE = 150
-"""Connections that have stood still for too long and are ended in one tick: those that came
-together would come back together, and have others wait."""
-
 AT_ONCE = 20
 """Connections that are taken, or ended, before others have their turn."""
+
+BREATH_S = 0.1
+"""Between two lots that have stood still for too long: those that came together would come back
+together, and have others wait."""
 
 MAX_PENDING = 2048
 """Connections that the system holds until they are taken."""
@@ -152,9 +152,9 @@ class Server(uvicorn.Server):
     @override
     async def on_tick(self, counter: int) -> bool:
         over = await super().on_tick(0)  # the date of answers is told anew
-        await self._end_idle()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(TICK_S):
+                await self._end_idle()
                 await self._over.wait()
         return over or self._over.is_set()
 
@@ -164,11 +164,13 @@ class Server(uvicorn.Server):
         idle = {still: one for one in self.server_state.connections if (still := _stands(one))}
         self._since_s = {still: self._since_s.get(still, now_s) for still in idle}
         by_age = sorted(idle, key=self._since_s.__getitem__)
-        late = [still for still in by_age if now_s - self._since_s[still] > IDLE_S][:LATE_AT_ONCE]
-        too_many = by_age[: max(len(by_age) - self._max_idle, 0)]
-        for n_ended, still in enumerate(dict.fromkeys([*too_many, *late])):
-            if n_ended % AT_ONCE == 0:
-                await asyncio.sleep(0)
+        n_too_many = max(len(by_age) - self._max_idle, 0)
+        for n_seen, still in enumerate(by_age):
+            at_leisure = n_seen >= n_too_many
+            if self._over.is_set() or (at_leisure and now_s - self._since_s[still] <= IDLE_S):
+                return
+            if n_seen % AT_ONCE == 0:
+                await asyncio.sleep(BREATH_S if at_leisure else 0)
             if _stands(idle[still]) == still:
                 idle[still].transport.abort()
 

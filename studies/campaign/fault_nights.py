@@ -423,47 +423,57 @@ def _by_second(moments: Sequence[Moment]) -> dict[int, float]:
     return {second: float(np.sqrt(np.mean(values))) for second, values in squares.items()}
 
 
-def _words(rng: np.random.Generator, seed: int, instrument: str, plant: str, s: float) -> list[str]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Night:
+    """What is played: instrument, plant, frame rate, and how long."""
+
+    instrument: str = SMALL
+    plant: str = "linear"
+    rate_hz: float = 1000.0
+    seconds: float = 600.0
+
+
+def _words(rng: np.random.Generator, seed: int, what: Night) -> list[str]:
     x, y = rng.uniform(-0.1, 0.1, 2)
     words = [
-        f"--instrument={instrument}",
-        f"--plant={plant}",
+        f"--instrument={what.instrument}",
+        f"--plant={what.plant}",
+        f"--rate={what.rate_hz:g}",
         "--n-controlled=45",
         f"--seed={seed}",
         "--mag=7",
         f"--alpha={x:.3f},{y:.3f},{rng.uniform(-0.3, 0.3):.3f},1.002",
     ]
-    for time_s in np.sort(rng.uniform(20.0, s, round(s / 200.0))):
+    for time_s in np.sort(rng.uniform(20.0, what.seconds, round(what.seconds / 200.0))):
         x, y = rng.uniform(-0.2, 0.2, 2)
         words.append(f"--jump={time_s:.2f}:{x:.3f},{y:.3f},{rng.uniform(-0.5, 0.5):.3f},0")
     return words
 
 
-def night_of(
-    seed: int, instrument: str, plant: str, seconds: float, *, listening: bool
-) -> FaultNight:
+def night_of(seed: int, what: Night, *, listening: bool) -> FaultNight:
     """Play one night; its archive is gone afterwards."""
     rng = np.random.default_rng([_SEED, seed])
-    words = _words(rng, seed, instrument, plant, seconds)
-    deeds = deeds_of(rng, seconds)
+    words = _words(rng, seed, what)
+    deeds = deeds_of(rng, what.seconds)
     with threadpool_limits(1), tempfile.TemporaryDirectory(prefix="fault-night-") as folder:
         night = FaultNight(words, Path(folder), seed, listening=listening)
-        night.play(deeds, seconds)
+        night.play(deeds, what.seconds)
         night.close()
     return night
 
 
-def play(seed: int, instrument: str, plant: str, seconds: float) -> Row:
+def play(seed: int, what: Night) -> Row:
     """Play one night, and the same with a service that only listens."""
     begun = time.process_time()
-    night = night_of(seed, instrument, plant, seconds, listening=False)
-    alone = night_of(seed, instrument, plant, seconds, listening=True)
-    deeds = deeds_of(_after_words(seed, instrument, plant, seconds), seconds)
+    night = night_of(seed, what, listening=False)
+    alone = night_of(seed, what, listening=True)
+    deeds = deeds_of(_after_words(seed, what), what.seconds)
     moments = night.dome.moments
     return {
         "seed": seed,
-        "plant": plant,
-        "seconds": seconds,
+        "plant": what.plant,
+        "rate_hz": what.rate_hz,
+        "seconds": what.seconds,
         "deeds": [(round(deed.time_s, 2), deed.name) for deed in deeds],
         "broken": night.broken,
         "worse": worse(moments, alone.dome.moments),
@@ -474,9 +484,9 @@ def play(seed: int, instrument: str, plant: str, seconds: float) -> Row:
     }
 
 
-def _after_words(seed: int, instrument: str, plant: str, seconds: float) -> np.random.Generator:
+def _after_words(seed: int, what: Night) -> np.random.Generator:
     rng = np.random.default_rng([_SEED, seed])
-    _words(rng, seed, instrument, plant, seconds)
+    _words(rng, seed, what)
     return rng
 
 
@@ -487,13 +497,22 @@ def _median(moments: Sequence[Moment]) -> float:
 def table(rows: Sequence[Row]) -> str:
     """Return the campaign as a Markdown table, and every night that went wrong."""
     text = heading(
-        *("plant", "nights", "simulated hours", "faults and orders", "windows", "matrices sent"),
+        *(
+            "plant",
+            "frames a second",
+            "nights",
+            "simulated hours",
+            "faults and orders",
+            "windows",
+            "matrices sent",
+        ),
         *("rules broken", f"worse by {HARM - 1:.0%} for {HARM_S:g} s"),
     )
-    for plant in sorted({row["plant"] for row in rows}):
-        of = [row for row in rows if row["plant"] == plant]
+    kinds = sorted({(row["plant"], row["rate_hz"]) for row in rows})
+    for plant, rate_hz in kinds:
+        of = [row for row in rows if (row["plant"], row["rate_hz"]) == (plant, rate_hz)]
         text += line(
-            *(plant, len(of), f"{sum(row['seconds'] for row in of) / 3600.0:.2f}"),
+            *(plant, f"{rate_hz:g}", len(of), f"{sum(row['seconds'] for row in of) / 3600.0:.2f}"),
             *(sum(len(row["deeds"]) for row in of), sum(row["n_windows"] for row in of)),
             sum(row["n_swaps"] for row in of),
             *(sum(len(row[name]) for row in of) for name in ("broken", "worse")),
@@ -507,10 +526,16 @@ def main() -> int:
     """Play what is missing, then print the table; 1 if anything was broken."""
     given = _parser().parse_args()
     file = RowFile(given.output)
-    done = {(row["seed"], row["plant"], row["seconds"]) for row in file.rows}
+    what = Night(
+        instrument=given.instrument,
+        plant=given.plant,
+        rate_hz=given.rate,
+        seconds=given.seconds,
+    )
+    done = {(row["seed"], row["plant"], row["rate_hz"], row["seconds"]) for row in file.rows}
     for seed in given.seeds:
-        if (seed, given.plant, given.seconds) not in done:
-            file.add(play(seed, given.instrument, given.plant, given.seconds))
+        if (seed, what.plant, what.rate_hz, what.seconds) not in done:
+            file.add(play(seed, what))
     tell(table(file.rows), given.table, "python -m studies.campaign.fault_nights")
     return int(any(row["broken"] or row["worse"] for row in file.rows))
 
@@ -524,6 +549,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     parser.add_argument("--instrument", default=SMALL, metavar="NAME|FILE")
     parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
+    parser.add_argument("--rate", type=float, default=1000.0, metavar="HZ", help="of frames")
     parser.add_argument("--seeds", type=range_of, default=range(4), metavar="FIRST:END")
     parser.add_argument("--seconds", type=float, default=600.0, help="of each night")
     return parser

@@ -6,7 +6,7 @@ import pytest
 from service.tracking import commands as cmd
 from service.tracking.state import Mode
 from studies.campaign import fault_nights
-from studies.campaign.fault_nights import AT_ONCE, LASTING, FaultNight, deeds_of, worse
+from studies.campaign.fault_nights import AT_ONCE, LASTING, FaultNight, Night, deeds_of, worse
 from studies.campaign.observatory_dome import Moment
 from studies.campaign.small import latencies_of
 from studies.campaign.trouble import Trouble, strike
@@ -83,7 +83,7 @@ def test_an_order_that_a_kill_loses_is_told(night, monkeypatch):
 
 @pytest.mark.long
 def test_ten_faults_and_orders_in_a_hundred_seconds_break_no_rule():
-    row = fault_nights.play(0, str(INSTRUMENT), "linear", 100.0)
+    row = fault_nights.play(0, Night(instrument=str(INSTRUMENT), seconds=100.0))
     assert row["broken"] == []
     assert row["worse"] == []
     assert row["n_windows"] > 10

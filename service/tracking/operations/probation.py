@@ -151,7 +151,7 @@ def _begin_rollback(context: StepContext, trial: Probation, found: str) -> None:
     if why is not None:
         _keep_worse(context, trial, why)
         return
-    text = f"{trial.worse}: going back to {trial.before}"
+    text = f"{trial.worse}. The service goes back to {trial.before}"
     _set(context, replace(trial, state=ProbationState.ROLLING_BACK, text=text))
     context.raise_alarm(PROBATION, f"{trial.id} {text}")
     why = f"the service goes back to {trial.before}: {trial.id} made the loop worse"
@@ -206,7 +206,7 @@ def _await_republished(context: StepContext, trial: Probation, event: Event) -> 
 
 def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     """Check whether the loop recovers, now that the matrix before is in use again."""
-    text = f"{trial.worse}: the service went back to {trial.before}, as {in_use}"
+    text = f"{trial.worse}. The service went back to {trial.before}, as {in_use}"
     # an operator's rollback would go back to it
     reconstructors.change_state(
         context, trial.id, MatrixState.FAILED, f"rolled back, it {trial.worse}"
@@ -218,7 +218,7 @@ def _begin_watch(context: StepContext, trial: Probation, in_use: str) -> None:
     )
     _end(context, watched, ProbationState.WATCHED, text)
     context.raise_alarm(
-        PROBATION, f"{trial.id} {text}; the mode is hold until an operator sets another"
+        PROBATION, f"{trial.id} {text}. The mode is hold until an operator sets another"
     )
 
 
@@ -236,13 +236,13 @@ def _watch(context: StepContext, trial: Probation) -> None:
 
 
 def _end_watch(context: StepContext, trial: Probation, found: str, *, lost: bool) -> None:
-    trial = replace(trial, text=f"{trial.text}; since then: {found}")
+    trial = replace(trial, text=f"{trial.text}. Since then: {found}")
     if lost and trial.opens:
         _open(context, trial)
         return
     _end(context, trial, ProbationState.ROLLED_BACK, trial.text)
-    do = "; open the loop" if lost else ""
-    text = f"{trial.id} {trial.text}; the mode is hold until an operator sets another{do}"
+    do = ". Open the loop" if lost else ""
+    text = f"{trial.id} {trial.text}. The mode is hold until an operator sets another{do}"
     context.raise_alarm(PROBATION, text, critical=lost)
 
 
@@ -270,16 +270,16 @@ def opening_text(context: StepContext) -> str | None:
     trial, asked = context.operations.probation, context.loop.command
     if trial is None or trial.state not in {ProbationState.OPENING, ProbationState.OPENED}:
         return None
-    raised, does = context.alarm_text(LOOP_OPENED), "the RTC is asked to open the loop"
+    raised, does = context.alarm_text(LOOP_OPENED), "The RTC is asked to open the loop"
     if trial.state is ProbationState.OPENED:
-        does = "the loop was asked to open, and is open"
+        does = "The loop was asked to open, and is open"
     elif asked is not None and asked.state in {CommandState.REFUSED, CommandState.FAILED}:
-        does = f"the RTC was asked to open the loop and has not ({asked.reason}): open it there"
+        does = f"The RTC was asked to open the loop and has not ({asked.reason}): open it there"
     elif raised is not None:
         return raised  # it is asked again and again
     return (
-        f"{trial.id} {trial.text}; {does}; find out why, then close it on a matrix known to be "
-        "good; the mode is hold until an operator sets another"
+        f"{trial.id} {trial.text}. {does}. Find out why, then close it on a matrix known to be "
+        "good. The mode is hold until an operator sets another"
     )
 
 

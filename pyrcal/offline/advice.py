@@ -84,7 +84,7 @@ def recommendation(fit: Fit, grounds: Grounds) -> str:
     edge = float(_at_edge(fit.sigma, radius))
     if edge > ENOUGH_SUBAP:
         return (
-            f"{Advice.MEASURE_MORE}: at the pupil's edge the mirror is known to {edge:.2g} "
+            f"{Advice.MEASURE_MORE}: at the pupil's edge the mirror is known to {edge:.3f} "
             f"subapertures (1 sigma), {ENOUGH_SUBAP:g} is enough; average more, or push more modes"
         )
     for other in fit.alternatives:
@@ -141,6 +141,8 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
     left = fit.left_over
     if grounds.refusal is Refusal.NO_CAUSE and left is not None and left.subapertures:
         return left.words
+    if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
+        return f"{left.words}; measure these again, or leave them out (--modes)"
     return fit.verdict.removeprefix("refused: ").partition(";")[0]
 
 

@@ -364,6 +364,7 @@ _REPORTED = (
     words("--obscuration RATIO", "linear, default none", type=float, default=0.0),
     words("--wavelength-m W", "default: unknown", type=float),
     words("--modulation RADIUS", "of a pyramid, λ/D; default: unknown", type=float),
+    words("--pupil-subap N", "pupil's diameter, subapertures; default the mask's", type=float),
 )
 """What no file says."""
 

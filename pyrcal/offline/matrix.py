@@ -33,6 +33,7 @@ from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
 from pyrcal.offline.origins import origins
 from pyrcal.offline.pupil_checks import LEAST_EXPLAINED, Few, left_by_light, tried_pupils
+from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
 from pyrcal.offline.solver import nuisances_of
@@ -324,6 +325,7 @@ def _answer(
         rivals=others,
         off_centre=off_centre(few, others),
         optics=optics,
+        narrow=_narrow(settled),
         as_told=without,
         axes=untold,
         passes=usable.passes,
@@ -372,6 +374,17 @@ def _answer(
     tried = alternatives(settled, few, others, pupils, optics, without)
     causes = gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
     return explained(fit, tried, replace(grounds, gains=tuple(causes)))
+
+
+def _narrow(settled: Settled) -> SeenPupil | None:
+    """Return a pupil's image that is narrower than the instrument file says, if it is."""
+    target, solution = settled.target, settled.solution
+    squares = solution.projection.gains**2
+    measured = np.einsum("ij,ij->i", target.matrix, target.matrix)
+    counted = np.where(target.rows | (measured == 0.0), 1.0, np.nan)
+    expected = np.einsum("ij,ij,j->i", solution.matrix, solution.matrix, squares)
+    answers = answers_of(measured * counted, expected * counted, target.valid)
+    return seen_pupil(answers, settled.models.instrument.wfs.pupil_diameter)
 
 
 def _rows_left_out(target: Target, instrument: Instrument) -> Iterator[str]:

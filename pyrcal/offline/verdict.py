@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
 from pyrcal.offline.methods import Landing
+from pyrcal.offline.pupil_width import SeenPupil
 from pyrcal.offline.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
 from pyrcal.offline.uncertainty import Uncertainty
 from service.model.misregistration import BOUNDARY_SCALE
@@ -78,6 +79,9 @@ class FitFindings:
     optics: tuple[FoundOptic, ...]
     """What was found of the instrument itself."""
 
+    narrow: SeenPupil | None
+    """A pupil's image that is narrower than the file says; None: it is as wide."""
+
     as_told: AsTold | None
     """The fit with all of these as the file says; None: they are, so far as the matrix tells."""
 
@@ -99,6 +103,7 @@ class Refusal(StrEnum):
     """Why a fit is refused."""
 
     AXES = "axes"
+    ANOTHER_PUPIL = "another pupil"
     UNSETTLED = "unsettled"
     UNDETERMINED = "undetermined"
     UNEXPLAINED = "unexplained"
@@ -114,6 +119,7 @@ def judged(findings: FitFindings) -> tuple[Refusal | None, str]:
     """Return why the registration is refused, or None, and the verdict on one line."""
     for reason, refusal in (
         (Refusal.AXES, findings.axes),
+        (Refusal.ANOTHER_PUPIL, _another_pupil(findings)),
         (Refusal.UNSETTLED, _unsettled(findings)),
         (Refusal.UNDETERMINED, _undetermined(findings)),
         (Refusal.UNEXPLAINED, _unexplained(findings)),
@@ -178,6 +184,15 @@ def _another_minimum(findings: FitFindings) -> str:
         f"another minimum is nearly as good: shift {rival['shift_x_subap']:.2f}, "
         f"{rival['shift_y_subap']:.2f} subaperture, {rival['rotation_deg']:.1f} deg, "
         f"{rival['magnification']:.3f}; give a start near the right one (--start) or more modes"
+    )
+
+
+def _another_pupil(findings: FitFindings) -> str:
+    if findings.narrow is None:
+        return ""
+    return (
+        f"{findings.narrow.words}; write that into the instrument file (pupil_diameter_subap), or "
+        "leave them out of the mask of valid subapertures"
     )
 
 

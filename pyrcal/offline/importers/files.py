@@ -21,6 +21,7 @@ from pyrcal.offline.importers.imported import (
     matrix_of,
     oriented,
 )
+from pyrcal.offline.pupil_width import answers_of, seen_pupil
 from service.errors import MatrixError
 
 UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
@@ -57,6 +58,9 @@ class Reported:
 
     modulation_lambda_over_d: float | None = None
     """None: unknown; of a pyramid only."""
+
+    pupil_diameter_subap: float | None = None
+    """Of the pupil's image; None: as wide as the mask."""
 
     order: str = "xy"
     """Of the slopes, as its user would list them; the fit finds another."""
@@ -99,15 +103,7 @@ def from_arrays(source: str, arrays: Mapping[str, Array], reported: Reported) ->
         notes.append("the unit of the commands is unknown: only shapes are compared")
     else:
         matrix = matrix / UNITS_M[reported.unit]
-    sensor: dict[str, Any] = {
-        "kind": reported.sensor,
-        "n_subapertures": len(valid),
-        "wavelength_m": reported.wavelength_m or UNKNOWN,
-        "valid_subapertures": Dataset("valid_subapertures"),
-    }
-    if reported.sensor == "pyramid":
-        modulation = reported.modulation_lambda_over_d
-        sensor["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
+    sensor = _sensor(reported, valid, matrix, notes)
     return Imported(
         source=source,
         tables={
@@ -134,6 +130,37 @@ def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
     """Return how many columns are expected: all modes, or as many of them as the matrix has."""
     others = [n for n in matrix.shape if n != 2 * int(valid.sum())]
     return others[0] if len(others) == 1 and others[0] < n_modes else n_modes
+
+
+def _sensor(
+    reported: Reported, valid: NDArray[np.bool_], matrix: Array, notes: list[str]
+) -> dict[str, Any]:
+    """Return ``[wfs]``."""
+    table: dict[str, Any] = {
+        "kind": reported.sensor,
+        "n_subapertures": len(valid),
+        "wavelength_m": reported.wavelength_m or UNKNOWN,
+        "valid_subapertures": Dataset("valid_subapertures"),
+    }
+    if reported.sensor == "pyramid":
+        modulation = reported.modulation_lambda_over_d
+        table["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
+    if reported.pupil_diameter_subap is not None:
+        return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
+    notes += _narrow(matrix, valid)
+    return table
+
+
+def _narrow(matrix: Array, valid: NDArray[np.bool_]) -> list[str]:
+    """Return that the mask is wider than the pupil's image, if it looks so."""
+    power = np.einsum("ij,ij->i", matrix, matrix)
+    seen = seen_pupil(answers_of(power, np.ones(len(power)), valid), len(valid))
+    if seen is None:
+        return []
+    return [
+        f"{seen.words}, the mask has {len(valid)}: say --pupil-subap, unless the mirror does not "
+        "reach these"
+    ]
 
 
 # --- the mirror

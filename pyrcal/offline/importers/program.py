@@ -78,6 +78,7 @@ def _reported(options: argparse.Namespace) -> Reported:
         obscuration_ratio=options.obscuration,
         wavelength_m=options.wavelength_m,
         modulation_lambda_over_d=options.modulation,
+        pupil_diameter_subap=options.pupil_subap,
         unit=getattr(options, "unit", UNIT if options.source in {"specula", "synim"} else None),
     )
 

@@ -10,8 +10,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pyrcal.offline.advice import Grounds, recommendation
 from pyrcal.offline.fitted import Fit
+from pyrcal.offline.left_over import LeftOver
 from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.verdict import Refusal
 from service.estimation.reference import Reference
 from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration
@@ -19,6 +22,7 @@ from service.model.modes import modal_basis
 from service.model.pupil import lit_subapertures
 from service.model.slopes import SlopeRecipe
 from tests.unit.estimation.bench import ELSEWHERE, PLAIN, fit, instrument, matrix
+from tests.unit.offline.made import a_fit
 from tests.unit.offline.test_mistold import MODES, TRUTH, N, bench, masked, sigmas_off, zonal
 
 EXPLAIN = FitOptions(explain=True)
@@ -309,6 +313,22 @@ def test_a_mode_that_was_measured_badly_is_named():
 
 
 # --- what to do
+
+
+def test_modes_that_fit_badly_are_the_cause_where_sets_of_modes_disagree():
+    bad = LeftOver(border=None, subapertures=(), modes=((67, 0.71),))
+    divided = a_fit(accepted=False, verdict="refused: sets of modes disagree", left_over=bad)
+    grounds = Grounds(refusal=Refusal.DIVIDED, structure=0.05, n_sets=8)
+    assert recommendation(divided, grounds) == (
+        "do not use it: modes that fit worse than the others: 67 (71%) left over; measure these "
+        "again, or leave them out (--modes)"
+    )
+
+
+def test_a_sigma_next_to_what_is_enough_is_said_to_its_third_place():
+    known = a_fit(covariance=np.diag([0.0304**2, 1e-6, 1e-12, 1e-12]))
+    grounds = Grounds(refusal=None, structure=0.0, n_sets=8)
+    assert "known to 0.030 subapertures (1 sigma), 0.03 is enough" in recommendation(known, grounds)
 
 
 def test_too_few_modes_and_too_much_noise_are_reasons_to_measure_more():

@@ -153,6 +153,23 @@ def test_calibrations_of_pyrtc_are_known_by_their_record(tmp_path):
         np.testing.assert_array_equal(file.find("interaction_matrix").read(), recorded)
 
 
+@pytest.mark.parametrize("told", [None, 8.0])
+def test_a_mask_that_is_wider_than_the_pupil_is_said_and_a_diameter_that_is_told_is_taken(told):
+    rows, columns = np.mgrid[:12, :12] - 5.5
+    away = np.hypot(rows, columns)[None, :, :, None]
+    maps = np.where(away < 4.0, 1.0, 0.05) * np.ones((2, 12, 12, 5))
+    maps[:, away[0, :, :, 0] > 6.0] = 0.0
+    reported = replace(REPORTED, pupil_diameter_subap=told)
+    imported = from_arrays("bench", {"matrix": maps, "modes": CUBE}, reported)
+    (note,) = [n for n in imported.notes if "--pupil-subap" in n] or [None]
+    if told is None:
+        assert "the pupil's image looks 8 subapertures wide, the mask has 12" in note
+        assert "pupil_diameter_subap" not in imported.tables["wfs"]
+    else:
+        assert note is None
+        assert imported.tables["wfs"]["pupil_diameter_subap"] == told
+
+
 def test_a_bare_array_has_no_record_and_is_refused_without_its_role(tmp_path, capsys):
     np.save(tmp_path / "im.npy", MATRIX)
     words = ["import", "pyrtc", str(tmp_path / "im.npy"), "--diameter-m", "2"]

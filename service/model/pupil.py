@@ -194,21 +194,30 @@ def _shares(
 def _shadows(pupil: PupilGrid, outline: _Outline) -> NDArray[np.float64]:
     """Return the share of every cell ``(n, n)`` that an arm of the spider hides.
 
-    Cells are divided; of each part the share is that of an edge across it.
+    Cells near an arm are divided; of each part the share is that of an edge across it.
     """
-    inside = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) / pupil.sampling
-    fine = (pupil.coordinates[:, None] + inside).reshape(-1)
-    part, hidden = 1.0 / (_PARTS * pupil.sampling), np.zeros((len(fine), len(fine)))
-    for degrees in outline.spiders_deg:
-        cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-        along = cosine * fine + sine * fine[:, None]
-        across = np.abs(cosine * fine[:, None] - sine * fine)
+    cell, centres = 1.0 / pupil.sampling, pupil.coordinates
+    directions = [
+        (float(np.cos(angle)), float(np.sin(angle))) for angle in np.deg2rad(outline.spiders_deg)
+    ]
+    near = np.zeros((len(centres), len(centres)), np.bool_)
+    for cosine, sine in directions:
+        reach = outline.spiders / 2 + cell * (abs(cosine) + abs(sine))
+        near |= np.abs(cosine * centres[:, None] - sine * centres) < reach
+    inside = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) * cell
+    row, column = np.nonzero(near)
+    y = centres[row][:, None, None] + inside[:, None]
+    x = centres[column][:, None, None] + inside
+    part, hidden = cell / _PARTS, np.zeros((len(row), _PARTS, _PARTS))
+    for cosine, sine in directions:
         width = part * (abs(cosine) + abs(sine))  # of a square part, seen along the edge
+        across = np.abs(cosine * y - sine * x)
         covered = np.clip((outline.spiders / 2 - across) / width + 0.5, 0.0, 1.0)
-        covered *= np.clip(along / width + 0.5, 0.0, 1.0)
+        covered *= np.clip((cosine * x + sine * y) / width + 0.5, 0.0, 1.0)
         np.maximum(hidden, covered, out=hidden)
-    n = len(pupil.coordinates)
-    return np.asarray(hidden.reshape(n, _PARTS, n, _PARTS).mean(axis=(1, 3)))
+    shares = np.zeros(near.shape)
+    shares[near] = hidden.mean(axis=(1, 2))
+    return shares
 
 
 def valid_subapertures(instrument: Instrument) -> NDArray[np.bool_]:

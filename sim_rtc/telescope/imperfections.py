@@ -82,6 +82,12 @@ SETS = {
 """Mixes that have a name."""
 
 
+_WHOLE_BYTES = 1e9
+"""A larger array is worked through in parts: it would stand in memory five times."""
+
+_COLUMNS = 1024
+
+
 class SlopeErrors:
     """Errors of light and slopes: dark pixels, silent subapertures, turned axes.
 
@@ -128,6 +134,15 @@ class SlopeErrors:
         """Return the slopes with these errors; the first axis of ``slopes`` is ``n_slopes``."""
         if self.absent:
             return slopes
+        if slopes.nbytes <= _WHOLE_BYTES:
+            return self._wrong(slopes)
+        read = np.empty_like(slopes)
+        for start in range(0, slopes.shape[1], _COLUMNS):
+            part = slice(start, start + _COLUMNS)
+            read[:, part] = self._wrong(slopes[:, part])
+        return read
+
+    def _wrong(self, slopes: Array32) -> Array32:
         along_x, along_y = before = slopes_of(slopes, self.recipe.kind)
         turned = np.stack(
             [

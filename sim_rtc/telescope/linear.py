@@ -32,6 +32,8 @@ _SAMPLINGS = (4, 2)
 
 _LARGEST_BYTES = 1e9
 
+_ROWS = 4096
+
 _NODES = 4
 _SOURCE_POINTS = 32
 
@@ -106,7 +108,10 @@ class LinearPlant(Plant):
         modes = np.ascontiguousarray(shapes)
         matrix = jacobian @ modes
         content = modal_content(modes, self.weights).astype(np.float32)
-        jacobian += (matrix * (self._gain - 1.0)) @ content
+        lost = matrix * (self._gain - 1.0)
+        for start in range(0, len(lost), _ROWS):  # the whole product would be as large as K
+            rows = slice(start, start + _ROWS)
+            jacobian[rows] += lost[rows] @ content
         return LinearOptics(
             alpha=alpha,
             responses=((1.0, PhaseResponse(jacobian)),),

@@ -3,9 +3,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from service.model.kinds import SignalKind
 from service.model.misregistration import Misregistration
 from service.model.pupil import instrument_pupil
 from service.model.sensors.pyramid.signals import pixel_places
+from service.model.slopes import SlopeRecipe
+from sim_rtc.telescope import imperfections
 from sim_rtc.telescope.diffractive import DiffractiveOptics, DiffractivePlant
 from sim_rtc.telescope.imperfections import (
     SETS,
@@ -57,6 +60,17 @@ def test_turned_axes_turn_the_slopes_and_keep_their_length():
     read = errors.applied(slopes)
     np.testing.assert_allclose(read[25:], slopes[:25], atol=1e-5)
     np.testing.assert_allclose(read[:25], -slopes[25:], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", SignalKind)
+def test_what_is_worked_through_in_parts_is_the_same(kind, monkeypatch):
+    rng = np.random.default_rng(2)
+    wrong = replace(IDEAL, bad_pixels=3, slope_rotation_deg=2.0)
+    errors = SlopeErrors(PIXELS, wrong, rng, SlopeRecipe(order=kind.orders[0]))
+    slopes = rng.normal(size=(kind.n_planes * 25, 2500)).astype(np.float32)
+    whole = errors.applied(slopes)
+    monkeypatch.setattr(imperfections, "_WHOLE_BYTES", 0)
+    np.testing.assert_array_equal(errors.applied(slopes), whole)
 
 
 def test_a_dead_pixel_silences_both_slopes_of_its_subaperture():

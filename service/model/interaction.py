@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
@@ -21,7 +21,7 @@ from typing_extensions import override
 from service.model.arrays import NUMPY, Arrays
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
-from service.model.local import LocalShapes, Patch, Shapes, beside, tiles_of
+from service.model.local import Drawing, LocalShapes, Patch, Shapes, beside, tiles_of
 from service.model.misregistration import Misregistration, rotation, stretching
 from service.model.modes import Basis, ModalBasis
 from service.model.pupil import Illumination, instrument_pupil
@@ -125,6 +125,17 @@ class InteractionModel:
     ) -> None:
         self.instrument = instrument
         self._anamorphosis = anamorphosis
+        self._again = partial(
+            InteractionModel,
+            instrument,
+            pupil_sampling=pupil_sampling,
+            detector_nodes=detector_nodes,
+            working_point=working_point,
+            illumination=illumination,
+            dtype=dtype,
+            kept_bytes=kept_bytes,
+            arrays=arrays,
+        )
         binning = instrument.binning  # of the finest subapertures, so fine are points and nodes
         pupil = instrument_pupil(instrument, pupil_sampling * binning)
         self.pupil = pupil if illumination is None else pupil.lit_by(illumination)
@@ -153,7 +164,10 @@ class InteractionModel:
         self._modes: _Last[Shapes] = _Last()
         local = isinstance(basis, ModalBasis) and basis.is_local
         self._tiles = tiles_of(self.pupil) if local else ()
-        self._combination = basis.coefficients.astype(self._dtype) if local else None
+        self._combination: Array | None = None
+        if isinstance(basis, ModalBasis) and local:
+            single = self._dtype is np.float32
+            self._combination = basis.in_single.coefficients if single else basis.coefficients
 
     def forget(self) -> None:
         """Give back the memory of the last response and the last rendered modes."""
@@ -196,10 +210,7 @@ class InteractionModel:
         stretches = self.instrument.with_anamorphosis(alpha).stretches
         back = np.linalg.inv(stretching(stretches)) @ turn
         along, askew = -turn.T * [1.0, -1.0] @ back, -turn.T[:, ::-1] @ back
-        moved = [
-            self._moved(alpha, lambda at: at @ along),
-            self._moved(alpha, lambda at: at @ askew),
-        ]
+        moved = [self._moved(alpha, partial(_stretching, by=by)) for by in (along, askew)]
         rates = self._seen_together(alpha, moved)
         return np.stack([self._as_listed(rate) for rate in rates])
 
@@ -303,16 +314,10 @@ class InteractionModel:
 
         With the mirror as stop a shift does not: it moves the pupil's images.
         """
-        ways: list[Way] = [
-            lambda at: at[:, ::-1] * [1.0, -1.0],
-            lambda at: -at / alpha.magnification,
-        ]
+        ways: list[Way] = [_turning, partial(_growing, magnification=alpha.magnification)]
         if self.instrument.stop is Stop.TELESCOPE:
-            step_x, step_y = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
-            ways[:0] = [
-                lambda at: np.broadcast_to(step_x, at.shape),
-                lambda at: np.broadcast_to(step_y, at.shape),
-            ]
+            steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
+            ways[:0] = [partial(_shifting, step=step) for step in steps]
         return [self._moved(alpha, way) for way in ways]
 
     def _seen_together(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
@@ -348,11 +353,40 @@ class InteractionModel:
             n_points=int(self.pupil.lit.sum()),
             n_functions=len(basis.coefficients),
             combination=self._combination,
+            drawing=Drawing(
+                parts=(self._again, basis.in_single if self._dtype is np.float32 else basis),
+                prepare=_made_again,
+                draw=partial(_drawn, alpha=alpha, way=way),
+            ),
         )
         return shapes if shapes.is_cheaper else shapes.array()
 
     def _by_rows(self, function: Callable[[Array], Array], rows: Array) -> Array:
         return by_rows(self._map, function, rows)
+
+
+def _made_again(model_of: Callable[[Basis], InteractionModel], basis: Basis) -> InteractionModel:
+    return model_of(basis)
+
+
+def _drawn(model: InteractionModel, *, alpha: Misregistration, way: Way | None) -> Shapes:
+    return model._moved(alpha, way)  # noqa: SLF001 - its own, in another process
+
+
+def _turning(at: Array) -> Array:
+    return at[:, ::-1] * [1.0, -1.0]
+
+
+def _growing(at: Array, *, magnification: float) -> Array:
+    return -at / magnification
+
+
+def _shifting(at: Array, *, step: Array) -> Array:
+    return np.broadcast_to(step, at.shape)
+
+
+def _stretching(at: Array, *, by: Array) -> Array:
+    return at @ by
 
 
 @dataclass(slots=True)

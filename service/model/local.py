@@ -6,8 +6,9 @@ not thousands: what a sensor makes of the tile is multiplied by those, and the m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -52,6 +53,26 @@ class Patch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drawing:
+    """Local shapes as what they are made from: a few kilobytes beside the modes."""
+
+    parts: tuple[object, ...]
+    """What all shapes of a model have in common: its settings and its modes."""
+
+    prepare: Callable[..., Any]
+    """Makes the model of its parts."""
+
+    draw: Callable[[Any], Shapes]
+    """Makes the shapes of the model."""
+
+    @classmethod
+    def beside(cls, drawings: Sequence[Drawing]) -> Drawing:
+        """Return the drawing of one model's shapes beside one another."""
+        draw = partial(_drawn_beside, draws=tuple(one.draw for one in drawings))
+        return replace(drawings[0], draw=draw)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalShapes:
     """Combinations of local functions: ``rows @ shapes`` is a product as with an array of shapes.
 
@@ -70,6 +91,9 @@ class LocalShapes:
     n_layers: int = 1
     """Sets of functions, combined alike, that stand beside one another: heights and rates, as many
     as were put ``beside`` one another. Function j of layer k is number ``k n_functions + j``."""
+
+    drawing: Drawing | None = None
+    """From what somebody else can make them; None: he cannot."""
 
     __array_ufunc__: ClassVar[None] = None
 
@@ -157,7 +181,13 @@ def beside(shapes: Sequence[Shapes]) -> Shapes:
         )
         for layers in zip(*(one.patches for one in local), strict=True)
     ]
-    return replace(local[0], patches=patches, n_layers=len(local))
+    drawings = [one.drawing for one in local if one.drawing is not None]
+    drawing = Drawing.beside(drawings) if len(drawings) == len(local) else None
+    return replace(local[0], patches=patches, n_layers=len(local), drawing=drawing)
+
+
+def _drawn_beside(model: object, *, draws: Sequence[Callable[[Any], Shapes]]) -> Shapes:
+    return beside([draw(model) for draw in draws])
 
 
 def tiles_of(pupil: PupilGrid) -> tuple[Tile, ...]:

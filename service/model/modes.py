@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,12 @@ class ModalBasis:
     def __getstate__(self) -> dict[str, object]:
         """Leave out the sums, 26 MB: whoever gets it makes them by himself."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @cached_property
+    def in_single(self) -> ModalBasis:
+        """The same modes as products take them, in float32."""
+        strokes: NDArray[Any] = self.coefficients.astype(np.float32)
+        return replace(self, mode_to_actuator=strokes, coefficients=strokes)
 
     @property
     def is_local(self) -> bool:

@@ -66,6 +66,13 @@ class Cluster:
         self.address = address
         self._client = _connected(address)
         self._seen_s = time.monotonic()
+        self._submitting = threading.Lock()
+        self._parts: list[tuple[object, Future]] = []
+        """What is with the workers already, of the last functions."""
+
+        self._checked: set[str] = set()
+        """Workers that are of this version."""
+
         try:
             self._check_versions()
         except BaseException:
@@ -118,16 +125,19 @@ class Cluster:
 
     def each(
         self,
-        function: Callable[[Item], Result],
+        function: Callable[..., Result],
         items: Sequence[Item],
         *,
+        parts: Sequence[object] = (),
         is_large: bool = False,
         enough: threading.Event | None = None,
     ) -> Iterator[tuple[int, Result]]:
         """Yield the number of an item and what the function makes of it, as they come.
 
-        What the function raises is raised here. One that ``is_large``, megabytes, is sent to each
-        worker once. Ends early when somebody has ``enough``.
+        What the function raises is raised here. It is given the ``parts`` after each item: they
+        stay with the workers for the next time, as long as they are the same objects. A function
+        that ``is_large``, megabytes, is sent to each worker once. Ends early when somebody has
+        ``enough``.
 
         Raises
         ------
@@ -136,8 +146,10 @@ class Cluster:
             version.
         """
         waiting: dict[Future, int] = {}
+        self._check_workers()
         try:
-            waiting |= {f: k for k, f in enumerate(self._submitted(function, items, is_large))}
+            futures = self._submitted(function, items, parts, is_large=is_large)
+            waiting |= {future: number for number, future in enumerate(futures)}
             while waiting and not (enough and enough.is_set()):
                 for future in self._finished(waiting):
                     yield waiting.pop(future), self._result_of(future)
@@ -146,17 +158,38 @@ class Cluster:
                 self._client.cancel(list(waiting))
 
     def _submitted(
-        self, function: Callable[[Item], Result], items: Sequence[Item], is_large: bool
+        self,
+        function: Callable[..., Result],
+        items: Sequence[Item],
+        parts: Sequence[object],
+        *,
+        is_large: bool,
     ) -> list[Future]:
-        client = self._client
         try:
-            sent = client.scatter(function, broadcast=True, hash=False) if is_large else function
-            futures = client.map(
-                _perform, items, function=sent, expected=own_versions(), pure=False
+            with self._submitting:
+                there = self._sent(parts)
+            futures = self._client.map(
+                _perform,
+                items,
+                function=self._scattered(function) if is_large else function,
+                expected=own_versions(),
+                parts=there,
+                pure=False,
             )
         except Exception as error:
             raise self._lost(error) from error
         return list(futures)
+
+    def _sent(self, parts: Sequence[object]) -> list[Future]:
+        """Return parts as every worker has them; those that it had before are not sent again."""
+        there = {id(part): future for part, future in self._parts if future.status == "finished"}
+        if parts:
+            found = [there.get(id(part)) or self._scattered(part) for part in parts]
+            self._parts = list(zip(parts, found, strict=True))
+        return [future for _, future in self._parts] if parts else []
+
+    def _scattered(self, what: object) -> Future:
+        return self._client.scatter(what, broadcast=True, hash=False)
 
     def _finished(self, waiting: Mapping[Future, int]) -> list[Future]:
         """Wait for the first of them, for no longer than a look; return those that are done."""
@@ -214,17 +247,33 @@ class Cluster:
         )
 
     def _check_versions(self) -> None:
-        expected = own_versions()
         try:
-            found: dict[str, Any] = self._client.run(own_versions, on_error="return")
-            found["the scheduler"] = self._client.run_on_scheduler(own_versions)
+            told = self._client.run_on_scheduler(own_versions)
         except Exception as error:
             raise ClusterError(_other_version(self.address, "the scheduler", error)) from error
-        if len(found) == 1:
+        self._compare({"the scheduler": told})
+        self._check_workers()
+        if not self._checked:
             raise ClusterError(f"{self.address}: found a scheduler without workers; {self._start}")
-        for who, told in found.items():
-            if told != expected:
-                raise ClusterError(_other_version(self.address, who, told))
+
+    def _check_workers(self) -> None:
+        """Refuse workers of another version: those that have come since the last time are asked.
+
+        One without pyrcal ends by itself when it is given a task, and nobody would know why.
+        """
+        came = sorted(set(self._workers()) - self._checked)
+        if came:
+            try:
+                told = self._client.run(own_versions, workers=came, on_error="return")
+            except Exception as error:
+                raise self._lost(error) from error
+            self._compare(told)
+            self._checked |= set(told)
+
+    def _compare(self, told: Mapping[str, object]) -> None:
+        for who, found in told.items():
+            if found != own_versions():
+                raise ClusterError(_other_version(self.address, who, found))
 
 
 @cache
@@ -243,13 +292,18 @@ def own_versions() -> Versions:
     }
 
 
-def _perform(item: Item, function: Callable[[Item], Result], expected: Versions) -> Result:
+def _perform(
+    item: Item,
+    function: Callable[..., Result],
+    expected: Versions,
+    parts: Sequence[object] = (),
+) -> Result:
     """Do a task on a worker, also on one that has come after the others were asked."""
     _keep_freed_memory()
     found = own_versions()
     if found != expected:
         raise ClusterError(_other_version(platform.node(), "a worker", found, expected))
-    return function(item)
+    return function(item, *parts)
 
 
 @cache

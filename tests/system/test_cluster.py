@@ -5,14 +5,18 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from service.errors import ClusterError
 from service.runtime.cluster import Cluster
+from service.runtime.worker import rows
 from tests.system.cable import free_port
 from tests.system.dask_cluster import dask_cluster
 from tests.system.night import INSTRUMENT, N_TARGET, ROOT, a_night, wait_for
 from tests.system.pace import patience
+from tests.unit.runtime.test_remote_rows import FIRST, model_of
+from tests.unit.runtime.test_shared_rows import helped_by
 
 pytestmark = [pytest.mark.system, pytest.mark.long]
 
@@ -119,6 +123,49 @@ def test_a_worker_of_another_pyrcal_is_named(tmp_path):
         dask.add_worker(other)
         with pytest.raises(ClusterError, match=r"found pyrcal .*\(code \w+\), expected pyrcal"):
             Cluster(dask.address)
+
+
+def without_pyrcal(folder):
+    """Make a folder in which a worker finds no pyrcal; return it."""
+    (folder / "without" / "service").mkdir(parents=True)
+    nothing = "raise ModuleNotFoundError(\"No module named 'service'\", name='service')\n"
+    (folder / "without" / "service" / "__init__.py").write_text(nothing)
+    return folder / "without"
+
+
+NO_PYRCAL = r"found no pyrcal that can be asked for its version \(ModuleNotFoundError"
+
+
+def test_a_worker_without_pyrcal_is_named_whenever_it_comes(tmp_path):
+    without = without_pyrcal(tmp_path)
+    with dask_cluster(tmp_path, n_workers=1) as dask:
+        with Cluster(dask.address) as cluster:
+            dask.add_worker(without)
+            with pytest.raises(ClusterError, match=NO_PYRCAL) as late:
+                list(cluster.each(abs, [-1, -2]))
+        with pytest.raises(ClusterError, match=NO_PYRCAL) as first:
+            Cluster(dask.address)
+    assert not any("\n" in str(one.value) for one in (late, first))
+
+
+def test_rows_of_a_worker_that_is_killed_are_computed_by_the_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(rows, "ROW_S", 0.0)
+    monkeypatch.setattr(rows, "PAYS_S", 0.0)
+    monkeypatch.setattr(rows, "_compute", lambda *work: None)  # all but the first by the cluster
+    here = model_of().linearise(FIRST)
+    with dask_cluster(tmp_path) as dask, Cluster(dask.address) as cluster:
+        each = cluster.each
+
+        def struck(*args, **how):
+            for number, answer in enumerate(each(*args, **how)):
+                if number == 2:
+                    dask.workers[0].kill()
+                yield answer
+
+        monkeypatch.setattr(cluster, "each", struck)
+        there = model_of(mapper=helped_by(cluster, 1).map).linearise(FIRST)
+    np.testing.assert_array_equal(there.matrix, here.matrix)
+    np.testing.assert_array_equal(there.rates, here.rates)
 
 
 def test_a_service_names_a_cluster_that_is_gone_and_works_on(tmp_path):

@@ -27,7 +27,7 @@ Mapper = Callable[[Callable[[int], Any], Iterable[int]], Iterator[Any]]
 
 
 class RowTask(ABC):
-    """A function of rows that may be sent to another process: megabytes, and no threads in it.
+    """A function of rows that may be sent to another process: no threads in it.
 
     A mapper may share its rows with other machines; those of any other function stay here.
     """
@@ -35,6 +35,25 @@ class RowTask(ABC):
     @abstractmethod
     def __call__(self, row: int) -> Array:
         """Return what there is of a row."""
+
+    @property
+    def elsewhere(self) -> RowsElsewhere | None:
+        """From what another process makes the same; None: it gets megabytes of arrays."""
+        return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RowsElsewhere:
+    """A function of rows as what it is made from; all can be pickled."""
+
+    parts: tuple[object, ...]
+    """What all matrices of a model have in common: instrument, modes. Sent once."""
+
+    prepare: Callable[..., Any]
+    """Makes of the parts what is kept for the next matrix, too."""
+
+    make: Callable[[Any], RowTask]
+    """Makes of that the function: a kilobyte."""
 
 
 KEPT_BYTES = 1e9

@@ -19,6 +19,7 @@ from typing import Any
 from service.errors import ClusterError
 from service.model.sensors.sensor import RowTask
 from service.runtime.cluster import Cluster
+from service.runtime.worker.remote_rows import RemoteRows
 
 ROW_S = 0.2
 """A row that takes less is not worth a task: Dask and the way there take some milliseconds,"""
@@ -85,8 +86,7 @@ class SharedRows:
         enough: threading.Event,
     ) -> None:
         try:
-            backwards = cluster.each(function, rows[::-1], is_large=True, enough=enough)
-            for number, answer in backwards:
+            for number, answer in _asked(cluster, function, rows[::-1], enough):
                 _give(answers[-1 - number], answer)
         except ClusterError as error:
             self._let_go(cluster, str(error))
@@ -116,6 +116,16 @@ class SharedRows:
 _TAKEN: Future[Any] = Future()
 """In the place of an answer that is not needed any more."""
 _TAKEN.set_result(None)
+
+
+def _asked(
+    cluster: Cluster, function: Row, rows: list[int], enough: threading.Event
+) -> Iterator[tuple[int, Any]]:
+    """Ask a cluster for rows: it gets what they are made from, where that is known, else all."""
+    there = function.elsewhere if isinstance(function, RowTask) else None
+    if there is None:
+        return cluster.each(function, rows, is_large=True, enough=enough)
+    return cluster.each(RemoteRows.of(there), rows, parts=there.parts, enough=enough)
 
 
 def _give(answer: Future[Any], found: Any) -> None:  # noqa: ANN401 - a row of anything

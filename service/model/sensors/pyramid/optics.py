@@ -24,7 +24,7 @@ from service.model.pupil import PupilGrid, gauss_legendre
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.sensors.pyramid.tiles import TiledResponse
 from service.model.sensors.pyramid.working_point import Halo
-from service.model.sensors.sensor import Mapper, RowTask
+from service.model.sensors.sensor import Mapper, RowsElsewhere, RowTask
 from service.model.slopes import PLAIN, SlopeRecipe
 
 Array = NDArray[Any]
@@ -402,10 +402,32 @@ class RowResponse(RowTask):
         """What all rows share."""
         return self.optics.prepare(self)
 
+    @property
+    @override
+    def elsewhere(self) -> RowsElsewhere | None:
+        """From what another process makes the same, where shapes can be drawn there."""
+        drawing = self.shapes.drawing if isinstance(self.shapes, LocalShapes) else None
+        if drawing is None:
+            return None
+        make = partial(
+            _of_model,
+            draw=drawing.draw,
+            shift=self.shift,
+            nodes_y=self.nodes_y,
+            nodes_x=self.nodes_x,
+        )
+        return RowsElsewhere(parts=drawing.parts, prepare=drawing.prepare, make=make)
+
     @override
     def __getstate__(self) -> dict[str, object]:
         """Leave out what whoever gets it prepares by himself."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def _of_model(model: Any, *, draw: Callable[[Any], Shapes], **where: Any) -> RowResponse:  # noqa: ANN401 - a model of its own
+    """Return rows of a model's pyramid, of the shapes that can be drawn of it."""
+    optics = model.sensor.optics
+    return RowResponse(optics=optics, valid=model.valid, shapes=draw(model), **where)
 
 
 def enough_modulation_points(wfs: Pyramid) -> int:

@@ -26,6 +26,9 @@ from service.model.slopes import to_conventions
 from service.tracking.policy import SECOND_NS
 from service.wire import FrameBatch, Manifest, Status, decode, decode_frames
 
+FRAMES = "frames"
+"""What the time of all measurements is called, by which files of pyrcal's own are known."""
+
 
 @dataclass(slots=True, kw_only=True)
 class Excerpt:
@@ -210,7 +213,7 @@ def _add_telemetry(aotpy: Any, system: Any, instrument: Instrument, taken: Excer
     commands_m = np.concatenate([batch.commands_m for batch in taken.batches])
     slopes = _as_listed(np.concatenate([batch.slopes for batch in taken.batches]), instrument)
     (sensor,), (corrector,) = system.wavefront_sensors, system.wavefront_correctors
-    sensor.measurements = aotpy.Image("slopes", slopes, time=_time(aotpy, "frames", t_ns, seqs))
+    sensor.measurements = aotpy.Image("slopes", slopes, time=_time(aotpy, FRAMES, t_ns, seqs))
     system.date_beginning, system.date_end = (
         datetime.fromtimestamp(int(t) / SECOND_NS, UTC).replace(tzinfo=None)
         for t in (t_ns[0], t_ns[-1])
@@ -237,6 +240,12 @@ def _add_telemetry(aotpy: Any, system: Any, instrument: Instrument, taken: Excer
                 measurements_to_modes=control,
             )
         )
+
+
+def is_own(measurements: Any) -> bool:  # noqa: ANN401
+    """Whether measurements of an AOT file were written here: in the axes of conventions.md."""
+    time = measurements.time
+    return time is not None and str(time.uid).casefold() == f"time of {FRAMES}"
 
 
 def _time(aotpy: Any, name: str, t_ns: NDArray[np.int64], seqs: NDArray[np.int64]) -> Any:  # noqa: ANN401

@@ -346,7 +346,7 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
             (words("folder CONF", type=Path), *_REPORTED),
         ),
         ("pyrtc", "from calibrations of pyRTC 2, or bare arrays", (named, unit, *_REPORTED)),
-        ("aot", "from an AOT file", (words("file FILE.fits", type=Path), *_REPORTED)),
+        ("aot", "from an AOT file", (words("file FILE.fits", type=Path), unit, *_REPORTED)),
         ("npz", "from NumPy, FITS or HDF5 files", (named, unit, *_REPORTED)),
     ):
         add(sources.add_parser(source, help=purpose), *more, folder)

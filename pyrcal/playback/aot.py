@@ -1,21 +1,24 @@
 """Telemetry and α of an AOT file, as arrays that ``pyrcal track`` plays.
 
 What ``pyrcal archive aot`` wrote comes back: signals, commands, reconstructor and frame numbers bit
-for bit; times are doubles of seconds there, 2.4e-7 s apart.
+for bit; times are doubles of seconds there, 2.4e-7 s apart. Its signals are in the axes of
+conventions.md; those of any other file are as its instrument lists them.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.aot import is_own
 from pyrcal.offline.importers.aot import places_of, read_system, registrations_between
 from pyrcal.offline.importers.registration import SECOND_NS, Dated
 from service.errors import MatrixError
-from service.model.instrument import Instrument
+from service.model.instrument import Instrument, Mirror
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import to_rtc
 
@@ -24,18 +27,25 @@ Array = NDArray[Any]
 UNITS_M = {None: 1.0, "": 1.0, "m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of modal commands; without one they are metres."""
 
+OFF_THE_BEAT = 0.25
+"""Of a frame, by which a time may be off the rate."""
 
-class AotTelemetry(NamedTuple):
+NO_MODES = 1e-2
+"""RMS share of the actuators' commands that no mode makes: more, and modes do not tell them."""
+
+
+@dataclass(kw_only=True, slots=True)
+class AotTelemetry:
     """What an AOT file holds of a night."""
-
-    arrays: dict[str, Array]
-    """As ``pyrcal.playback.arrays`` names them, in the RTC's order; empty: no frames."""
 
     registrations: tuple[Dated, ...]
     """The file's own α over time; empty: it says none."""
 
-    left_out: tuple[str, ...]
-    """Loops that are not in the arrays: the one with the most frames is."""
+    arrays: dict[str, Array] = field(default_factory=dict)
+    """As ``pyrcal.playback.arrays`` names them, in the RTC's order; empty: no frames."""
+
+    notes: list[str] = field(default_factory=list)
+    """What was taken for granted, and what is not played, one sentence each."""
 
 
 def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
@@ -56,90 +66,191 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
         )
     (sensor,), (mirror,) = system.wavefront_sensors, system.wavefront_correctors
     told = registrations_between(mirror, sensor, instrument.subaperture_m, str(path))
-    loops = [loop for loop in system.loops if getattr(loop, "modal_coefficients", None)]
-    arrays: dict[str, Array] = {}
-    left_out: tuple[str, ...] = ()
+    night = AotTelemetry(registrations=() if told is None else told.over_time)
+    loops = [loop for loop in system.loops if _commands(loop) is not None]
     if loops and sensor.measurements is not None:
-        loops.sort(key=lambda loop: -len(loop.modal_coefficients.data))
-        arrays = _arrays(loops[0], sensor, instrument, path)
-        left_out = tuple(loop.uid for loop in loops[1:])
-    return AotTelemetry(arrays, () if told is None else told.over_time, left_out)
-
-
-def _arrays(loop: Any, sensor: Any, instrument: Instrument, path: Path) -> dict[str, Array]:  # noqa: ANN401
-    """Return the frames of a loop; slopes are those that its commands are of."""
-    image, commands = sensor.measurements, loop.modal_coefficients
-    if image.unit not in {None, ""}:
-        raise MatrixError(
-            f"{path}: measurements: found the unit {image.unit}, expected slopes without one"
+        loops.sort(key=lambda loop: -len(_commands(loop).data))
+        night.arrays = _Reader(path=path, instrument=instrument, notes=night.notes).arrays(
+            loops[0], sensor
         )
-    listed = _listed(sensor, instrument, path)
-    slopes = _as_rtc(np.asarray(image.data), listed, instrument, path)
-    every, seqs = _frames(image, path), _frames(commands, path)
-    t_ns = [round(float(stamp) * SECOND_NS) for stamp in commands.time.timestamps]
-    places = {seq: k for k, seq in enumerate(every)}
-    if alone := [seq for seq in seqs if seq not in places]:
-        raise MatrixError(
-            f"{path}: loop {loop.uid}: found a command of frame {alone[0]}, which has no slopes"
+        if rest := [loop.uid for loop in loops[1:]]:
+            night.notes.append(f"one loop is played; left out: {', '.join(rest)}")
+    return night
+
+
+def _commands(loop: Any) -> Any:  # noqa: ANN401 - aotpy has no types
+    """Return the image of a loop's commands: of modes, or else of actuators; None: it has none."""
+    modal = getattr(loop, "modal_coefficients", None)
+    return loop.commands if modal is None else modal
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Reader:
+    path: Path
+    instrument: Instrument
+    notes: list[str]
+
+    def arrays(self, loop: Any, sensor: Any) -> dict[str, Array]:  # noqa: ANN401
+        """Return the frames of a loop; slopes are those that its commands are of."""
+        image, commands = sensor.measurements, _commands(loop)
+        if image.unit not in {None, ""}:
+            raise self._refusal(
+                f"measurements: found the unit {image.unit}, expected slopes without one"
+            )
+        if not loop.framerate:
+            raise self._refusal(f"loop {loop.uid}: found no framerate, expected frames a second")
+        own = is_own(image)
+        listed = self._listed(sensor, own=own)
+        slopes = self._as_rtc(np.asarray(image.data), listed, own=own)
+        every, seqs = self._frames(image, commands, float(loop.framerate))
+        places = {seq: k for k, seq in enumerate(every)}
+        if alone := [seq for seq in seqs if seq not in places]:
+            raise self._refusal(
+                f"loop {loop.uid}: found a command of frame {alone[0]}, which has no slopes"
+            )
+        stamps = _stamps(commands)
+        arrays = {
+            "slopes": slopes[[places[seq] for seq in seqs]],
+            "commands_m": self._modal(loop),
+            "seq": np.array(seqs, np.int64),
+            "frame_rate_hz": np.array(float(loop.framerate)),
+            "t0_ns_utc": np.array(float(round(stamps[0] * SECOND_NS)) if stamps else 0.0),
+            **self._filter(loop),
+        }
+        if loop.delay is not None:
+            arrays["delay_frames"] = np.array(float(loop.delay))
+        if loop.measurements_to_modes is not None:
+            control = self._in_metres(loop.measurements_to_modes)
+            arrays["reconstructor"] = self._as_rtc(control, listed, own=own)
+        return arrays
+
+    # --- signals
+
+    def _listed(self, sensor: Any, *, own: bool) -> Array:  # noqa: ANN401
+        """Return where the file lists each of the instrument's subapertures, row by row."""
+        if sensor.subaperture_mask is None:
+            raise self._refusal("found no subaperture_mask, expected one")
+        valid = (valid_subapertures if own else rtc_valid_subapertures)(self.instrument)
+        places = np.asarray(sensor.subaperture_mask.data)
+        if places.shape != valid.shape or not np.array_equal(places >= 0, valid):
+            raise self._refusal(
+                f"subaperture_mask: found {int((places >= 0).sum())} valid subapertures in "
+                f"{places.shape}, expected the {int(valid.sum())} in {valid.shape} of "
+                f"{self.instrument.name}"
+            )
+        return places_of(places, str(self.path))
+
+    def _as_rtc(self, values: Array, listed: Array, *, own: bool) -> Array:
+        """Return signals ``(n, 2, n_valid)``, pixels 4, as the RTC lists them: ``(n, n_slopes)``.
+
+        A file that pyrcal has not written has the RTC's axes and signs, as ``pyrcal import aot``
+        takes them.
+        """
+        recipe = self.instrument.slopes
+        planes = recipe.kind.n_planes
+        if values.ndim != 3 or values.shape[1:] != (planes, len(listed)):
+            raise self._refusal(
+                f"found signals of shape {values.shape}, expected (n, {planes}, {len(listed)})"
+            )
+        by_row = np.ascontiguousarray(values[..., listed].reshape(len(values), -1))
+        if not own:
+            return by_row
+        return np.ascontiguousarray(
+            to_rtc(by_row.T, recipe, rtc_valid_subapertures(self.instrument)).T
         )
-    if not loop.framerate:
-        raise MatrixError(f"{path}: loop {loop.uid}: found no framerate, expected frames a second")
-    arrays = {
-        "slopes": slopes[[places[seq] for seq in seqs]],
-        "commands_m": _in_metres(commands, path),
-        "seq": np.array(seqs, np.int64),
-        "frame_rate_hz": np.array(float(loop.framerate)),
-        "t0_ns_utc": np.array(float(t_ns[0])),
-    }
-    if loop.delay is not None:
-        arrays["delay_frames"] = np.array(float(loop.delay))
-    if loop.measurements_to_modes is not None:
-        control = _in_metres(loop.measurements_to_modes, path)
-        arrays["reconstructor"] = _as_rtc(control, listed, instrument, path)
-    return arrays
 
+    # --- frames
 
-def _listed(sensor: Any, instrument: Instrument, path: Path) -> Array:  # noqa: ANN401
-    """Return where the file lists each of the instrument's subapertures, row by row."""
-    if sensor.subaperture_mask is None:
-        raise MatrixError(f"{path}: found no subaperture_mask, expected one")
-    valid, places = valid_subapertures(instrument), np.asarray(sensor.subaperture_mask.data)
-    if places.shape != valid.shape or not np.array_equal(places >= 0, valid):
-        raise MatrixError(
-            f"{path}: subaperture_mask: found {int((places >= 0).sum())} valid subapertures in "
-            f"{places.shape}, expected the {int(valid.sum())} in {valid.shape} of {instrument.name}"
+    def _frames(self, image: Any, commands: Any, rate_hz: float) -> tuple[list[int], list[int]]:  # noqa: ANN401
+        """Return the numbers of the frames of signals and commands."""
+        n_numbers = [len(_numbers(one)) for one in (image, commands)]
+        if n_numbers == [len(image.data), len(commands.data)]:
+            return _numbers(image), _numbers(commands)
+        stamps = [_stamps(one) for one in (image, commands)]
+        if [len(one) for one in stamps] == [len(image.data), len(commands.data)]:
+            self.notes.append("frames have no numbers: counted by their times")
+            first = min(stamps[0][0], stamps[1][0])
+            every, seqs = (self._counted(one, first, rate_hz) for one in stamps)
+            return every, seqs
+        if any(n_numbers) or any(stamps) or len(image.data) != len(commands.data):
+            raise self._refusal(
+                f"found {n_numbers[0]} frame numbers and {len(stamps[0])} times of "
+                f"{len(image.data)} measurements, {n_numbers[1]} and {len(stamps[1])} of "
+                f"{len(commands.data)} commands, expected one of either each"
+            )
+        self.notes.append("frames have neither numbers nor times: taken as all there are, in order")
+        return list(range(len(image.data))), list(range(len(image.data)))
+
+    def _counted(self, stamps: list[float], first: float, rate_hz: float) -> list[int]:
+        beats = (np.array(stamps) - first) * rate_hz
+        numbers = np.round(beats)
+        off = float(np.max(np.abs(beats - numbers)))
+        if not off <= OFF_THE_BEAT or np.any(np.diff(numbers) <= 0):
+            raise self._refusal(
+                f"found times that are {off:.2g} of a frame off the loop's {rate_hz:g} Hz, or "
+                f"twice in one, expected at most {OFF_THE_BEAT:g}; give frame_numbers"
+            )
+        return [int(number) for number in numbers]
+
+    # --- commands
+
+    def _modal(self, loop: Any) -> Array:  # noqa: ANN401
+        """Return the commands ``(n, n_modes)`` of the instrument's modes, metres."""
+        if loop.modal_coefficients is not None:
+            return self._in_metres(loop.modal_coefficients)
+        strokes_m = self._in_metres(loop.commands)
+        if loop.ref_commands is not None:
+            strokes_m = strokes_m - self._in_metres(loop.ref_commands).ravel()
+        mirror = self.instrument.mirror
+        to_actuators = mirror.mode_to_actuator if isinstance(mirror, Mirror) else None
+        if to_actuators is None or strokes_m.shape[1:] != to_actuators.shape[:1]:
+            found = f"commands of {strokes_m.shape[1:]} actuators"
+            raise self._refusal(
+                f"found {found} and no modal_coefficients, expected modal_coefficients, or an "
+                "instrument file with the mode_to_actuator of these actuators"
+            )
+        modal = strokes_m @ np.linalg.pinv(to_actuators).T
+        left = np.linalg.norm(strokes_m - modal @ to_actuators.T) / np.linalg.norm(strokes_m)
+        if not left <= NO_MODES:
+            raise self._refusal(
+                f"commands: found {left:.0%} of them that no mode of mode_to_actuator makes, "
+                f"expected at most {NO_MODES:.0%}: other actuators, or another order"
+            )
+        self.notes.append("commands of actuators: turned into modes by mode_to_actuator")
+        return np.asarray(modal)
+
+    def _filter(self, loop: Any) -> dict[str, Array]:  # noqa: ANN401
+        """Return gains and leak, where the loop's time filter is an integrator."""
+        if loop.time_filter_num is None or loop.time_filter_den is None:
+            return {}
+        above, below = (
+            np.atleast_2d(np.asarray(one.data, np.float64))
+            for one in (loop.time_filter_num, loop.time_filter_den)
         )
-    return places_of(places, str(path))
+        leaks = -below[:, 1] if below.shape[1] > 1 else np.zeros(1)
+        simple = not above[:, 1:].any() and not below[:, 2:].any() and np.all(below[:, 0] == 1.0)
+        if simple and np.ptp(leaks) == 0.0 and 0.0 < leaks[0] <= 1.0:
+            return {"gains": above[:, 0], "leak": np.array(leaks[0])}
+        self.notes.append("the time filter is no integrator with one leak: gains are taken as 0.5")
+        return {}
+
+    def _in_metres(self, image: Any) -> Array:  # noqa: ANN401
+        if image.unit not in UNITS_M:
+            raise self._refusal(
+                f"{image.name}: found the unit {image.unit}, expected one of m, um, nm"
+            )
+        values, unit_m = np.asarray(image.data), UNITS_M[image.unit]
+        return values if unit_m == 1.0 else values * unit_m
+
+    def _refusal(self, what: str) -> MatrixError:
+        return MatrixError(f"{self.path}: {what}")
 
 
-def _as_rtc(values: Array, listed: Array, instrument: Instrument, path: Path) -> Array:
-    """Return signals ``(n, 2, n_valid)``, pixels 4, as the RTC lists them: ``(n, n_slopes)``."""
-    recipe, mask = instrument.slopes, rtc_valid_subapertures(instrument)
-    planes = recipe.kind.n_planes
-    if values.ndim != 3 or values.shape[1:] != (planes, len(listed)):
-        raise MatrixError(
-            f"{path}: found signals of shape {values.shape}, expected (n, {planes}, {len(listed)})"
-        )
-    ours = values[..., listed].reshape(len(values), -1)
-    return np.ascontiguousarray(to_rtc(ours.T, recipe, mask).T)
+def _numbers(image: Any) -> list[int]:  # noqa: ANN401
+    """Return the numbers of the frames that an image is of; empty: it has none."""
+    return [] if image.time is None else [int(number) for number in image.time.frame_numbers]
 
 
-def _in_metres(image: Any, path: Path) -> Array:  # noqa: ANN401
-    if image.unit not in UNITS_M:
-        raise MatrixError(
-            f"{path}: {image.name}: found the unit {image.unit}, expected one of m, um, nm"
-        )
-    values, unit_m = np.asarray(image.data), UNITS_M[image.unit]
-    return values if unit_m == 1.0 else values * unit_m
-
-
-def _frames(image: Any, path: Path) -> list[int]:  # noqa: ANN401
-    """Return the numbers of the frames that an image is of."""
-    time = image.time
-    numbers = [] if time is None else [int(number) for number in time.frame_numbers]
-    if len(numbers) != len(image.data) or len(time.timestamps) != len(numbers):
-        raise MatrixError(
-            f"{path}: {image.name}: found {len(numbers)} frame numbers of {len(image.data)} "
-            "frames, expected one each, and a time"
-        )
-    return numbers
+def _stamps(image: Any) -> list[float]:  # noqa: ANN401
+    """Return their times, seconds; empty: it has none."""
+    return [] if image.time is None else [float(stamp) for stamp in image.time.timestamps]

@@ -19,6 +19,7 @@ from service.config.policy import compute_of, policy_of
 from service.config.settings import Settings
 from service.errors import ModelError, UnknownIdError, WireError
 from service.estimation.dither_windows import EndedWindow
+from service.estimation.frames import FrameBlock
 from service.estimation.passive_sums import PASSIVE_INTERVAL_S
 from service.estimation.random_dither import Correlated, NoisyMatrix, joined, noisy_matrix
 from service.files.recording import Message, RecordedKind
@@ -69,6 +70,12 @@ class Track:
     n_frames: int = 0
     """Used."""
 
+    n_missing: int = 0
+    """Between these, by their numbers."""
+
+    n_gaps: int = 0
+    """Places where some are missing."""
+
     first_ns_utc: int = 0
     last_ns_utc: int = 0
     """End of the first and of the last used frame, the RTC's clock."""
@@ -108,6 +115,7 @@ class Player:
         self._windows: list[EndedWindow] = []
         self._unheard: str | None = None
         self._random: Correlated | None = None
+        self._next: tuple[str, int] | None = None
         self._engine = Engine(state, policy, self)
         self._engine.set_description(self._optics.describe())
 
@@ -165,10 +173,7 @@ class Player:
             blocks = self._intake.drain(before_events=True)
             self._engine.feed(blocks)
             for block in blocks:
-                if not self.track.n_frames:
-                    self.track.first_ns_utc = block.t0_ns_utc
-                self.track.n_frames += block.n_frames
-                self.track.last_ns_utc = block.next_t_ns - block.dt_ns
+                self._count(block)
             await self._fit_windows()
             events = self._intake.events()
             for event in events:
@@ -177,6 +182,18 @@ class Player:
             await self._hear_matrix()
             if not events:
                 return
+
+    def _count(self, block: FrameBlock) -> None:
+        track = self.track
+        if not track.n_frames:
+            track.first_ns_utc = block.t0_ns_utc
+        elif self._next is not None and self._next[0] == block.session:
+            missing = block.first_seq - self._next[1]
+            track.n_missing += missing
+            track.n_gaps += missing > 0
+        self._next = (block.session, block.next_seq)
+        track.n_frames += block.n_frames
+        track.last_ns_utc = block.next_t_ns - block.dt_ns
 
     async def _fit_windows(self) -> None:
         windows, self._windows = self._windows, []

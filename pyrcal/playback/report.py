@@ -47,8 +47,9 @@ def table(track: Track) -> str:
     """Return the result in a few lines: what was found, by what, and what was the matter."""
     seconds = (track.last_ns_utc - track.first_ns_utc) / SECOND_NS
     windows = track.state.windows
+    missing = f", {track.n_missing} missing in {track.n_gaps} gaps" if track.n_missing else ""
     heading = (
-        f"{track.n_frames} frames, {seconds:.1f} s; {windows.accepted} windows used, "
+        f"{track.n_frames} frames, {seconds:.1f} s{missing}; {windows.accepted} windows used, "
         f"{windows.refused} refused"
     )
     rows: list[Sequence[str]] = [("", *PARAMETERS)]
@@ -67,7 +68,7 @@ def table(track: Track) -> str:
         rows.append(("ordinary telemetry alone", *_cells(last.alpha.vector * BOUNDARY_SCALE)))
         rows.append(("1 sigma, its bias included", *_cells(last.sigma * BOUNDARY_SCALE)))
     rows += _stated(track, None if registration is None else registration.alpha.vector)
-    lines = [heading, *aligned(rows)]
+    lines = [heading, *(aligned(rows) if len(rows) > 1 else ())]
     if registration is None:
         lines.append(f"alpha was not found: {_why_not(track)}")
     if track.noisy is not None:
@@ -139,6 +140,7 @@ def document(track: Track, source: Path) -> dict[str, Any]:
     return {
         "telemetry": str(source),
         "n_frames": track.n_frames,
+        "n_missing": track.n_missing,
         "first_ns_utc": track.first_ns_utc,
         "last_ns_utc": track.last_ns_utc,
         "alpha": None if registration is None else registration.alpha.to_boundary(),

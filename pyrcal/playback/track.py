@@ -105,11 +105,11 @@ def _play_aot(path: Path, instrument: Instrument, settings: Settings) -> Track:
     aot = read_telemetry(path, instrument)
     if not aot.arrays:
         raise ConfigurationError(
-            f"{path}: found no slopes with modal commands, expected some; pyrcal import aot reads "
-            "its matrix and its alpha"
+            f"{path}: found no slopes with commands, expected measurements of its sensor and "
+            "modal_coefficients or commands of a loop; pyrcal import aot reads its matrix and alpha"
         )
-    if aot.left_out:
-        say(f"{path}: one loop is played; left out: {', '.join(aot.left_out)}")
+    for note in aot.notes:
+        say(f"note: {path}: {note}")
     messages = Arrays(path=path, found=aot.arrays, facts={}).messages(instrument)
     found = _play(messages, instrument, settings, instrument.name)
     return replace(found, stated=aot.registrations)

@@ -61,10 +61,16 @@ class LockInPlan(WindowPlan):
         edge = SIDE_OFFSETS_HZ.max()
         if not len(self.modes) == len(lines) == len(self.amplitude_m) > 0:
             raise ModelError("lock-in: modes, frequencies and amplitudes differ in length")
-        if lines.min() <= edge or lines.max() >= self.frame_rate_hz / 2 - edge:
+        highest = self.frame_rate_hz / 2 - edge
+        if highest <= edge:
             raise ModelError(
-                f"lock-in: found lines at {lines.min()} to {lines.max()} Hz; expected between "
-                f"{edge} and {self.frame_rate_hz / 2 - edge} Hz, room for the side bins"
+                f"lock-in: found {self.frame_rate_hz:.4g} frames a second; expected more than "
+                f"{4 * edge:g}, room for a line and its side bins"
+            )
+        if lines.min() <= edge or lines.max() >= highest:
+            raise ModelError(
+                f"lock-in: found lines at {lines.min():.4g} to {lines.max():.4g} Hz; expected "
+                f"between {edge:g} and {highest:.4g} Hz, room for the side bins"
             )
         periods = lines * self.n_frames / self.frame_rate_hz
         if np.abs(periods - np.round(periods)).max() > CUT_PERIODS:

@@ -140,7 +140,7 @@ def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
     step = event.estimate.alpha.vector - context.nominal.vector
     if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
         text = (
-            f"it cannot tell: {event.estimate.alpha.to_boundary()} is too far from where its fit "
+            f"it cannot tell: {event.estimate.alpha} is too far from where its fit "
             "begins, the nominal rotation; let the service acquire, or dither"
         )
         _show_passive(context, event, np.full(4, np.inf), np.zeros(4), text)

@@ -173,8 +173,8 @@ def check_controllable(instrument: Instrument, compute: Compute) -> None:
     """
     if not instrument.mirror.stroke_known:
         raise ModelError(
-            f"{instrument.name}: found mirror.stroke = unknown; expected a known one: a "
-            "reconstructor gives metres (pyrcal fit needs none)"
+            f"{instrument.name}: found mirror.stroke = unknown; expected a known one (--unit of "
+            "pyrcal import): a reconstructor gives metres (pyrcal fit needs none)"
         )
     if instrument.frames is not None:
         raise ModelError(

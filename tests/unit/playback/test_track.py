@@ -201,6 +201,7 @@ def test_frames_that_are_missing_are_told_by_their_numbers(telemetry, tmp_path, 
         holed[name] = telemetry[name][keep]
     _, found, _ = tracked(capsys, saved(tmp_path, holed))
     assert found["n_frames"] == keep.sum()
+    assert found["n_missing"] == len(keep) - keep.sum()
     assert found["last_ns_utc"] - found["first_ns_utc"] == (len(keep) - 1) * 1_000_000
 
 

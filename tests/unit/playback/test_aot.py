@@ -1,0 +1,179 @@
+"""An AOT file that somebody has written by hand, from the standard alone."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pyrcal.playback.aot import read_telemetry
+from service.config import load_instrument
+from service.errors import MatrixError
+from service.model.pupil import rtc_valid_subapertures
+from service.model.slopes import Orientation
+from studies.campaign.small import SMALL
+
+aotpy = pytest.importorskip("aotpy")
+
+N, N_CONTROLLED, RATE_HZ = 6, 5, 500.0
+SEQ = [3, 4, 5, 7, 8, 9]
+"""One is missing."""
+
+RNG = np.random.default_rng(4)
+
+
+@pytest.fixture(scope="module")
+def small():
+    return load_instrument(SMALL)
+
+
+@pytest.fixture(scope="module")
+def with_strokes(small):
+    """The same with modes of its user's own: 20 combinations of its actuators."""
+    strokes = np.linalg.qr(RNG.normal(size=(len(small.mirror.positions_m), 20)))[0]
+    return replace(small, mirror=replace(small.mirror, mode_to_actuator=strokes))
+
+
+class Hand:
+    """Someone's own AOT file of an instrument, to be spoilt before it is written."""
+
+    def __init__(self, about):
+        mask = rtc_valid_subapertures(about)
+        n_valid = int(mask.sum())
+        places = np.full(mask.shape, -1)
+        places[mask] = np.arange(n_valid)
+        self.slopes = RNG.normal(size=(N, 2, n_valid)).astype(np.float32)
+        self.modal_m = RNG.normal(size=(N, 20)).astype(np.float32)
+        self.control = RNG.normal(size=(N_CONTROLLED, 2, n_valid)).astype(np.float32)
+        stamps = [1.7e9 + seq / RATE_HZ for seq in SEQ]
+        self.time = aotpy.Time("when", timestamps=stamps, frame_numbers=SEQ)
+        self.telescope = aotpy.MainTelescope("telescope", enclosing_diameter=about.diameter_m)
+        self.sensor = aotpy.Pyramid(
+            uid="sensor",
+            n_sides=4,
+            source=aotpy.NaturalGuideStar("star"),
+            n_valid_subapertures=n_valid,
+            subaperture_mask=aotpy.Image("mask", places),
+            measurements=aotpy.Image("slopes", self.slopes, time=self.time),
+        )
+        self.mirror = aotpy.DeformableMirror("dm", telescope=self.telescope, n_valid_actuators=9)
+        self.loop = aotpy.ControlLoop(
+            "loop",
+            input_sensor=self.sensor,
+            commanded_corrector=self.mirror,
+            framerate=RATE_HZ,
+            delay=1.5,
+            modal_coefficients=aotpy.Image("modal", self.modal_m, unit="m", time=self.time),
+            measurements_to_modes=aotpy.Image("control", self.control),
+        )
+
+    def filter(self, above, below):
+        self.loop.time_filter_num = aotpy.Image("num", np.array(above))
+        self.loop.time_filter_den = aotpy.Image("den", np.array(below))
+
+    def read(self, folder, about):
+        system = aotpy.AOSystem(
+            ao_mode="SCAO",
+            name="by hand",
+            main_telescope=self.telescope,
+            sources=[self.sensor.source],
+            wavefront_sensors=[self.sensor],
+            wavefront_correctors=[self.mirror],
+            loops=[self.loop],
+        )
+        path = folder / "hand.fits"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            system.write_to_file(path, "fits")
+        return read_telemetry(path, about)
+
+
+def test_signals_of_somebody_elses_file_are_as_its_instrument_lists_them(small, tmp_path):
+    """Only files of pyrcal's own have the axes of conventions: these have their RTC's already."""
+    turned = replace(small, slopes=replace(small.slopes, orientation=Orientation(sign_x=-1)))
+    hand = Hand(turned)
+    night = hand.read(tmp_path, turned)
+    np.testing.assert_array_equal(night.arrays["slopes"], hand.slopes.reshape(N, -1))
+    flat = hand.control.reshape(N_CONTROLLED, -1)
+    np.testing.assert_array_equal(night.arrays["reconstructor"], flat)
+    np.testing.assert_array_equal(night.arrays["commands_m"], hand.modal_m)
+    assert night.arrays["delay_frames"] == 1.5
+    assert night.notes == []
+
+
+def test_frames_without_numbers_are_counted_by_their_times(small, tmp_path):
+    hand = Hand(small)
+    hand.time.frame_numbers = []
+    night = hand.read(tmp_path, small)
+    np.testing.assert_array_equal(np.diff(night.arrays["seq"]), np.diff(SEQ))
+    assert night.notes == ["frames have no numbers: counted by their times"]
+
+
+def test_frames_without_numbers_and_times_are_all_there_are_and_it_is_said(small, tmp_path):
+    hand = Hand(small)
+    hand.sensor.measurements.time = hand.loop.modal_coefficients.time = None
+    night = hand.read(tmp_path, small)
+    np.testing.assert_array_equal(night.arrays["seq"], np.arange(N))
+    assert "neither numbers nor times" in night.notes[0]
+
+
+@pytest.mark.parametrize("stamps", [[0.0, 1.0, 1.4, 3.0, 4.0, 5.0], [0.0, 1.0, 1.0, 3.0, 4.0, 5.0]])
+def test_times_off_the_rate_or_twice_in_a_frame_are_refused(stamps, small, tmp_path):
+    hand = Hand(small)
+    hand.time.frame_numbers = []
+    hand.time.timestamps = [stamp / RATE_HZ for stamp in stamps]
+    with pytest.raises(MatrixError, match="of a frame off the loop's 500 Hz"):
+        hand.read(tmp_path, small)
+
+
+def test_commands_of_more_frames_than_signals_without_any_number_are_refused(small, tmp_path):
+    hand = Hand(small)
+    hand.sensor.measurements = aotpy.Image("slopes", hand.slopes[:-1])
+    hand.loop.modal_coefficients.time = None
+    with pytest.raises(MatrixError, match="of 5 measurements, 0 and 0 of 6 commands"):
+        hand.read(tmp_path, small)
+
+
+def test_commands_of_actuators_become_modes_less_their_reference(with_strokes, tmp_path):
+    hand, strokes = Hand(with_strokes), with_strokes.mirror.mode_to_actuator
+    flat = RNG.normal(size=len(strokes))
+    sent_um = 1e6 * hand.modal_m @ strokes.T + flat
+    hand.loop.modal_coefficients = None
+    hand.loop.commands = aotpy.Image("commands", sent_um, unit="um", time=hand.time)
+    hand.loop.ref_commands = aotpy.Image("flat", flat, unit="um")
+    night = hand.read(tmp_path, with_strokes)
+    np.testing.assert_allclose(night.arrays["commands_m"], hand.modal_m, atol=1e-9)
+    assert night.notes == ["commands of actuators: turned into modes by mode_to_actuator"]
+
+
+def test_commands_of_other_actuators_are_refused(small, with_strokes, tmp_path):
+    other_folder = tmp_path / "other"
+    other_folder.mkdir()
+    hand = Hand(with_strokes)
+    hand.loop.modal_coefficients = None
+    other = RNG.normal(size=(N, len(small.mirror.positions_m)))
+    hand.loop.commands = aotpy.Image("commands", other, unit="m", time=hand.time)
+    with pytest.raises(MatrixError, match="that no mode of mode_to_actuator makes"):
+        hand.read(tmp_path, with_strokes)
+    hand.loop.commands = aotpy.Image("commands", other[:, 1:], unit="m", time=hand.time)
+    with pytest.raises(MatrixError, match="expected modal_coefficients, or an instrument file"):
+        hand.read(other_folder, with_strokes)
+
+
+def test_a_time_filter_tells_gains_and_leak(small, tmp_path):
+    hand = Hand(small)
+    hand.filter([[0.3, 0.0]] * N_CONTROLLED, [[1.0, -0.98]] * N_CONTROLLED)
+    arrays = hand.read(tmp_path, small).arrays
+    np.testing.assert_array_equal(arrays["gains"], np.full(N_CONTROLLED, 0.3))
+    assert arrays["leak"] == 0.98
+
+
+@pytest.mark.parametrize(
+    ("above", "below"), [([[0.3, 0.1]], [[1.0, -0.98]]), ([[0.3]] * 2, [[1.0, -0.98], [1.0, -1.0]])]
+)
+def test_another_time_filter_is_said_to_be_left_alone(above, below, small, tmp_path):
+    hand = Hand(small)
+    hand.filter(above, below)
+    night = hand.read(tmp_path, small)
+    assert "gains" not in night.arrays
+    assert night.notes == ["the time filter is no integrator with one leak: gains are taken as 0.5"]

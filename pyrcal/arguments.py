@@ -26,10 +26,23 @@ OTHER_PROGRAMS = {
 """Module and purpose of what is run in this program's place, with options of its own."""
 
 
+HEADINGS = {
+    "run": "the service",
+    "status": "ask the service",
+    "approve": "give the service orders",
+    "archive": "what the service has kept, without it",
+    "fit": "files in, answers out, without a service",
+    "demo": "try it, or an RTC of yours",
+}
+"""Said before the first command of a group."""
+
+
 def command_line() -> argparse.ArgumentParser:
     """Return the parser of ``pyrcal``'s command line; ``command`` names the command."""
     parser = OneLineParser(
-        prog="pyrcal", description="Calibration service of an adaptive telescope."
+        prog="pyrcal",
+        description="Calibration service of an adaptive telescope.",
+        formatter_class=_Grouped,
     )
     parser.add_argument("--version", action="version", version=f"pyrcal {__version__}")
     parser.add_argument(
@@ -46,6 +59,16 @@ def command_line() -> argparse.ArgumentParser:
     for name, (_, purpose) in OTHER_PROGRAMS.items():
         commands.add_parser(name, help=f"{purpose}: pyrcal {name} --help", add_help=False)
     return parser
+
+
+class _Grouped(argparse.HelpFormatter):
+    """Commands under headings."""
+
+    @override
+    def _format_action(self, action: argparse.Action) -> str:
+        text = super()._format_action(action)
+        heading = HEADINGS.get(str(action.metavar))
+        return text if heading is None else f"\n  {heading}:\n{text}"
 
 
 class _Completion(argparse.Action):

@@ -39,9 +39,19 @@ def table(report: FitReport) -> str:
         "",
         *_basis(report),
         *_extras(fit),
-        *(f"note: {note}" for note in report.notes),
+        *(f"note: {note}" for note in report.notes if not _said_before(note, fit)),
     ]
     return "\n".join(shown(line) for line in lines)
+
+
+def _said_before(note: str, fit: Fit) -> bool:
+    """Whether a note repeats the line of what was found and not told."""
+    keys = [one.key for one in fit.origins if one.correct]
+    return any(
+        f"{key}: unknown; " in note
+        or (note.startswith(f"{key} = ") and " was found, 1 sigma" in note)
+        for key in keys
+    )
 
 
 def _registration(fit: Fit) -> Iterator[str]:
@@ -130,11 +140,12 @@ def _as_written(fit: Fit) -> str:
 
 
 def _extras(fit: Fit) -> Iterator[str]:
+    listed = {one.key for one in fit.origins if one.correct}
     for one in fit.optics:
-        if one.found is not None:
+        if one.found is not None and one.key not in listed:
             stated = "unknown" if one.reported is None else f"{one.reported:g}"
             words = f"{one.found:.4g} +- {one.found_sigma:.2g}"
-            yield f"{one.key[:19]:20s}{words} (the instrument file says {stated})"
+            yield f"{one.key + ' ':20s}{words} (the instrument file says {stated})"
     if fit.anamorphosis_sigma is not None:
         words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
         told = "" if fit.anamorphosis is not None else "not observable with these modes: "

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pyrcal.__main__ import main
-from pyrcal.arguments import command_line
+from pyrcal.arguments import HEADINGS, command_line
 from pyrcal.offline.matrix import FitOptions
 from service import __version__
 from service.config import Settings, load_settings
@@ -52,6 +52,14 @@ def test_whoever_reads_may_have_seen_enough(monkeypatch, words):
     with os.fdopen(begin, "w") as nobody_reads:
         monkeypatch.setattr(sys, "stdout", nobody_reads)
         assert main(words) == 0
+
+
+def test_commands_stand_under_headings_in_their_order(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    places = [text.index(f"\n  {heading}:\n    {first} ") for first, heading in HEADINGS.items()]
+    assert places == sorted(places)
 
 
 @pytest.mark.parametrize("words", [[], ["fly"], ["run", "--mode", "wild"], ["run", "--prot", "1"]])

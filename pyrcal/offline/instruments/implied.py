@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+from pyrcal.terminal import span
 from service.control.reconstructor import MAX_CONDITION, invert
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
@@ -107,5 +108,5 @@ def described(instrument: Instrument, found: Implied) -> tuple[str, ...]:
             f"{MAX_CONDITION:g}"
         )
     if found.seconds is not None:
-        lines.append(f"time        {found.seconds:.2g} s for modes and matrix")
+        lines.append(f"time        {span(found.seconds)} for modes and matrix")
     return tuple(lines)

@@ -30,6 +30,7 @@ def main(options: argparse.Namespace) -> int:
             return _check(options)
         case _:
             write_drawing(load_instrument(options.instrument), options.picture)
+            print_lines([f"{options.picture}: drawn"])
             return USABLE
 
 

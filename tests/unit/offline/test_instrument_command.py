@@ -144,10 +144,11 @@ def test_what_the_model_cannot_work_with_is_said(tmp_path, capsys):
     assert "expected metres in the pupil plane" in capsys.readouterr().out
 
 
-def test_the_picture_is_drawn(tmp_path):
+def test_the_picture_is_drawn(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     picture = tmp_path / "tiny.png"
     assert main(["instrument", "show", str(TINY), str(picture)]) == 0
+    assert capsys.readouterr().out == f"{picture}: drawn\n"
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

@@ -1,12 +1,15 @@
 import json
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.fit_table import table
+from pyrcal.offline.instrument_checks import FoundOptic
 from pyrcal.offline.left_over import LeftOver
+from pyrcal.offline.models import Optic
 from pyrcal.offline.origins import Origin
 from pyrcal.offline.report import document, read_fit
 from service.model.misregistration import PARAMETERS
@@ -163,6 +166,27 @@ def test_what_was_found_rather_than_told_has_its_line():
             "how": "scanned: the lowest modes",
             "correct": True,
         }
+    ]
+
+
+def test_what_was_found_is_said_once_and_its_key_whole():
+    key = "modulation_lambda_over_d"
+    told = FoundOptic(
+        optic=Optic.SENSOR, key=key, change=0.01, sigma=0.003, found=3.02, reported=3.0
+    )
+    assert line(table(a_report(a_fit(optics=(told,)))), key).startswith(f"{key} 3.02 +- ")
+    unknown = replace(told, reported=None)
+    origin = Origin(key=key, found="3.02", reported='"unknown"', how="fitted", correct=True)
+    fit = a_fit(optics=(unknown,), origins=(origin,))
+    notes = (
+        f"bench.toml: wfs.{key}: unknown; a fit of a measured matrix finds it",
+        f"{key} = 3.02 was found, 1 sigma 0.009: write it into the instrument file",
+        f"with {key} = 3.02 the misfit is less",
+    )
+    text = table(a_report(fit, notes=notes))
+    assert [row for row in text.splitlines() if key in row] == [
+        line(text, "found, not told"),
+        f"note: {notes[2]}",
     ]
 
 

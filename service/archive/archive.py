@@ -10,7 +10,13 @@ from typing import IO, Any, Self
 
 from service.archive.index import AuditEntry, Index, Pin, Range, begun_ns_utc
 from service.archive.nights import Nights, TrendSample
-from service.archive.products import MeasuredArchive, NoisyArchive, ReconstructorArchive, Recordings
+from service.archive.products import (
+    PROBE_BYTES,
+    MeasuredArchive,
+    NoisyArchive,
+    ReconstructorArchive,
+    Recordings,
+)
 from service.archive.serialisation import TrackingFile
 from service.archive.store import FOLDER_MODE, Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
@@ -211,7 +217,9 @@ class Archive:
         path = self.reconstructors.directory / "probe.part"
         try:
             with path.open("wb") as file:
-                file.write(bytes(self.reconstructors.largest_bytes))
+                for start in range(0, self.reconstructors.largest_bytes, PROBE_BYTES):
+                    left = self.reconstructors.largest_bytes - start
+                    file.write(bytes(min(PROBE_BYTES, left)))
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:

@@ -385,7 +385,8 @@ def _fill(
     instrument: str,
 ) -> None:
     # beside the matrix and its modes, pyrcal fit reads the noise of the columns
-    file["noise"] = np.sqrt(np.mean(numbers.noise.astype(float) ** 2, axis=0))
+    power = np.einsum("ij,ij->j", numbers.noise, numbers.noise, dtype=np.float64)
+    file["noise"] = np.sqrt(power / len(numbers.noise))
     file["noise"].attrs["description"] = "(n_modes,), RMS over slopes of element_noise"
     file["element_noise"] = np.asarray(numbers.noise, "<f4")
     file["element_noise"].attrs["description"] = "(n_slopes, n_modes), 1 sigma of each element"

@@ -178,8 +178,8 @@ class Store(Folder, Generic[Record]):
             raise UnknownIdError(f"{self.noun} {product_id}: no such matrix in the archive")
         return self._matrix(product_id, sha256)
 
-    def file(self, product_id: str) -> bytes:
-        """Return the HDF5 file as it was written, once its matrix is verified.
+    def file(self, product_id: str) -> Path:
+        """Return where the HDF5 file is, as it was written, once its matrix is verified.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class Store(Folder, Generic[Record]):
             As :meth:`matrix`.
         """
         self.matrix(product_id)
-        return self.path_of(product_id).read_bytes()
+        return self.path_of(product_id)
 
     def _became(self, record: Record, *, anew: bool) -> Record:
         """Return what has become of a product, as far as is known without the index."""

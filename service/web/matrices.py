@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pathlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
-from fastapi.responses import StreamingResponse
+from fastapi.responses import FileResponse, StreamingResponse
 from numpy.typing import NDArray
 
 from service.control.gains import ModeGain, gain_table
@@ -75,7 +76,7 @@ OtherId = Annotated[str, Depends(_other)]
 _SLOPES_AT_ONCE = 1024
 """Of a product in float64."""
 
-_PART_BYTES = 4_000_000
+PART_BYTES = 4_000_000
 """Of a large telescope's matrix, 250 MB, that leaves without being copied whole."""
 
 
@@ -119,7 +120,7 @@ async def numbers_of(
     matrix_id: str,
     form: MatrixFormat,
     matrix_of: Callable[[str], Numbers],
-    file_of: Callable[[str], bytes],
+    file_of: Callable[[str], pathlib.Path],
 ) -> Response:
     """Return a matrix as it is asked for; the shape is in the headers, but with HDF5.
 
@@ -135,7 +136,7 @@ async def numbers_of(
         extension = _EXTENSIONS.get(form, form.value)
         headers = {"Content-Disposition": f'attachment; filename="{matrix_id}.{extension}"'}
         if form is MatrixFormat.HDF5:
-            return Response(file_of(matrix_id), media_type=MEDIA_TYPES[form], headers=headers)
+            return FileResponse(file_of(matrix_id), media_type=MEDIA_TYPES[form], headers=headers)
         numbers = np.ascontiguousarray(matrix_of(matrix_id), "<f4")
         headers |= {"X-Shape": ",".join(str(n) for n in numbers.shape), "X-Dtype": "<f4"}
         if form is MatrixFormat.FITS:
@@ -153,8 +154,8 @@ def _parts(head: bytes, numbers: Numbers) -> Iterator[bytes]:
     """Yield a file's head, and its numbers as they lie in memory."""
     yield head
     lying = numbers.reshape(-1).view(np.uint8)
-    for first in range(0, len(lying), _PART_BYTES):
-        yield lying[first : first + _PART_BYTES].tobytes()
+    for first in range(0, len(lying), PART_BYTES):
+        yield lying[first : first + PART_BYTES].tobytes()
 
 
 def _npy_head(numbers: Numbers) -> bytes:

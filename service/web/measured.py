@@ -6,6 +6,7 @@ A noisy one can never become a reconstructor: no route, and nothing behind one, 
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -23,7 +24,13 @@ from service.runtime.uploads import FitJob, FitQueue, FitState
 from service.tracking.operation_records import MeasurementRecord, NoisyFinding
 from service.tracking.state import TrackerState
 from service.web import views
-from service.web.matrices import MatrixFormat, MatrixParameters, describes_numbers, numbers_of
+from service.web.matrices import (
+    PART_BYTES,
+    MatrixFormat,
+    MatrixParameters,
+    describes_numbers,
+    numbers_of,
+)
 from service.web.problems import COMMAND, INVALID, UNKNOWN, problem_response
 from service.web.views import (
     Parameters,
@@ -267,8 +274,8 @@ async def fit(
     if parameters.measurement is not None:
         if content_length:
             raise errors.MatrixError("found a body beside ?measurement=, expected one of the two")
-        content = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
-        body, content_length = _kept(content), len(content)
+        path = await run_in_threadpool(service.archive.measured.file, parameters.measurement)
+        body, content_length = _kept(path), path.stat().st_size
     name = parameters.name or parameters.measurement or ""
     job = await desk.take(parameters.asked(), body, content_length, name)
     links = {"fit": f"/v1/fits/{job.id}", "fits": "/v1/fits"}
@@ -336,8 +343,10 @@ async def give_up_fit(desk: FitsDep, fit_id: FitId) -> Response:
     return answer(await desk.give_up(fit_id))
 
 
-async def _kept(content: bytes) -> AsyncIterator[bytes]:
-    yield content
+async def _kept(path: pathlib.Path) -> AsyncIterator[bytes]:
+    with path.open("rb") as file:
+        while part := await run_in_threadpool(file.read, PART_BYTES):
+            yield part
 
 
 async def _body(request: Request) -> AsyncIterator[bytes]:

@@ -268,8 +268,8 @@ def checksum(matrix: NDArray[np.float32]) -> str:
 
 def split(matrix: NDArray[np.float32], chunk_bytes: int) -> list[bytes]:
     """Return the bytes of a matrix in parts of ``chunk_bytes``, the last one shorter."""
-    data = np.ascontiguousarray(matrix, dtype=DTYPE).tobytes()
-    return [data[start : start + chunk_bytes] for start in range(0, len(data), chunk_bytes)]
+    data = np.ascontiguousarray(matrix, dtype=DTYPE).data.cast("B")
+    return [bytes(data[start : start + chunk_bytes]) for start in range(0, len(data), chunk_bytes)]
 
 
 class ChunkAssembler:

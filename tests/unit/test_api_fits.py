@@ -57,18 +57,20 @@ def desk():
 class FakeMatrices:
     """One that the RTC has measured."""
 
+    def __init__(self, folder):
+        self.path = folder / "product.h5"
+        self.path.write_bytes(b"measured")
+
     def file(self, measurement_id):
         if measurement_id != "im-1":
             raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
-        return b"measured"
-
-
-SERVICE = SimpleNamespace(archive=SimpleNamespace(measured=FakeMatrices()))
+        return self.path
 
 
 @pytest.fixture
-async def client(desk):
-    transport = httpx.ASGITransport(create_app(SERVICE, desk), raise_app_exceptions=False)
+async def client(desk, tmp_path):
+    service = SimpleNamespace(archive=SimpleNamespace(measured=FakeMatrices(tmp_path)))
+    transport = httpx.ASGITransport(create_app(service, desk), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         yield client
 

@@ -48,6 +48,10 @@ RUNNING = replace(
 class FakeMatrices:
     """The archive's measured matrices."""
 
+    def __init__(self, folder):
+        self.path = folder / "product.h5"
+        self.path.write_bytes(FILE)
+
     def matrix(self, measurement_id):
         if measurement_id != "im-1":
             raise UnknownIdError(f"measurement {measurement_id}: no such matrix in the archive")
@@ -55,15 +59,15 @@ class FakeMatrices:
 
     def file(self, measurement_id):
         self.matrix(measurement_id)
-        return FILE
+        return self.path
 
 
 @pytest.fixture
-def service():
+def service(tmp_path):
     return Obedient(
         tracker_state(system="flao-lbt", measurements=(STORED, RUNNING)),
         now_ns=1_763_696_400_250_000_000,
-        archive=SimpleNamespace(measured=FakeMatrices()),
+        archive=SimpleNamespace(measured=FakeMatrices(tmp_path)),
     )
 
 

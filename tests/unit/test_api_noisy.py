@@ -49,21 +49,25 @@ RUNNING = replace(STORED, id="noisy-2", state=MeasureState.RUNNING, finding=None
 class FakeMatrices:
     """The archive's noisy matrices."""
 
+    def __init__(self, folder):
+        self.path = folder / "product.h5"
+        self.path.write_bytes(FILE)
+
     def matrix(self, noisy_id):
         raise AssertionError(f"{noisy_id}: its numbers leave with their noise alone")
 
     def file(self, noisy_id):
         if noisy_id != "noisy-1":
             raise UnknownIdError(f"noisy matrix {noisy_id}: no such matrix in the archive")
-        return FILE
+        return self.path
 
 
 @pytest.fixture
-def service():
+def service(tmp_path):
     return Obedient(
         tracker_state(system="flao-lbt", measurements=(STORED, RUNNING)),
         now_ns=1_763_696_400_250_000_000,
-        archive=SimpleNamespace(noisy=FakeMatrices()),
+        archive=SimpleNamespace(noisy=FakeMatrices(tmp_path)),
     )
 
 

@@ -177,6 +177,9 @@ _LENGTH = 1.5
 """Of a transform, over that of the window: longer ones need more memory, shorter ones more of
 them."""
 
+_OUTPUTS_TOGETHER = 1024
+"""Of a matrix, transformed at a time: all of an ELT's would take 16 GB for 5 that are kept."""
+
 _BLOCKS_TOGETHER = 10
 """Blocks answered at a time: the spectra are read from memory once for all of them."""
 
@@ -283,10 +286,16 @@ class FrozenLayer:
 
     def filters(self, matrix: Array32) -> Complex64:
         """Return the spectra of the filters that make ``matrix @ phase`` of the rows."""
-        cells = self._reading.T @ np.ascontiguousarray(matrix.T)
-        cells -= matrix.sum(axis=1) / np.float32(len(cells))
-        filters = cells.reshape(self._n_rows, self._n_rows, -1)
-        return np.asarray(scipy.fft.rfft(filters, self._length, axis=0))
+        shape = (self._length // 2 + 1, self._n_rows, len(matrix))
+        spectra = np.empty(shape, np.complex64)
+        for start in range(0, len(matrix), _OUTPUTS_TOGETHER):
+            outputs = slice(start, start + _OUTPUTS_TOGETHER)
+            part = matrix[outputs]
+            cells = self._reading.T @ np.ascontiguousarray(part.T)
+            cells -= part.sum(axis=1) / np.float32(len(cells))
+            filters = cells.reshape(self._n_rows, self._n_rows, -1)
+            spectra[:, :, outputs] = scipy.fft.rfft(filters, self._length, axis=0)
+        return spectra
 
     def _windows(self, step: NDArray[np.intp]) -> Array32:
         """Return the windows over the pupil at these steps, ``(n_steps, n_rows²)``, mean 0."""

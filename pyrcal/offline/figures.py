@@ -192,7 +192,7 @@ def mirror_outline(instrument: Instrument) -> tuple[Array, str]:
     mirror = instrument.mirror
     parity = np.array([1.0, mirror.y_sign])
     if isinstance(mirror, TabulatedModes):
-        half = (np.array(mirror.cube.shape[:0:-1]) - 1) / 2 * mirror.pitch_m
+        half = (np.array(mirror.known.shape[::-1]) - 1) / 2 * mirror.pitch_m
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
         return corners / instrument.subaperture_m * parity, "-"
     return mirror.positions_m / instrument.subaperture_m * parity, "+"

@@ -1,4 +1,4 @@
-"""Measured influence functions that are cropped: each a patch at its place in the whole table."""
+"""Measured influence functions that end, or are cropped: each a patch of the whole table."""
 
 from __future__ import annotations
 
@@ -11,9 +11,61 @@ from service.config.instrument_schema import MirrorTable, Section
 from service.config.sources import refuse
 from service.errors import ConfigurationError
 from service.files.container import MAX_BYTES
+from service.model.instrument import LocalFunctions
+from service.model.surface import NOTHING
+
+_MANY = 200
+"""Functions from which on it pays to know that each covers little,"""
+
+_LITTLE = 0.1
+"""of what all cover, in the mean."""
 
 _CUT = 0.01
 """Share of the height that a function may have at the rim of its crop."""
+
+
+def local_functions(
+    file: Section[MirrorTable],
+    heights: NDArray[np.floating],
+    strokes: NDArray[np.floating] | None,
+    known: NDArray[np.bool_] | None = None,
+) -> tuple[LocalFunctions, NDArray[np.bool_]] | None:
+    """Return functions that end, and where the table is known; None: they cover it all, or are few.
+
+    ``heights`` are crops ``(n_actuators, p, q)`` or, with ``known`` ``(ny, nx)``, whole tables.
+
+    Raises
+    ------
+    ConfigurationError
+        As :func:`modes_of_crops`, but for the size.
+    """
+    if len(heights) < _MANY:
+        return None
+    if known is None:
+        shape = _table_of(file, heights)
+        known, parts = np.zeros(shape, np.bool_), []
+        for at, part in _placed(heights, _origins(file, heights, shape), shape):
+            known[at] = True
+            parts.append((at, part))
+    else:
+        whole = (slice(0, known.shape[0]), slice(0, known.shape[1]))
+        parts = [(whole, np.where(known, one, one.dtype.type(0))) for one in heights]
+    found, places = [], []
+    for (rows, columns), part in parts:
+        row, column = np.nonzero(np.abs(part) > NOTHING * np.abs(part).max())
+        found.append(part[row, column])
+        places.append((row + rows.start) * known.shape[1] + column + columns.start)
+    ends = np.concatenate([[0], np.cumsum([len(one) for one in places])]).astype(np.intp)
+    if ends[-1] > _LITTLE * len(heights) * known.sum():
+        return None
+    local = LocalFunctions(
+        heights=np.concatenate(found),
+        places=np.concatenate(places),
+        ends=ends,
+        strokes=None if strokes is None else strokes.astype(np.float64),
+        floor=NOTHING,
+    )
+    return local, known
 
 
 def modes_of_crops(
@@ -30,13 +82,7 @@ def modes_of_crops(
     ConfigurationError
         One line: the table or a place in it is missing or wrong, or the modes are too large.
     """
-    shape = file.said.influence_table
-    if shape is None:
-        raise ConfigurationError(
-            f"{file.where('influence_table')}: missing beside mirror.influence_origin"
-        )
-    if not np.isfinite(crops).all():
-        refuse(file.where("influence_functions"), "a height that is not finite", "numbers alone")
+    shape = _table_of(file, crops)
     n_modes = len(crops) if strokes is None else strokes.shape[1]
     n_bytes = n_modes * shape[0] * shape[1] * crops.dtype.itemsize
     if n_bytes > MAX_BYTES:
@@ -53,6 +99,18 @@ def modes_of_crops(
         else:
             modes[:, *at] += np.multiply.outer(strokes[k].astype(crops.dtype), part)
     return modes, known
+
+
+def _table_of(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[int, int]:
+    """Return the shape of the whole table that finite crops lie on."""
+    shape = file.said.influence_table
+    if shape is None:
+        raise ConfigurationError(
+            f"{file.where('influence_table')}: missing beside mirror.influence_origin"
+        )
+    if not np.isfinite(crops).all():
+        refuse(file.where("influence_functions"), "a height that is not finite", "numbers alone")
+    return shape
 
 
 def remarks_on_crops(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[str, ...]:

@@ -121,7 +121,9 @@ class MirrorTable(kinds.InfluenceShape):
     """Meaning of the user's modes: OPD, or surface."""
 
     influence_functions: str | None = None
-    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``, or cropped."""
+    """``path:/dataset`` of measured influence functions, ``(n_actuators, ny, nx)``, or cropped.
+    From 200 on, those that end are kept as far as they are higher than a millionth of their height:
+    on an ELT, crop them."""
 
     influence_origin: str | None = None
     """Cropped functions only: ``path:/dataset`` of ``(n_actuators, 2)``, row and column where each

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config.crops import modes_of_crops, remarks_on_crops
+from service.config.crops import local_functions, modes_of_crops, remarks_on_crops
 from service.config.instrument_schema import MirrorTable, Section
 from service.config.sources import refuse
 from service.errors import ConfigurationError
@@ -95,7 +95,7 @@ def _read(file: MirrorSection, key: str) -> NDArray[np.floating]:
 def own_modes(mirror: Mirror | TabulatedModes) -> int | None:
     """Return how many modes the user's own basis has; None where ``[modes]`` decides."""
     if isinstance(mirror, TabulatedModes):
-        return len(mirror.cube)
+        return mirror.n_modes
     if mirror.mode_to_actuator is not None:
         return int(mirror.mode_to_actuator.shape[1])
     return len(mirror.positions_m) if mirror.basis is BasisKind.ZONAL else None
@@ -399,10 +399,16 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     if cube.ndim != 3 or min(cube.shape) < 1:
         refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
     strokes = _strokes(file, len(cube)) if key == "influence_functions" else None
-    if file.said.influence_origin is not None:
+    whole = None if file.said.influence_origin is not None else known_samples(cube)
+    of_functions = key == "influence_functions"
+    ending = local_functions(file, _opd(file, cube), strokes, whole) if of_functions else None
+    local = None
+    if ending is not None:
+        local, known = ending
+    elif whole is None:
         cube, known = modes_of_crops(file, cube, strokes)
     else:
-        known = known_samples(cube)
+        known = whole
         cube = np.where(known, cube, cube.dtype.type(0))
         if strokes is not None:
             cube = np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
@@ -411,7 +417,8 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
         *remarks_on_crops(file, crops),
     )
     modes = TabulatedModes(
-        cube=_opd(file, cube),
+        cube=None if local is not None else _opd(file, cube),
+        local=local,
         pitch_m=file.said.modes_pitch_m,
         known=known,
         **_mount(file.said),

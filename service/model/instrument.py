@@ -108,17 +108,56 @@ class Mirror(Mount):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocalFunctions:
+    """Measured influence functions that end: of each the samples that are not nothing."""
+
+    heights: NDArray[np.floating]
+    """``(n_samples,)`` metres of OPD per unit stroke, function after function."""
+
+    places: NDArray[np.intp]
+    """``(n_samples,)`` where each lies in the table, row-major."""
+
+    ends: NDArray[np.intp]
+    """``(n_functions + 1,)`` where the samples of each begin, and those of the last end."""
+
+    strokes: NDArray[np.floating] | None
+    """``(n_functions, n_modes)`` of each mode; None: each function is one."""
+
+    floor: float
+    """Share of a function's height below which it is nothing."""
+
+    @property
+    def n_functions(self) -> int:
+        """Functions, one of each actuator."""
+        return len(self.ends) - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TabulatedModes(Mount):
     """Modes measured on a grid, centred on the pupil, in the units of their owner."""
 
-    cube: NDArray[np.floating]
-    """``(n_modes, ny, nx)``: metres of OPD per unit command, finite; float32 or float64."""
+    cube: NDArray[np.floating] | None
+    """``(n_modes, ny, nx)``: metres of OPD per unit command, finite; float32 or float64. None: see
+    ``local``."""
 
     pitch_m: float
     """Step of the grid along both axes, metres in the pupil plane."""
 
     known: NDArray[np.bool_]
     """``(ny, nx)``: where the table says something about the surface."""
+
+    local: LocalFunctions | None = None
+    """The functions that modes are made of, where these end; None: the modes are in ``cube``."""
+
+    @property
+    def n_modes(self) -> int:
+        """Modes of the mirror."""
+        if self.cube is not None:
+            return len(self.cube)
+        if self.local is None:
+            return 0
+        strokes = self.local.strokes
+        return self.local.n_functions if strokes is None else int(strokes.shape[1])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -294,6 +333,7 @@ _LATER = frozenset(
         "segments_deg",
         "nominal_anamorphosis",
         "laser",
+        "local",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

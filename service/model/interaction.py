@@ -23,7 +23,7 @@ from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.local import Drawing, LocalShapes, Patch, Shapes, beside, tiles_of
 from service.model.misregistration import Misregistration, rotation, stretching
-from service.model.modes import Basis, ModalBasis
+from service.model.modes import Basis, local_of
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.registry import kind_of
@@ -162,12 +162,12 @@ class InteractionModel:
     def _take_up(self, basis: Basis) -> None:
         self.basis = basis
         self._modes: _Last[Shapes] = _Last()
-        local = isinstance(basis, ModalBasis) and basis.is_local
-        self._tiles = tiles_of(self.pupil) if local else ()
+        local = local_of(basis)
+        self._tiles = () if local is None else tiles_of(self.pupil)
         self._combination: Array | None = None
-        if isinstance(basis, ModalBasis) and local:
+        if local is not None:
             single = self._dtype is np.float32
-            self._combination = basis.in_single.coefficients if single else basis.coefficients
+            self._combination = (local.in_single if single else local).coefficients
 
     def forget(self) -> None:
         """Give back the memory of the last response and the last rendered modes."""
@@ -338,9 +338,9 @@ class InteractionModel:
         return moved.astype(self._dtype)
 
     def _by_tiles(self, alpha: Misregistration, way: Way | None) -> Shapes:
-        basis = self.basis
-        if not isinstance(basis, ModalBasis):
-            raise TypeError(f"found {type(basis).__name__}; only functions of actuators end")
+        basis = local_of(self.basis)
+        if basis is None:
+            raise TypeError(f"found {type(self.basis).__name__}; only functions of actuators end")
 
         def patch(number: int) -> Patch:
             tile = self._tiles[number]

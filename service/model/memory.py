@@ -55,14 +55,19 @@ def work_of(
 
 def _n_functions(instrument: Instrument) -> int:
     mirror = instrument.mirror
-    return len(mirror.positions_m) if isinstance(mirror, Mirror) else instrument.modes.n_modes
+    if isinstance(mirror, Mirror):
+        return len(mirror.positions_m)
+    return instrument.modes.n_modes if mirror.local is None else mirror.local.n_functions
 
 
 def _of_modes(instrument: Instrument) -> tuple[float, float]:
     """Return bytes of the modes as they are kept, and while they are made."""
     mirror = instrument.mirror
     if not isinstance(mirror, Mirror):
-        return 2.0 * mirror.cube.nbytes, 3.0 * mirror.cube.nbytes
+        if mirror.cube is not None:
+            return 2.0 * mirror.cube.nbytes, 3.0 * mirror.cube.nbytes
+        kept = 12.0 * _n_functions(instrument) * instrument.modes.n_modes
+        return kept, kept + _OF_STATISTICS * 8.0 * _n_functions(instrument) ** 2
     n_actuators = float(len(mirror.positions_m))
     surface = mirror_surface(mirror, instrument.subaperture_m)
     local = isinstance(surface, Gaussian)
@@ -83,11 +88,20 @@ def _near(instrument: Instrument) -> float:
     """Return how many functions reach a tile of the pupil, about."""
     mirror = instrument.mirror
     if not isinstance(mirror, Mirror):
-        return float(instrument.modes.n_modes)
+        if mirror.local is None:
+            return float(instrument.modes.n_modes)
+        step = mirror.pitch_m / instrument.subaperture_m
+        n_functions, n_samples = mirror.local.n_functions, len(mirror.local.heights)
+        reach = step * (float(np.sqrt(n_samples / n_functions / np.pi)) + 4.0)
+        each = np.pi / 4 * instrument.wfs.pupil_diameter**2 / n_functions
+        return float(min(n_functions, _reached(reach) / each))
     surface = mirror_surface(mirror, instrument.subaperture_m)
     n_actuators = float(len(mirror.positions_m))
     if not isinstance(surface, Gaussian):
         return n_actuators
-    reach = surface.reach
-    area = TILE_SUBAP**2 + 4 * TILE_SUBAP * reach + np.pi * reach**2
-    return float(min(n_actuators, area / surface.pitch**2))
+    return float(min(n_actuators, _reached(surface.reach) / surface.pitch**2))
+
+
+def _reached(reach: float) -> float:
+    """Return the area within this distance of a tile, subapertures."""
+    return float(TILE_SUBAP**2 + 4 * TILE_SUBAP * reach + np.pi * reach**2)

@@ -16,6 +16,7 @@ from service.model.far_field import PlateSum
 from service.model.instrument import Instrument, Mirror, TabulatedModes
 from service.model.karhunen_loeve import karhunen_loeve, surface_statistics
 from service.model.kinds import BasisKind
+from service.model.local_table import LocalTable, local_table
 from service.model.surface import Gaussian, Surface, mirror_surface
 from service.model.tabulated import TabulatedBasis, smoothed, tabulated_basis
 from service.model.turbulence import expected_variance
@@ -153,6 +154,15 @@ class ModalBasis:
 
 
 Basis = ModalBasis | TabulatedBasis
+LocalBasis = ModalBasis | LocalTable
+"""Made of functions that may end near their actuators."""
+
+
+def local_of(basis: Basis) -> LocalBasis | None:
+    """Return a basis whose functions end near their actuators; None: they do not."""
+    return basis if isinstance(basis, LocalBasis) and basis.is_local else None
+
+
 """Shapes of the mirror that can be evaluated wherever a registration puts them."""
 
 
@@ -165,8 +175,10 @@ def modal_basis(instrument: Instrument) -> Basis:
         If the mirror has fewer modes than were asked for, or its table is too coarse.
     """
     finest = instrument.finest
-    if isinstance(finest.mirror, TabulatedModes):
-        return in_subapertures(tabulated_basis(finest, finest.mirror), instrument)
+    mirror = finest.mirror
+    if isinstance(mirror, TabulatedModes):
+        made = tabulated_basis if mirror.local is None else local_table
+        return in_subapertures(made(finest, mirror), instrument)
     return in_subapertures(analytic_basis(finest), instrument)
 
 

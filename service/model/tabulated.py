@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -56,6 +57,9 @@ class TabulatedBasis:
     y_sign: float = 1.0
     """-1: the mirror is seen from behind."""
 
+    is_local: ClassVar[bool] = False
+    """Whether its functions end near their actuators."""
+
     @property
     def n_modes(self) -> int:
         """Modes of the basis."""
@@ -68,17 +72,11 @@ class TabulatedBasis:
 
     def render(self, points: Array) -> Array:
         """Return the modes ``(n_points, n_modes)`` at mirror ``points`` ``(n_points, 2)``."""
-        (rows, y), (columns, x) = self._splines(points)
-        return self._combined(rows, columns, _outer(y[0], x[0]))
+        return self._combined(self._splines_at(points, None))
 
     def render_slope(self, points: Array, direction: Array) -> Array:
         """Return the derivative of the modes along ``direction``, ``(n_points, n_modes)``."""
-        (rows, y), (columns, x) = self._splines(points)
-        along_x = direction[:, 0] / self.step_subap
-        along_y = direction[:, 1] * self.y_sign / self.step_subap
-        weights = along_x[:, None, None] * _outer(y[0], x[1])
-        weights += along_y[:, None, None] * _outer(y[1], x[0])
-        return self._combined(rows, columns, weights)
+        return self._combined(self._splines_at(points, direction))
 
     def render_wider(self, points: Array) -> Array:
         """Return how the modes change when their influence functions become wider."""
@@ -120,18 +118,30 @@ class TabulatedBasis:
             found.append((lines, _cubic(np.clip(place - cell, 0.0, 1.0))))
         return tuple(found)
 
-    def _combined(self, rows: NDArray[np.intp], columns: NDArray[np.intp], weights: Array) -> Array:
+    def _splines_at(self, points: Array, direction: Array | None) -> Any:  # noqa: ANN401 - sparse
+        """Return what each table point weighs at points, or in the rate along a direction there."""
+        (rows, y), (columns, x) = self._splines(points)
+        if direction is None:
+            weights = _outer(y[0], x[0])
+        else:
+            along_x = direction[:, 0] / self.step_subap
+            along_y = direction[:, 1] * self.y_sign / self.step_subap
+            weights = along_x[:, None, None] * _outer(y[0], x[1])
+            weights += along_y[:, None, None] * _outer(y[1], x[0])
         n_points = len(rows)
         index = rows[:, :, None] * self.surface_known.shape[1] + columns[:, None, :]
-        matrix = scipy.sparse.csr_array(
+        return scipy.sparse.csr_array(
             (
                 weights.astype(self.coefficients.dtype).ravel(),
                 index.astype(np.int32).ravel(),
                 np.arange(0, 16 * n_points + 1, 16, dtype=np.int32),
             ),
-            shape=(n_points, len(self.coefficients)),
+            shape=(n_points, self.surface_known.size),
         )
-        return np.asarray(matrix @ self.coefficients)
+
+    def _combined(self, splines: Any) -> Array:  # noqa: ANN401 - scipy has no types
+        """Return the modes where the table's points weigh so much."""
+        return np.asarray(splines @ self.coefficients)
 
 
 def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedBasis:
@@ -142,18 +152,10 @@ def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedB
     ModelError
         If the table is too coarse for the sensor.
     """
-    step = table.pitch_m / instrument.subaperture_m
-    if step > 1.0 / MIN_POINTS_PER_SUBAPERTURE:
-        raise ModelError(
-            f"modes: found a table of {1 / step:.2f} points per subaperture; expected at least "
-            f"{MIN_POINTS_PER_SUBAPERTURE:g}, {ENOUGH_POINTS_PER_SUBAPERTURE:g} for good"
-        )
-    reach = (instrument.wfs.pupil_diameter / 2 + MARGIN_SUBAP) / step
-    ny, nx = table.known.shape
-    margin = (int(np.ceil(reach - (ny - 1) / 2)), int(np.ceil(reach - (nx - 1) / 2)))
+    if table.cube is None:
+        raise ModelError("modes: found functions that end; expected a table of modes")
+    step, margin = margin_of(instrument, table)
     known = padded(table.known, margin)
-    if not known.any():
-        raise ModelError("modes: found a table that knows nothing of the surface over the pupil")
     samples = filled(table.cube, table.known, margin)
     for mode in samples.T:
         mode[:] = scipy.ndimage.spline_filter(
@@ -166,6 +168,28 @@ def tabulated_basis(instrument: Instrument, table: TabulatedModes) -> TabulatedB
         step_subap=step,
         y_sign=table.y_sign,
     )
+
+
+def margin_of(instrument: Instrument, table: TabulatedModes) -> tuple[float, tuple[int, int]]:
+    """Return the table's step in subapertures, and how many more rows and columns are needed.
+
+    Raises
+    ------
+    ModelError
+        If the table is too coarse for the sensor, or knows nothing over the pupil.
+    """
+    step = table.pitch_m / instrument.subaperture_m
+    if step > 1.0 / MIN_POINTS_PER_SUBAPERTURE:
+        raise ModelError(
+            f"modes: found a table of {1 / step:.2f} points per subaperture; expected at least "
+            f"{MIN_POINTS_PER_SUBAPERTURE:g}, {ENOUGH_POINTS_PER_SUBAPERTURE:g} for good"
+        )
+    reach = (instrument.wfs.pupil_diameter / 2 + MARGIN_SUBAP) / step
+    ny, nx = table.known.shape
+    margin = (int(np.ceil(reach - (ny - 1) / 2)), int(np.ceil(reach - (nx - 1) / 2)))
+    if not padded(table.known, margin).any():
+        raise ModelError("modes: found a table that knows nothing of the surface over the pupil")
+    return step, margin
 
 
 def smoothed(render: Callable[[Array], Array], points: Array) -> Array:
@@ -217,7 +241,7 @@ def filled(cube: Table, known: Mask, margin: tuple[int, int]) -> Table:
     """
     shapes = _resized(np.where(known, cube, cube.dtype.type(0)), margin)
     samples = np.ascontiguousarray(shapes.reshape(len(shapes), -1).T)
-    target, weights = _continuation(padded(known, margin))
+    target, weights = continuation(padded(known, margin))
     samples[target] = weights.astype(samples.dtype) @ samples
     return samples
 
@@ -228,7 +252,7 @@ def _resized(planes: NDArray[np.generic], margin: tuple[int, int]) -> NDArray[np
     return np.pad(planes[:, cut[0], cut[1]], [(0, 0), *grown])
 
 
-def _continuation(known: Mask) -> tuple[NDArray[np.intp], scipy.sparse.csr_array]:
+def continuation(known: Mask) -> tuple[NDArray[np.intp], scipy.sparse.csr_array]:
     """Return the unknown samples and the weights ``(n_unknown, n_samples)`` that make them."""
     nearest = scipy.ndimage.distance_transform_edt(
         ~known, return_distances=False, return_indices=True

@@ -66,6 +66,10 @@ HARM, HARM_S = 1.10, 5.0
 LEAST_NM = 20.0
 """Below it a wavefront is as good as any."""
 
+WIND_M = 0.012
+"""What the air moves from a frame to the next: at a lower rate the wind is as much slower. Gains of
+0.4 would leave a radian of wavefront else, and a matrix that reads too much would do better."""
+
 _OWNERS = {
     OperationKind.MEASURING,
     OperationKind.GATHERING,
@@ -439,6 +443,7 @@ def _words(rng: np.random.Generator, seed: int, what: Night) -> list[str]:
         f"--instrument={what.instrument}",
         f"--plant={what.plant}",
         f"--rate={what.rate_hz:g}",
+        f"--wind={WIND_M * what.rate_hz:g},35",
         "--n-controlled=45",
         f"--seed={seed}",
         "--mag=7",

@@ -29,7 +29,18 @@ _FITS_BEGINS = (b"SIMPLE  =", b"\x1f\x8b")
 
 NUMPY_BEGINS = b"\x93NUMPY"
 
-_OTHERS = {b"MATLAB 5": "a MATLAB file older than 7.3"}
+_OTHERS = {
+    b"MATLAB 5": ("a MATLAB file older than 7.3", "save it with -v7.3"),
+    b"PK\x03\x04": (
+        "a zip archive, as np.savez writes",
+        "save the matrix alone with np.save, or read it with pyrcal import npz",
+    ),
+    b"\x80": ("objects that Python pickled", "save the matrix alone with np.save"),
+}
+"""First bytes of what else comes, what it is, and what to do with it."""
+
+_SHOWN = 16
+"""Bytes of a file that tell what it is: a message repeats them."""
 
 
 class FileKind(StrEnum):
@@ -52,7 +63,7 @@ def kind_of(path: Path) -> FileKind:
     """
     try:
         with path.open("rb") as file:
-            begins, offset = file.read(9), 512
+            begins, offset = file.read(_SHOWN), 512
             there = begins[:8]
             while there and there != _HDF5_BEGINS:
                 file.seek(offset)
@@ -65,9 +76,21 @@ def kind_of(path: Path) -> FileKind:
         return FileKind.FITS
     if begins.startswith(NUMPY_BEGINS):
         return FileKind.NUMPY
-    kind = "something else" if begins else "an empty file"
-    kind = next((words for first, words in _OTHERS.items() if begins.startswith(first)), kind)
-    raise MatrixError(f"{path}: found {kind}, expected an HDF5, a FITS or a NumPy file")
+    kind, advice = _other_kind(begins)
+    raise MatrixError(f"{path}: found {kind}, expected an HDF5, a FITS or a NumPy file; {advice}")
+
+
+def _other_kind(begins: bytes) -> tuple[str, str]:
+    """Return what a file is that is none of these, and what to do with it."""
+    if not begins:
+        return "an empty file", "write it again"
+    for first, known in _OTHERS.items():
+        if begins.startswith(first):
+            return known
+    if not any(byte < 0x20 and byte not in b"\t\n\r" for byte in begins):
+        shown = begins.decode("ascii", "replace")
+        return f"text that begins {shown!r}", "np.save(path, np.loadtxt(file)) makes one of a table"
+    return f"a file that begins with the bytes {begins[:8].hex(' ')}", "np.save or h5py writes one"
 
 
 # --- what is asked of a fit

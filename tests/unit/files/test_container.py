@@ -82,7 +82,11 @@ def test_a_missing_file_is_said(tmp_path):
     [
         (b"", "an empty file"),
         (b"MATLAB 5.0 MAT-file", "a MATLAB file"),
-        (b"shift,rotation\n", "something else"),
+        (b"shift,rotation\n", "text that begins 'shift,rotation\\n'"),
+        ("µ".encode() + b" of a table", "text that begins"),
+        (b"PK\x03\x04\x14\x00", "a zip archive, as np.savez writes"),
+        (b"\x80\x04\x95", "objects that Python pickled"),
+        (b"\x1bLua\x00\xff", "a file that begins with the bytes 1b 4c 75 61 00 ff"),
     ],
 )
 def test_another_kind_of_file_is_named(tmp_path, content, kind):
@@ -90,7 +94,9 @@ def test_another_kind_of_file_is_named(tmp_path, content, kind):
     path.write_bytes(content)
     text = refused(path)
     assert kind in text
-    assert "expected an HDF5, a FITS or a NumPy file" in text
+    _, _, advice = text.partition("expected an HDF5, a FITS or a NumPy file; ")
+    assert advice
+    assert "\n" not in text
 
 
 def test_the_one_array_of_a_numpy_file_is_the_matrix(tmp_path):

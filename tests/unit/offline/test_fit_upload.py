@@ -227,7 +227,7 @@ def test_refusals_do_not_tell_where_the_service_keeps_its_files(tmp_path):
     folder = uploaded(tmp_path, HERE / "tiny.toml", tmp_path / "other.h5")
     with pytest.raises(MatrixError) as error:
         fitted(folder)
-    assert str(error.value).startswith("other.h5: found something else")
+    assert str(error.value).startswith("other.h5: found text that begins 'x'")
 
 
 def test_a_file_of_the_server_is_no_packaged_instrument(tmp_path, monkeypatch):

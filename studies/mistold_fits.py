@@ -50,7 +50,7 @@ from studies.mistold_matrices import (
     obscured_case,
     zonal_cases,
 )
-from studies.peers import KEPT, REQUIREMENTS, ROOT
+from studies.peers import FITTED, KEPT, ROOT
 from studies.peers_files import LISTINGS
 from studies.peers_pushpull import Measured
 
@@ -355,7 +355,7 @@ def _honesty(found: list[dict[str, Any]], *, modal: bool) -> str:
 def main() -> int:
     """Ask, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--peers", nargs="+", choices=list(REQUIREMENTS), default=None)
+    parser.add_argument("--peers", nargs="+", choices=FITTED, default=None)
     parser.add_argument(
         "--fresh", action="store_true", help="matrices that no constant was chosen on"
     )
@@ -365,7 +365,7 @@ def main() -> int:
     if given.fresh:
         answered, written, path = fresh_answers, fresh_page, PAGE.with_name("mistold_fresh.md")
     ask = not given.kept
-    found = [one for peer in given.peers or REQUIREMENTS for one in answered(peer, ask=ask)]
+    found = [one for peer in given.peers or FITTED for one in answered(peer, ask=ask)]
     if given.peers is None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(written(found))

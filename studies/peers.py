@@ -34,7 +34,7 @@ REQUIREMENTS = {
 """What is installed for each peer."""
 
 FITTED = ("oopao", "hcipy", "specula")
-"""Peers whose matrices of FLAO are fitted here."""
+"""Peers with a pyramid, whose matrices of FLAO are fitted here: SynIM's sensors are lenslets."""
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 

@@ -1,8 +1,9 @@
 """Matrices of other codes far off: 1.4 subapertures, 8 deg, 2 %, an anamorphosis of 1 %.
 
 OOPAO, HCIPy and SPECULA push the 357 actuators of the bench of ``studies.mistold_matrices`` with
-their own optics. Each matrix is fitted as it is, its instrument file told rightly with any
-orientation: actuators, and 250 KL modes, which are combinations of the same columns.
+their own optics; SynIM has lenslets of as many subapertures, and differentiates the same shapes.
+Each matrix is fitted as it is, its instrument file told rightly with any orientation: actuators,
+and 250 KL modes, which are combinations of the same columns.
 Run: ``python -m studies.peers_far``, or with ``--peers hcipy`` for some; matrices are kept.
 """
 
@@ -27,14 +28,20 @@ from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import karhunen_loeve_basis
+from service.model.sensors.shack_hartmann.description import ShackHartmann
 from studies.mistold_fits import AS_IT_IS, bench, error
 from studies.mistold_matrices import COUPLING, FRESH, PITCH_M, ZonalCase, actuators_m
 from studies.peers import KEPT, ROOT, environment, variables
-from studies.peers_pushpull import Measured, read_product, write_job
+from studies.peers_pushpull import Bench, Measured, read_product, write_job
 
 Array = NDArray[Any]
 
-PEERS = ("hcipy", "oopao", "specula")
+PEERS = ("hcipy", "oopao", "specula", "synim")
+LENSLETS = "synim"
+"""The peer whose sensor is a Shack-Hartmann, of mean gradients."""
+
+FINE = 12
+"""Its points across a subaperture: it differentiates on them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,9 +91,32 @@ CASES = (
 )
 
 
-def shapes_m(case: ZonalCase, far: Far) -> Array:
+def told_bench(peer: str) -> Bench:
+    """Return what the peer is told of the optics."""
+    told = _case(peer).bench
+    return replace(told, sampling=FINE) if peer == LENSLETS else told
+
+
+def _case(peer: str) -> ZonalCase:
+    return ZonalCase(peer=peer, stop=Stop.TELESCOPE, alpha=FRESH)
+
+
+def told_instrument(peer: str, measured: Measured, strokes: Array | None) -> Instrument:
+    """Return what a user of the peer knows."""
+    if peer != LENSLETS:
+        return bench(_case(peer), measured, strokes)
+    about = bench(_case("oopao"), measured, strokes)
+    lenslets = ShackHartmann(
+        n_subapertures=about.wfs.n_subapertures,
+        wavelength_m=measured.wavelength_m,
+        valid_subapertures=measured.valid,
+    )
+    return replace(about, name=peer, wfs=lenslets)
+
+
+def shapes_m(told: Bench, far: Far) -> Array:
     """Return every actuator's shape on the peer's pupil, ``(n_actuators, n, n)``: written out."""
-    told, (along, askew) = case.bench, far.stretch
+    along, askew = far.stretch
     axis = (np.arange(told.n_pupil) - (told.n_pupil - 1) / 2) / told.sampling
     x, y = np.meshgrid(axis, axis)
     points = np.column_stack([x.ravel(), y.ravel()]) - far.alpha.vector[:2]
@@ -98,16 +128,16 @@ def shapes_m(case: ZonalCase, far: Far) -> Array:
     return np.asarray(shapes.reshape(-1, told.n_pupil, told.n_pupil))
 
 
-def measured(case: ZonalCase, far: Far) -> Measured:
+def measured(peer: str, far: Far) -> Measured:
     """Return the peer's matrix, measured now unless it is kept."""
-    kept = KEPT / case.peer / f"{far.name}.npz"
+    kept = KEPT / peer / f"{far.name}.npz"
     if not kept.exists():
-        interpreter = environment(case.peer)
-        print(f"{case.peer}, {far.name}: measuring", file=sys.stderr, flush=True)
-        job = kept.with_name(f"{far.name}-job.npz")
-        write_job(job, case.bench, shapes_m=shapes_m(case, far))
+        interpreter = environment(peer)
+        print(f"{peer}, {far.name}: measuring", file=sys.stderr, flush=True)
+        job, told = kept.with_name(f"{far.name}-job.npz"), told_bench(peer)
+        write_job(job, told, shapes_m=shapes_m(told, far))
         subprocess.run(
-            [str(interpreter), "-m", f"studies.peers_{case.peer}", str(job), str(kept)],
+            [str(interpreter), "-m", f"studies.peers_{peer}", str(job), str(kept)],
             cwd=ROOT,
             env=variables(),
             stdout=subprocess.DEVNULL,
@@ -125,14 +155,13 @@ def strokes_of(about: Instrument) -> Array:
 
 def fitted(peer: str, far: Far, *, modal: bool) -> dict[str, Any]:
     """Return what the fit says of one matrix, and how far off that is."""
-    case = ZonalCase(peer=peer, stop=Stop.TELESCOPE, alpha=FRESH)
-    matrix = measured(case, far)
-    strokes = strokes_of(bench(case, matrix, None)) if modal else None
+    matrix = measured(peer, far)
+    strokes = strokes_of(told_instrument(peer, matrix, None)) if modal else None
     values = np.asarray(matrix.matrix, dtype=np.float64)
     begun = time.process_time()
     with threadpool_limits(1):
         fit = fit_matrix(
-            bench(case, matrix, strokes),
+            told_instrument(peer, matrix, strokes),
             Reference(matrix=values if strokes is None else values @ strokes),
             FitOptions(explain=True),
         )

@@ -36,6 +36,9 @@ diffractive telescopes; told an obscuration of 0.14 instead of 0.25 it was 0.13 
 MAX_TENSION = 5.0
 """Distance of a set of modes from the others, in its own σ."""
 
+MOST_GAIN = 500.0
+"""Of all modes, or one over it: a thousand between two units is beyond, whatever the light."""
+
 MAX_SCATTER = 0.35
 """Robust relative scatter of the gains; modes of another basis scatter by more than this."""
 
@@ -250,7 +253,7 @@ def _another_unit(findings: FitFindings) -> str:
         return ""
     gains = findings.solution.projection.gains
     middle = float(np.median(gains))
-    if not 1e-3 < middle < 1e3:
+    if not 1.0 / MOST_GAIN < middle < MOST_GAIN:
         return (
             f"the measured slopes are {middle:.1e} times the model's: the matrix is in another "
             "unit than slope per metre of OPD (per nanometre would be 1e-09)"

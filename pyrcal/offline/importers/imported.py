@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.config.instrument import load_instrument
-from service.errors import MatrixError, StorageError
+from service.errors import ConfigurationError, MatrixError, StorageError
 from service.files.container import DATASET
 from service.files.whole import write_whole
 from service.model.instrument import Instrument
@@ -24,6 +24,9 @@ Array = NDArray[Any]
 Tables = Mapping[str, Mapping[str, Any]]
 
 INSTRUMENT_FILE, ARRAYS_FILE = "instrument.toml", "matrix.h5"
+
+LARGEST_TELESCOPE_M = 100.0
+"""A wider one is a slip of the unit."""
 
 UNKNOWN = "unknown"
 """What an instrument file says of a number that nobody told."""
@@ -65,10 +68,16 @@ class Imported:
         Raises
         ------
         ConfigurationError
-            If the instrument file does not describe an instrument.
+            If the instrument file does not describe an instrument, or a telescope of 100 m.
         StorageError
             If the disk refuses.
         """
+        diameter_m = float(self.tables["instrument"]["diameter_m"])
+        if diameter_m > LARGEST_TELESCOPE_M:
+            raise ConfigurationError(
+                f"diameter_m: found {diameter_m:g}, expected metres, at most "
+                f"{LARGEST_TELESCOPE_M:g}; give the pupil's diameter in metres"
+            )
         place = Path(folder)
         saved = Saved(place / INSTRUMENT_FILE, place / ARRAYS_FILE)
         try:

@@ -27,6 +27,11 @@ from service.files.container import Container, opened
 UNIT = "nm"
 """Of SPECULA's commands."""
 
+LENSLETS = (
+    "slopes of lenslets are shares of half their field, which these files do not tell: the strokes "
+    "are taken as unknown"
+)
+
 
 class Subapertures(NamedTuple):
     """Where the subapertures lie, as they are listed."""
@@ -61,23 +66,25 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     """
     found: dict[str, Array] = {}
     places: Subapertures | None = None
-    interleaved = False
+    interleaved, notes = False, list[str]()
     for path in paths:
         with opened(path) as container:
             if "fsizex" in container.facts or "np_sub" in container.facts:
                 places = _subapertures(container)
                 continue
-            role, values = _role_of(container)
+            role, values, turned = _role_of(container)
             if role in found:
                 raise MatrixError(f"{path}: found a second {role}, expected one")
             found[role] = values
+            notes += turned
             interleaved |= bool(container.facts.get("intrlvd", False))
     if places is None or "matrix" not in found:
         missing = "PupData or SubapData" if places is None else "Intmat"
         raise MatrixError(f"{source}: found no {missing}, expected one among the files")
-    matrix, notes = oriented(
+    matrix, turned = oriented(
         found["matrix"], 2 * len(places.rows), None, "Intmat", "(n_slopes, n_modes)"
     )
+    notes += turned
     components = matrix.reshape(-1, 2, matrix.shape[1]) if interleaved else None
     both = (
         np.moveaxis(components, 1, 0) if components is not None else np.stack(np.split(matrix, 2))
@@ -86,40 +93,43 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     found["valid"] = places.mask
     # what its pyramid calls x runs along the rows of its mask
     order = "yx" if reported.sensor == "pyramid" else "xy"
+    if reported.sensor != "pyramid" and reported.unit is not None:
+        notes.append(LENSLETS)
+        reported = replace(reported, unit=None)
     imported = from_arrays(source, found, replace(reported, order=order))
-    moved = not np.array_equal(places.by_rows, np.arange(len(places.rows)))
-    ordered = ("subapertures were not listed row by row: sorted",) if moved else ()
-    return imported.noted(*notes, *ordered)
+    if not np.array_equal(places.by_rows, np.arange(len(places.rows))):
+        notes.append("subapertures were not listed row by row: sorted")
+    return imported.noted(*notes)
 
 
-def _role_of(container: Container) -> tuple[str, Array]:
-    """Return what the arrays of a file are for, and them as numbers."""
+def _role_of(container: Container) -> tuple[str, Array, tuple[str, ...]]:
+    """Return what the arrays of a file are for, them as numbers, and notes."""
     matrix, functions = container.find("INTMAT"), container.find("INFLUENCE_FUNCTION")
     if matrix is not None:
-        return "matrix", matrix.numbers()
+        return "matrix", matrix.numbers(), ()
     if functions is not None:
-        return "modes", _cube(container, functions.numbers())
+        return "modes", *_cube(container, functions.numbers())
     arrays = [stored for stored in container.arrays.values() if len(stored.shape) == 2]
     if len(arrays) != 1:
         raise MatrixError(
             f"{container.path}: found {container.listing()}, expected SPECULA's Intmat, PupData, "
             "SubapData, IFunc or M2C"
         )
-    return "mode_to_actuator", arrays[0].numbers()
+    return "mode_to_actuator", arrays[0].numbers(), ()
 
 
-def _cube(container: Container, functions: Array) -> Array:
+def _cube(container: Container, functions: Array) -> tuple[Array, tuple[str, ...]]:
     """Return an ``IFunc`` as maps, unknown outside its mask: it holds the points inside alone."""
     stored = container.find("MASK_INF_FUNC")
     if stored is None:
         raise MatrixError(f"{container.path}: found no MASK_INF_FUNC beside INFLUENCE_FUNCTION")
     inside = stored.numbers() > 0.0
-    values, _ = oriented(
+    values, turned = oriented(
         functions, int(inside.sum()), None, "INFLUENCE_FUNCTION", "(n_points, n_functions)"
     )
     cube = np.full((values.shape[1], *inside.shape), np.nan, dtype=np.float32)
     cube[:, inside] = values.T
-    return cube
+    return cube, turned
 
 
 def _subapertures(container: Container) -> Subapertures:

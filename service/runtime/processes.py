@@ -11,6 +11,7 @@ while its parent does.
 from __future__ import annotations
 
 import contextlib
+import io
 import multiprocessing
 import os
 import pickle
@@ -22,8 +23,9 @@ from importlib import import_module
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from threadpoolctl import threadpool_limits
 
@@ -31,6 +33,9 @@ from service.errors import PyrcalError, WorkerError
 
 ITS_WORK = "service.runtime.worker"
 """What every process imports before its first work."""
+
+APART_BYTES = 1 << 16
+"""An array that is larger is not copied to be sent: windows of many modes are 45 MB."""
 
 R = TypeVar("R")
 
@@ -80,8 +85,8 @@ class JobProcess:
             try:
                 line = self._started()
                 if not sent:
-                    line.send(work)
-                answer = line.recv()
+                    _send(line, work)
+                answer = _loaded(*_received(line))
             except OSError as error:  # no process to be had, or a line that is cut
                 raise EOFError from error
         if isinstance(answer, PyrcalError):
@@ -136,7 +141,7 @@ class Worker(JobProcess):
         self._enter = enter
         if self._line is not None:
             with contextlib.suppress(OSError):  # the first job finds out
-                self._line.send(enter)
+                _send(self._line, enter)
                 self._enters = True
         return self
 
@@ -155,12 +160,44 @@ def _work(line: Connection, nice: int, imports: str) -> None:
     threadpool_limits(1)  # of BLAS, which has been imported now
     with contextlib.suppress(EOFError, OSError):
         while True:
-            line.send(_answer(line.recv_bytes()))
+            _send(line, _answer(*_received(line)))
 
 
-def _answer(work: bytes) -> object:
+def _send(line: Connection, what: object) -> None:
+    """Send an object: its arrays as they lie in memory, the rest pickled."""
+    buffers: list[memoryview] = []
+
+    def is_small(buffer: pickle.PickleBuffer) -> bool:
+        raw = buffer.raw()
+        if raw.nbytes < APART_BYTES:
+            return True
+        buffers.append(raw)
+        return False
+
+    head = io.BytesIO()
+    ForkingPickler(head, pickle.HIGHEST_PROTOCOL, True, is_small).dump(what)
+    line.send_bytes(pickle.dumps([buffer.nbytes for buffer in buffers]))
+    line.send_bytes(head.getbuffer())
+    for buffer in buffers:
+        line.send_bytes(buffer)
+
+
+def _received(line: Connection) -> tuple[bytes, list[bytearray]]:
+    """Return what was sent: pickled, and its arrays where they are to stay."""
+    sizes = pickle.loads(line.recv_bytes())  # of this very program
+    head, buffers = line.recv_bytes(), [bytearray(size) for size in sizes]
+    for buffer in buffers:
+        line.recv_bytes_into(buffer)
+    return head, buffers
+
+
+def _loaded(head: bytes, buffers: list[bytearray]) -> Any:  # noqa: ANN401 - whatever was sent
+    return pickle.loads(head, buffers=buffers)  # of this very program
+
+
+def _answer(head: bytes, buffers: list[bytearray]) -> object:
     try:
-        return pickle.loads(work)()  # of this very program
+        return _loaded(head, buffers)()
     except PyrcalError as error:
         return error
     except Exception as error:  # noqa: BLE001 - sent home, where it is a failed job

@@ -30,7 +30,7 @@ UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 ROLES = {
     "matrix": ("interaction_matrix", "im", "imat", "intmat", "D", "matrix"),
     "valid": ("valid_subapertures", "valid", "mask", "valid_sub_aps", "subap_mask"),
-    "modes": ("modes", "influence_functions", "cube", "ifunc"),
+    "modes": ("modes", "influence_functions", "cube", "ifunc", "mode_shapes"),
     "mode_to_actuator": ("mode_to_actuator", "M2C", "m2c"),
     "positions": ("positions", "xy_m", "coordinates"),
 }

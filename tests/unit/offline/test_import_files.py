@@ -188,6 +188,23 @@ def test_arrays_are_known_by_their_names(tmp_path):
         by_role({"D": MATRIX, "im": MATRIX}, "it")
 
 
+def test_what_an_import_wrote_is_imported_again_the_same(tmp_path):
+    """From .npz to matrix.h5, from that to .npz and once more: the same numbers and keys."""
+    reported = replace(REPORTED, unit="m")
+    given = arrays(positions=np.random.default_rng(6).normal(size=(5, 2)))
+    for left_out in ("positions", "modes"):
+        np.savez(tmp_path / "it.npz", **{k: v for k, v in given.items() if k != left_out})
+        first = from_arrays("it", by_role(read_npz(tmp_path / "it.npz"), "it"), reported)
+        saved = first.save(tmp_path / "bench").matrix
+        with pyrcal.offline.recorded.opened(saved) as file:
+            np.savez(tmp_path / "it.npz", **{k: v.read() for k, v in file.arrays.items()})
+        again = from_arrays("it", by_role(read_npz(tmp_path / "it.npz"), "it"), reported)
+        assert again.tables == first.tables
+        assert again.arrays.keys() == first.arrays.keys()
+        for name, values in first.arrays.items():
+            np.testing.assert_array_equal(again.arrays[name], values, strict=True)
+
+
 @pytest.mark.parametrize(
     "listed",
     [

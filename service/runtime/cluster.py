@@ -270,8 +270,8 @@ class Cluster:
             self._compare(told)
             self._checked |= set(told)
 
-    def _compare(self, told: Mapping[str, object]) -> None:
-        for who, found in told.items():
+    def _compare(self, versions: Mapping[str, object]) -> None:
+        for who, found in versions.items():
             if found != own_versions():
                 raise ClusterError(_other_version(self.address, who, found))
 

@@ -39,6 +39,9 @@ Way = Callable[[Array], Array]
 LARGEST_STRETCH = 0.2
 """Beyond a fifth the image is another one."""
 
+_POINTS_TOGETHER = 2048
+"""Of the pupil, whose modes are evaluated at once: fewer would cut tiles of plates in pieces."""
+
 UNKNOWN_REACH_SUBAP = 1.0
 """Slopes this near to surface that a table does not know are left out of comparisons."""
 
@@ -220,7 +223,7 @@ class InteractionModel:
         ``(n_slopes, n_modes)``; the strokes of the actuators stay.
         """
         shapes = self._by_rows(self.basis.render_wider, self._mirror_points(alpha))
-        return self.seen(alpha, shapes.astype(self._dtype))
+        return self.seen(alpha, shapes)
 
     def linearise(self, alpha: Misregistration) -> Linearisation:
         """Return D(α) and its derivatives together, by an anamorphosis where it is followed."""
@@ -332,10 +335,9 @@ class InteractionModel:
             return self._by_tiles(alpha, way)
         points = self._mirror_points(alpha)
         if way is None:
-            return self._by_rows(self.basis.render, points).astype(self._dtype)
+            return self._by_rows(self.basis.render, points)
         both = np.hstack([points, way(points)])
-        moved = self._by_rows(lambda p: self.basis.render_slope(p[:, :2], p[:, 2:]), both)
-        return moved.astype(self._dtype)
+        return self._by_rows(lambda p: self.basis.render_slope(p[:, :2], p[:, 2:]), both)
 
     def _by_tiles(self, alpha: Misregistration, way: Way | None) -> Shapes:
         basis = local_of(self.basis)
@@ -361,8 +363,14 @@ class InteractionModel:
         )
         return shapes if shapes.is_cheaper else shapes.array()
 
-    def _by_rows(self, function: Callable[[Array], Array], rows: Array) -> Array:
-        return by_rows(self._map, function, rows)
+    def _by_rows(self, render: Callable[[Array], Array], points: Array) -> Array:
+        """Return what a basis makes of points, in the precision of products."""
+        return by_rows(
+            self._map,
+            lambda some: render(some).astype(self._dtype, copy=False),
+            points,
+            _POINTS_TOGETHER,
+        )
 
 
 def _made_again(model_of: Callable[[Basis], InteractionModel], basis: Basis) -> InteractionModel:
@@ -398,6 +406,7 @@ class _Last(Generic[Value]):
 
     def get(self, key: tuple[float, ...], compute: Callable[[], Value]) -> Value:
         if self.value is None or key != self.key:
+            self.value = None  # its memory is the next one's
             self.key, self.value = key, compute()
         return self.value
 

@@ -211,8 +211,10 @@ class Light(Protocol):
         """Return the light over that of an even beam, ``(n, n)`` on the sensor, and where known."""
 
 
-def by_rows(mapper: Mapper, function: Callable[[Array], Array], rows: Array) -> Array:
-    """Return what a function makes of rows, chunk after chunk."""
-    starts = range(0, len(rows), _ROW_CHUNK)
-    chunks = mapper(lambda start: function(rows[start : start + _ROW_CHUNK]), starts)
+def by_rows(
+    mapper: Mapper, function: Callable[[Array], Array], rows: Array, n_together: int = _ROW_CHUNK
+) -> Array:
+    """Return what a function makes of rows, chunk after chunk of so many together."""
+    starts = range(0, len(rows), n_together)
+    chunks = mapper(lambda start: function(rows[start : start + n_together]), starts)
     return np.concatenate(list(chunks))

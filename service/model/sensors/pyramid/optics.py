@@ -6,7 +6,7 @@ the modulated pupil field and W the one-dimensional "roof" operator. Unit of len
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
@@ -176,14 +176,14 @@ class PyramidOptics:
         """Return what all rows of subapertures share."""
         roof_y = self._roof(of_row.shift[1], of_row.nodes_y)
         roof_x = self._roof(of_row.shift[0], of_row.nodes_x)
-        fields_at_rest = self._fields(roof_y, roof_x)
-        along_y, along_x = self._tilts()
+        modulated_y, modulated_x = self._modulated(roof_y, roof_x)
+        fields_at_rest = self._fields(modulated_y, modulated_x)
         return PreparedRows(
             images=self._images(fields_at_rest, roof_y, roof_x),
             fields=fields_at_rest,
-            roof_y=roof_y,
-            along_y=along_y,
-            modulated_x=self.arrays.there(self._modulated_x(roof_x, along_x)),
+            factors_y=_weighted_parts(modulated_y, roof_y, axis=1),
+            factors_x=self.arrays.there(_weighted_parts(modulated_x, roof_x, axis=-2)),
+            signs=self._signs(len(roof_y.weights), len(roof_x.weights)),
             finish=self._finish(of_row.shapes),
         )
 
@@ -200,7 +200,7 @@ class PyramidOptics:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
         roof_y = self._roof(shift[1], Nodes.area(self.n_nodes))
         roof_x = self._roof(shift[0], Nodes.area(self.n_nodes))
-        return self._images(self._fields(roof_y, roof_x), roof_y, roof_x)
+        return self._images(self._fields(*self._modulated(roof_y, roof_x)), roof_y, roof_x)
 
     def _flux_gradient(self, by_row: list[Array], n_valid: int) -> Array:
         match self.recipe.normalisation:
@@ -220,7 +220,10 @@ class PyramidOptics:
         x = _SIDES[:, None, None] * half + centres[:, None] + nodes.offsets - shift
         distance = x[..., None] - self.pupil.coordinates
         kernel = _roof_kernel(distance, half, self.pupil.sampling)
-        return _Roof(kernel=kernel.astype(self._complex), weights=nodes.weights)
+        return _Roof(
+            kernel=np.ascontiguousarray(kernel.swapaxes(0, 1), self._complex),
+            weights=nodes.weights,
+        )
 
     def _source(self) -> tuple[Array, Array, Array]:
         """Return radius, angle and weight of every pair of source points, ``(M/2,)`` each.
@@ -252,92 +255,100 @@ class PyramidOptics:
         x = (radii * np.sin(angles))[:, None, None] * _SIDES[:, None]
         return along_y.astype(self._complex), np.exp(1j * x * u).astype(self._complex)
 
-    def _fields(self, roof_y: _Roof, roof_x: _Roof) -> Array:
-        """Return the fields at rest ``(M/2, 2, n, n_nodes, 2 of the pair, 2, n, n_nodes)``."""
+    def _modulated(self, roof_y: _Roof, roof_x: _Roof) -> tuple[Array, Array]:
+        """Return the roof operators times the source's phasors.
+
+        Along y ``(M/2, n, 2, n_nodes, N)``: source, subaperture, image side, node; along x
+        ``(n, M/2, 2, 2 of the pair, n_nodes, N)``.
+        """
         along_y, along_x = self._tilts()
-        amplitude = self.pupil.amplitude.astype(self.dtype)
-        n_u = len(amplitude)
-        left, right = roof_y.kernel.reshape(-1, n_u), roof_x.kernel.reshape(-1, n_u)
-        fields = [
-            ((left * tilt_y) @ amplitude) @ np.concatenate([right * tilt for tilt in pair]).T
-            for tilt_y, pair in zip(along_y, along_x, strict=True)
-        ]
-        return np.array(fields).reshape(
-            len(along_y), *roof_y.kernel.shape[:-1], 2, *roof_x.kernel.shape[:-1]
+        return (
+            along_y[:, None, None, None] * roof_y.kernel,
+            along_x[:, None, :, None] * roof_x.kernel[:, None, :, None],
         )
 
+    def _fields(self, modulated_y: Array, modulated_x: Array) -> Array:
+        """Return the fields at rest, for each subaperture together.
+
+        ``(n, n, M/2, 2, n_nodes, 2, 2 of the pair, n_nodes)``: row, column, source, image side and
+        node along y, image side, one of the pair and node along x.
+        """
+        amplitude = self.pupil.amplitude.astype(self._complex)
+        n_source, n, *_, n_u = modulated_y.shape
+        at_y, at_x = modulated_y.shape[2:-1], modulated_x.shape[2:-1]
+        fields = np.empty((n, n, n_source, math.prod(at_y), math.prod(at_x)), self._complex)
+        for source, left in enumerate(modulated_y):
+            right = modulated_x[:, source].reshape(-1, n_u)
+            seen = (left.reshape(-1, n_u) @ amplitude) @ right.T
+            fields[:, :, source] = seen.reshape(n, fields.shape[-2], n, -1).swapaxes(1, 2)
+        return fields.reshape(n, n, n_source, *at_y, *at_x)
+
     def _images(self, fields: Array, roof_y: _Roof, roof_x: _Roof) -> NDArray[np.float64]:
-        power = (fields.real**2 + fields.imag**2).sum(axis=(0, 4), dtype=np.float64)
-        images = np.einsum("yiaxjb,a,b->yixj", power, roof_y.weights, roof_x.weights)
+        parts = fields.view(self.dtype).reshape(*fields.shape[:3], -1)
+        power = np.square(parts).sum(axis=2, dtype=np.float64)
+        power = power.reshape(*fields.shape[:2], *fields.shape[3:], 2)
+        images = np.einsum("ijyaxpbc,a,b->yixj", power, roof_y.weights, roof_x.weights)
         # what the halo loses beyond the grid still falls on the detector, only without signal
         return np.asarray(images / (2.0 * self._source()[2].sum()))
 
-    def _modulated_x(self, roof_x: _Roof, along_x: Array) -> Array:
-        """Return the weighted x factors ``(2, M/2, n, 2 of the pair * n_nodes * Re | Im, N)``."""
-        weighted = roof_x.kernel * roof_x.weights[:, None].astype(self.dtype)
-        product = weighted[:, None, :, None] * along_x[None, :, None, :, None]
-        parts = np.stack([product.real, product.imag], axis=-2)
-        return parts.reshape(*parts.shape[:3], -1, parts.shape[-1])
+    def _signs(self, n_y: int, n_x: int) -> Array:
+        """Return with which sign each field at rest has a part in every plane of signals.
 
-    def _row_factors(self, row: int, columns: Array, rows: PreparedRows) -> tuple[Foreign, Foreign]:
-        """Return factors ``(n_terms, N)`` along y, ``(n_terms, n_lines, N)`` along x of one row.
+        ``(n_planes, 1, 1, 2, 2, n_y, 2, 2, n_x)``: with local normalisation the flux is one more
+        plane. Of the two parts of a field, times i and as it is, see ``_row_factors``.
+        """
+        if self.recipe.kind is SignalKind.INTENSITY:
+            signs = np.eye(4).reshape(4, 2, 2)
+        else:
+            signs = np.stack([np.tile(_SIGNS, (2, 1)), np.tile(_SIGNS, (2, 1)).T])
+        if self.recipe.normalisation is Normalisation.LOCAL:
+            signs = np.concatenate([signs, np.ones((1, 2, 2))])
+        parts = np.array([1j, 1.0])[:, None, None, None, None, None]
+        every = signs[:, None, None, None, :, None, :, None, None] * parts
+        shape = (len(signs), 1, 1, 2, 2, n_y, 2, 2, n_x)
+        return np.broadcast_to(every, shape).astype(self._complex)
+
+    def _row_factors(
+        self, row: int, columns: Array, rows: PreparedRows
+    ) -> tuple[Foreign, list[Foreign]]:
+        """Return factors ``(N, n_terms)`` along y, ``(n_lines, n_terms, N)`` along x of one row.
 
         The sum of their products over the terms, times the amplitude, is the gradient of each line:
         the signals plane by plane, then the flux of every subaperture with local normalisation,
-        else their sum. Modulation, nodes and images along y are terms; only the imaginary part is
-        needed: Re | Im of one factor stand against Im | Re of the other.
+        else, apart from the others, their sum. Modulation, nodes and images along y are terms; only
+        the imaginary part is needed: Re | Im of one factor stand against Im | Re of the other.
         """
-        weights = rows.roof_y.weights[:, None].astype(self.dtype)
-        along_y = rows.along_y[:, None, None] * rows.roof_y.kernel[:, row] * weights
-        factor_y = np.stack([along_y.real, along_y.imag], axis=1)
-        # (image side x, M/2, column, image side y, node y, pair, node x)
-        here = rows.fields[:, :, row][..., columns, :].transpose(4, 0, 5, 1, 2, 3, 6)
-        imaginary = np.stack([-here.imag, here.real], axis=-1)
-        real = np.stack([here.real, here.imag], axis=-1)
-        left = np.stack([imaginary, real], axis=3)
-        left = left.reshape(*left.shape[:3], 4 * len(weights), -1)
         xp, there = self.arrays.xp, self.arrays.there
+        along_y = rows.factors_y[:, :, row]
+        n_u = along_y.shape[-1]
         span = slice(int(columns[0]), int(columns[-1]) + 1)  # not copied, as a list of columns is
         if len(columns) == span.stop - span.start:
-            right = rows.modulated_x[:, :, span, :, :]
+            here, right = rows.fields[row, span], rows.factors_x[span, ...]
         else:
-            right = xp.take(rows.modulated_x, there(columns), axis=2)
-        product = xp.permute_dims(xp.matmul(there(left), right), (0, 1, 3, 2, 4))
-        seen = xp.reshape(product, (2, *factor_y.shape[:-1], *product.shape[3:]))
-        lines = self._lines(seen)
-        return (
-            there(factor_y.reshape(-1, factor_y.shape[-1])),
-            xp.reshape(lines, (-1, *lines.shape[-2:])),
-        )
+            here = rows.fields[row, columns]
+            right = xp.take(rows.factors_x, there(columns), axis=0)
+        left = (here[None, :, :, None] * rows.signs).view(self.dtype)
+        n_planes, n_columns, n_source = left.shape[:3]
+        left = left.reshape(n_planes, n_columns, n_source, along_y[0].size // n_u, -1)
+        right = xp.reshape(right, (n_columns, n_source, -1, n_u))
+        lines = xp.matmul(there(left), right)
+        along_x = [xp.reshape(lines, (n_planes * n_columns, -1, n_u))]
+        if self.recipe.normalisation is Normalisation.GLOBAL:
+            along_x.append(self._flux_factor(lines, along_y))
+        return there(along_y.reshape(-1, n_u).T), along_x
 
-    def _lines(self, seen: Foreign) -> Foreign:
-        """Return what images ``(2, M/2, 2, 2, n_nodes, n_columns, N)`` add to every line of a row.
-
-        Image side along x, source, Im | Re, image side along y, node along y.
-        """
-        xp, n = self.arrays.xp, seen.shape[-2]
-        left, right = seen[0, ...], seen[1, ...]
-        local = self.recipe.normalisation is Normalisation.LOCAL
-        n_signals = self.recipe.kind.n_planes * n
-        n_lines = n_signals + (n if local else 1)
-        out = xp.zeros(
-            (*left.shape[:-2], n_lines, seen.shape[-1]), dtype=seen.dtype, device=seen.device
-        )
-        total = left + right
+    def _flux_factor(self, lines: Foreign, along_y: Array) -> Foreign:
+        """Return the factor along x of a row's whole flux, ``(1, n_terms, N)``."""
+        xp = self.arrays.xp
         if self.recipe.kind is SignalKind.INTENSITY:
-            for plane, (side, along_x) in enumerate(itertools.product((0, 1), repeat=2)):
-                part = slice(plane * n, (plane + 1) * n)
-                out[:, :, side, :, part, :] = seen[along_x, :, :, side, ...]
-        else:
-            out[..., :n, :] = left
-            out[..., :n, :] -= right
-            out[..., n : 2 * n, :] = total
-            out[:, :, 1, :, n : 2 * n, :] *= float(_SIGNS[1])  # that of the other side is 1
-        flux = total if local else xp.sum(total, axis=-2, keepdims=True)
-        out[..., n_signals:, :] = flux
-        return out
+            flux = xp.sum(lines, axis=(0, 1))
+        else:  # the plane along y, less its signs
+            signs = np.broadcast_to(_SIGNS[:, None, None], (*along_y.shape[:-1], 1))
+            signs = signs.reshape(len(along_y), -1, 1).astype(self.dtype)
+            flux = xp.sum(lines[1, ...], axis=0) * self.arrays.there(signs)
+        return xp.reshape(flux, (1, -1, flux.shape[-1]))
 
-    def _finish(self, shapes: Shapes | None) -> Callable[[Foreign, Foreign], Foreign]:
+    def _finish(self, shapes: Shapes | None) -> Callable[[Foreign, list[Foreign]], Foreign]:
         """Return what makes of a row's factors its gradient, or its response to shapes."""
         if isinstance(shapes, LocalShapes):
             return TiledResponse(shapes, self._scale, self.arrays)
@@ -354,7 +365,7 @@ class PyramidOptics:
     def _fold(
         self,
         along_y: Foreign,
-        along_x: Foreign,
+        along_x: list[Foreign],
         *,
         lit: Foreign,
         scale: Foreign,
@@ -362,8 +373,9 @@ class PyramidOptics:
     ) -> Foreign:
         """Return the gradient of every line ``(n_lines, n_points)``, or its product with shapes."""
         xp = self.arrays.xp
-        product = xp.matmul(along_y.T, xp.permute_dims(along_x, (1, 0, 2)))
-        gradient = xp.take(xp.reshape(product, (product.shape[0], -1)), lit, axis=1)
+        products = (xp.matmul(along_y, part) for part in along_x)
+        flat = [xp.reshape(product, (product.shape[0], -1)) for product in products]
+        gradient = xp.concat([xp.take(lines, lit, axis=1) for lines in flat], axis=0)
         gradient *= scale
         return gradient if shapes is None else xp.matmul(gradient, shapes)
 
@@ -374,10 +386,16 @@ class PreparedRows:
 
     images: NDArray[np.float64]
     fields: Array
-    roof_y: _Roof
-    along_y: Array
-    modulated_x: Foreign
-    finish: Callable[[Foreign, Foreign], Foreign]
+    factors_y: Array
+    """``(M/2, Re | Im, n, 2, n_nodes, N)``."""
+
+    factors_x: Foreign
+    """``(n, M/2, 2, 2 of the pair, n_nodes, Re | Im, N)``."""
+
+    signs: Array
+    """What a field is multiplied by in every plane of signals."""
+
+    finish: Callable[[Foreign, list[Foreign]], Foreign]
     """What makes of a row's factors its gradient, or its response to shapes."""
 
 
@@ -444,10 +462,16 @@ class _Roof:
     """The roof operator along one axis at every quadrature node."""
 
     kernel: Array
-    """``(2, n, n_nodes, N)``: image side, subaperture, node, pupil coordinate."""
+    """``(n, 2, n_nodes, N)``: subaperture, image side, node, pupil coordinate."""
 
     weights: NDArray[np.float64]
     """``(n_nodes,)``."""
+
+
+def _weighted_parts(modulated: Array, roof: _Roof, axis: int) -> Array:
+    """Return roof operators times phasors and weights of the nodes, Re | Im along an axis."""
+    weighted = modulated * roof.weights[:, None].astype(modulated.real.dtype)
+    return np.stack([weighted.real, weighted.imag], axis=axis)
 
 
 def _roof_kernel(

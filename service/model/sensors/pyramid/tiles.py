@@ -66,15 +66,13 @@ class _Strip:
 
     sum: _Sum
 
-    def seen(self, along_y: Foreign, along_x: Foreign, arrays: Arrays) -> Foreign:
+    def seen(self, along_y: Foreign, along_x: Sequence[Foreign], arrays: Arrays) -> Foreign:
         """Return ``(n_functions, n_lines)`` what lines see of the strip's functions."""
         xp = arrays.xp
-        n_terms, n_lines, n_u = along_x.shape
-        flat = xp.reshape(along_x, (n_terms, n_lines * n_u))
-        product = xp.matmul(along_y[:, self.lines].T, flat)
-        by_line = xp.permute_dims(xp.reshape(product, (-1, n_lines, n_u)), (1, 0, 2))
+        products = [xp.matmul(along_y[self.lines, :], part) for part in along_x]
+        by_line = xp.concat(products, axis=0)
         rows = [
-            xp.matmul(heights, xp.reshape(by_line[:, :, columns], (n_lines, -1)).T)
+            xp.matmul(heights, xp.reshape(by_line[:, :, columns], (by_line.shape[0], -1)).T)
             for columns, heights in self.tiles
         ]
         return self.sum(xp.concat(rows, axis=0), arrays)
@@ -98,8 +96,8 @@ class TiledResponse:
         known = shapes.combination
         self._combination = None if known is None else arrays.there(known)
 
-    def __call__(self, along_y: Foreign, along_x: Foreign) -> Foreign:
-        """Return ``(n_lines, n_shapes)`` of ``(n_terms, N)`` and ``(n_terms, n_lines, N)``."""
+    def __call__(self, along_y: Foreign, along_x: Sequence[Foreign]) -> Foreign:
+        """Return ``(n_lines, n_shapes)`` of ``(N, n_terms)`` and ``(n_lines, n_terms, N)``."""
         xp, arrays = self._arrays.xp, self._arrays
         strips = [strip.seen(along_y, along_x, arrays) for strip in self._strips]
         by_function = self._sum(xp.concat(strips, axis=0), arrays)

@@ -145,7 +145,9 @@ class Few:
 
     def matrix(self, tried: FitModels) -> Array:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
-        return self._at_solution(tried.model(CHEAP, tried.basis.subset(self.modes)))
+        own = tried.basis is self.models.basis
+        basis = self.model.basis if own else tried.basis.subset(self.modes)
+        return self._at_solution(tried.model(CHEAP, basis))
 
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, those given by a derivative included."""

@@ -76,9 +76,12 @@ class Columns:
         gains = np.sum(matrix * measured, axis=0) / power
         if not self.signed:
             gains = np.maximum(gains, 0.0)
-        counted = derivatives if self.rows.all() else np.compress(self.rows, derivatives, axis=1)
         # laid out row by row: every product of it would else copy it first
-        jacobian = counted.astype(np.float64, order="C")
+        if self.rows.all():
+            jacobian = derivatives.astype(np.float64, order="C")
+        else:
+            counted = np.compress(self.rows, derivatives, axis=1)
+            jacobian = counted.astype(np.float64, order="C", copy=False)
         along = np.einsum("ksm,sm->km", jacobian, matrix) / power
         for k, part in enumerate(along):
             jacobian[k] -= matrix * part

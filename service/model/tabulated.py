@@ -96,11 +96,14 @@ class TabulatedBasis:
         return np.asarray(inside)
 
     def subset(self, indices: Sequence[int] | NDArray[np.integer]) -> TabulatedBasis:
-        """Return a basis of these modes only."""
+        """Return a basis of these modes only; itself if they are all, in order."""
+        if np.array_equal(indices, np.arange(self.n_modes)):
+            return self
         return replace(self, coefficients=np.ascontiguousarray(self.coefficients[:, indices]))
 
     def combined(self, weights: Array) -> TabulatedBasis:
         """Return a basis of combinations of the modes, ``weights`` ``(n_modes, n_combined)``."""
+        weights = weights.astype(self.coefficients.dtype)
         return replace(self, coefficients=self.coefficients @ weights)
 
     def _place(self, points: Array) -> Array:

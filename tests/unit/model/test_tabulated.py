@@ -96,6 +96,17 @@ def test_a_table_of_single_precision_stays_one(points):
     np.testing.assert_allclose(single.render(points), double.render(points), atol=2e-5)
 
 
+def test_a_subset_of_all_modes_in_order_is_no_copy(basis):
+    assert basis.subset(np.arange(basis.n_modes)) is basis
+    assert basis.subset(np.arange(basis.n_modes)[::-1]) is not basis
+
+
+def test_combinations_keep_the_precision_of_the_table():
+    single = basis_of(table(dtype=np.float32)[0])
+    combined = single.combined(np.full((single.n_modes, 2), 0.5))
+    assert combined.coefficients.dtype == np.float32
+
+
 def test_a_subset_is_those_columns(basis, points):
     some = basis.subset([7, 2])
     assert some.n_modes == 2

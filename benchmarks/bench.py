@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from benchmarks import plant
 from benchmarks.bench_alone import alone_rows, elt_section, peak_mb
@@ -315,8 +315,13 @@ def facts(rounds: Rounds, peers: Sequence[PeerProcess]) -> list[str]:
     ours = [f"pyrcal {version('pyrcal')}", f"numpy {np.__version__}", f"scipy {version('scipy')}"]
     theirs = [f"{peer.peer} {peer.version}" for peer in peers]
     gflops = np.array(rounds.gflops)
+    kernels = {
+        f"{blas['internal_api']} {blas['version']} with kernels for {blas.get('architecture', '?')}"
+        for blas in threadpool_info()
+        if blas["user_api"] == "blas"
+    }
     return [
-        ", ".join([*ours, *theirs]),
+        ", ".join([*ours, *theirs, *sorted(kernels)]),
         f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; one "
         f"thread each; a product of {PRODUCT} x {PRODUCT} float32 at {np.median(gflops):.0f} "
         f"GFLOPS ({gflops.min():.0f} to {gflops.max():.0f} over the rounds)",

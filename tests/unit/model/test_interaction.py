@@ -221,7 +221,8 @@ def test_a_model_of_other_modes_shares_the_optics_and_nothing_else(stop, work):
     every = model.interaction_matrix(SOMEWHERE)
     work.clear()
     few = model.of_modes(model.basis.subset([3, 1]))
-    np.testing.assert_allclose(few.interaction_matrix(SOMEWHERE), every[:, [3, 1]], rtol=1e-4)
+    # 2e-7 of the whole: an element that is small itself is off by more in proportion
+    assert relative(few.interaction_matrix(SOMEWHERE), every[:, [3, 1]]) < 1e-6
     assert work["optics"] == 0
     np.testing.assert_array_equal(model.interaction_matrix(SOMEWHERE), every)
 

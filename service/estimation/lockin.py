@@ -65,7 +65,7 @@ class LockInPlan(WindowPlan):
         if highest <= edge:
             raise ModelError(
                 f"lock-in: found {self.frame_rate_hz:.4g} frames a second; expected more than "
-                f"{4 * edge:g}, room for a line and its side bins"
+                f"{4 * edge:g}, room for the side bins of a line"
             )
         if lines.min() <= edge or lines.max() >= highest:
             raise ModelError(

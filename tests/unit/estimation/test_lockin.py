@@ -69,7 +69,10 @@ def test_side_bins_stand_on_both_sides_at_three_to_twenty_hertz():
         ({"modes": (), "frequencies_hz": (), "amplitude_m": ()}, "differ in length"),
         ({"frequencies_hz": (15.0, 270.0)}, "lines at 15 to 270 Hz; expected between 20 and"),
         ({"frequencies_hz": (230.0, 485.0)}, "and 480 Hz, room for the side bins"),
-        ({"frame_rate_hz": 5.5}, "found 5.5 frames a second; expected more than 80, room"),
+        (
+            {"frame_rate_hz": 5.5},
+            "found 5.5 frames a second; expected more than 80, room for the side",
+        ),
         ({"frequencies_hz": (230.5, 270.0), "n_frames": 1001}, "1001 frames cut a period"),
         ({"frequencies_hz": (230.0, 233.0)}, "closer than 4 bins in one window"),
     ],

@@ -254,4 +254,4 @@ def test_an_aot_file_is_played_and_its_own_alpha_is_compared(telemetry, tmp_path
     write_aot(tmp_path / "alpha.fits", instrument, [told], None)
     status, _, said = tracked(capsys, tmp_path / "alpha.fits")
     assert status == 2
-    assert "found no slopes with modal commands" in said
+    assert "found no slopes with commands" in said

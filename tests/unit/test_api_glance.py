@@ -59,7 +59,7 @@ async def test_products_are_summed_over_slopes_some_at_a_time(monkeypatch):
 
 @pytest.mark.parametrize("form", ["raw", "npy"])
 async def test_a_large_matrix_leaves_in_parts_and_is_whole(client, service, monkeypatch, form):
-    monkeypatch.setattr(matrices, "_PART_BYTES", 100)
+    monkeypatch.setattr(matrices, "PART_BYTES", 100)
     answer = await client.get(f"/v1/reconstructors/cm-1/matrix?format={form}")
     matrix, file = service.matrix("cm-1"), io.BytesIO()
     np.save(file, matrix)

@@ -187,7 +187,7 @@ def test_nothing_is_opened_unasked_but_in_auto(mode):
     told = gone_back(story(mode))
     told.tell(found(after="cm-2"), after_s=2.0)
     assert opened(told) == []
-    assert "open the loop" in alarm(told, "probation").text
+    assert "Open the loop" in alarm(told, "probation").text
 
 
 @pytest.mark.parametrize(("setting", "mode", "n"), [(True, Mode.PROPOSE, 1), (False, Mode.AUTO, 0)])

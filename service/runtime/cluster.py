@@ -182,11 +182,12 @@ class Cluster:
 
     def _sent(self, parts: Sequence[object]) -> list[Future]:
         """Return parts as every worker has them; those that it had before are not sent again."""
+        if not parts:
+            return []
         there = {id(part): future for part, future in self._parts if future.status == "finished"}
-        if parts:
-            found = [there.get(id(part)) or self._scattered(part) for part in parts]
-            self._parts = list(zip(parts, found, strict=True))
-        return [future for _, future in self._parts] if parts else []
+        found = [there.get(id(part)) or self._scattered(part) for part in parts]
+        self._parts = list(zip(parts, found, strict=True))
+        return found
 
     def _scattered(self, what: object) -> Future:
         return self._client.scatter(what, broadcast=True, hash=False)

@@ -5,6 +5,7 @@ Instrument and modes come once and stay; of each matrix it is told α, and the r
 
 from __future__ import annotations
 
+import operator
 import pickle
 import threading
 from dataclasses import dataclass
@@ -43,7 +44,7 @@ class _Kept:
     def rows(self, described: bytes, parts: tuple[object, ...]) -> RowTask:
         """Return a function of rows; one thread makes it, the others wait."""
         with self._making:
-            known = len(parts) == len(self._parts) and all(map(_is, parts, self._parts))
+            known = len(parts) == len(self._parts) and all(map(operator.is_, parts, self._parts))
             if self._rows is None or not known or described != self._described:
                 self._rows = None  # before the next one takes memory
                 prepare, make = pickle.loads(described)  # of this very program
@@ -52,10 +53,6 @@ class _Kept:
                     self._model, self._parts = prepare(*parts), parts
                 self._rows, self._described = make(self._model), described
             return self._rows
-
-
-def _is(one: object, other: object) -> bool:
-    return one is other
 
 
 _HERE = _Kept()

@@ -43,13 +43,13 @@ fuzz: $(STAMP) ## a million malformed inputs of every kind; ARGS="--inputs 50000
 	@$(PY) -m tests.malformed $(ARGS)
 
 faults: $(STAMP) ## every fault that a night may bring, on real processes; a quarter of an hour, ARGS=--quick two minutes
-	@$(PY) -m studies.faults $(ARGS)
+	@$(PY) -m pyrcal_studies.faults $(ARGS)
 
 nights: $(STAMP) ## random sequences of faults in simulated time; hours, ARGS="--seeds 0:6 --seconds 100" minutes
-	@$(PY) -m studies.campaign.fault_nights $(ARGS)
+	@$(PY) -m pyrcal_studies.campaign.fault_nights $(ARGS)
 
 restarts: $(STAMP) ## the service killed two hundred times, and what it had acknowledged; half an hour
-	@$(PY) -m studies.restarts $(ARGS)
+	@$(PY) -m pyrcal_studies.restarts $(ARGS)
 
 check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m ruff check .
@@ -58,7 +58,7 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 	@.venv/bin/lint-imports --no-logo
 
 paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--quick rehearses
-	@$(PY) -m studies.heritier2018 $(ARGS)
+	@$(PY) -m pyrcal_studies.heritier2018 $(ARGS)
 
 bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/bench.md; a quarter of an hour
 	@$(PY) -m benchmarks.bench $(ARGS)

@@ -35,17 +35,25 @@ from pyrcal.offline.fitted import Fit
 from pyrcal.offline.matrix import FitOptions, fit_matrix
 from pyrcal.offline.recorded import read_recorded
 from pyrcal.offline.report import FitReport
+from pyrcal_studies.peers import ROOT, environment, measured, variables
+from pyrcal_studies.peers_cases import (
+    N_MODES,
+    SMALL,
+    Case,
+    bench,
+    in_degrees,
+    instrument,
+    job_arrays,
+)
+from pyrcal_studies.peers_files import LISTINGS, write_instrument, write_reference
+from pyrcal_studies.peers_fits import error
+from pyrcal_studies.peers_pushpull import Array, Measured, read_product, write_job
 from service.config import load_instrument
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.model.modes import ModalBasis, karhunen_loeve_basis
-from studies.peers import ROOT, environment, measured, variables
-from studies.peers_cases import N_MODES, SMALL, Case, bench, in_degrees, instrument, job_arrays
-from studies.peers_files import LISTINGS, write_instrument, write_reference
-from studies.peers_fits import error
-from studies.peers_pushpull import Array, Measured, read_product, write_job
 
 PEERS = ("oopao", "hcipy", "specula")
 MODES = (0, 50, 100, 200, 300, 399)
@@ -334,7 +342,9 @@ def main() -> int:
     """Measure, write the page and the plot, print the page."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bench")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--elt", action="store_true", help="the steps of studies.elt as well")
+    parser.add_argument(
+        "--elt", action="store_true", help="the steps of pyrcal_studies.elt as well"
+    )
     parser.add_argument("--page", type=Path, default=PAGE)
     given = parser.parse_args()
     with ExitStack() as stack, threadpool_limits(1):

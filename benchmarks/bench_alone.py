@@ -58,8 +58,8 @@ def alone_rows(
 
 
 def elt_section() -> str:
-    """Return what ``studies.elt`` says: it takes five minutes of processor time, and 4 GB."""
-    command = [sys.executable, "-m", "studies.elt"]
+    """Return what ``pyrcal_studies.elt`` says: five minutes of processor time, and 4 GB."""
+    command = [sys.executable, "-m", "pyrcal_studies.elt"]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return f"\n## A telescope of 39 m\n\n{said.strip()}\n"
 

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from studies.peers_pushpull import Array, Bench, Peer, read_job
+from pyrcal_studies.peers_pushpull import Array, Bench, Peer, read_job
 
 if TYPE_CHECKING:
-    from studies.peers_oopao import Oopao
+    from pyrcal_studies.peers_oopao import Oopao
 
 Result = TypeVar("Result")
 
@@ -43,7 +43,7 @@ def main() -> None:
     os.dup2(2, 1)
     name, job = sys.argv[1], Path(sys.argv[2])
     bench, arrays = read_job(job)
-    peer = getattr(import_module(f"studies.peers_{name}"), PEERS[name])(bench)
+    peer = getattr(import_module(f"pyrcal_studies.peers_{name}"), PEERS[name])(bench)
     print(json.dumps({"version": peer.version}), file=answers)
     sprint = None
     for line in sys.stdin:
@@ -82,7 +82,7 @@ class Sprint:
     def __init__(self, peer: Oopao, arrays: dict[str, Array], bench: Bench) -> None:
         from OOPAO.SPRINT import SPRINT
 
-        from studies import peers_oopao
+        from pyrcal_studies import peers_oopao
 
         self._oopao, self._bench, self._valid = peers_oopao, bench, peer.valid
         self.tel, self.ngs, self.wfs = peer.telescope, peer.telescope.src, peer.sensor

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.peers import variables
 from service.config import load_instrument
 from service.wire import encode_frames
 from sim_rtc.assembly import Telescope, build_telescope
@@ -30,7 +31,6 @@ from sim_rtc.computer.feed import BATCH_FRAMES, message_frames
 from sim_rtc.computer.telemetry import frames_of
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
-from studies.peers import variables
 
 _PEER = Path(__file__).with_name("plant_oopao.py")
 _PEER_SAMPLINGS = (2, 4)

@@ -12,14 +12,14 @@ from contextlib import suppress
 
 import numpy as np
 
+from pyrcal_studies.campaign.golden import FOLDER, INSTRUMENT, nights_in, read, with_instrument
+from pyrcal_studies.campaign.golden_codec import decoded
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import PyrcalError
 from service.tracker import step
 from service.tracking.events import Event
 from service.tracking.state import Mode, OperatorState, TrackerState
-from studies.campaign.golden import FOLDER, INSTRUMENT, nights_in, read, with_instrument
-from studies.campaign.golden_codec import decoded
 
 
 def main() -> int:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Observatory
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.control.loop import ControlLoop
@@ -34,7 +35,6 @@ from service.model.modes import karhunen_loeve_basis
 from service.runtime.worker import Compute, Conditions, OpticsWorker
 from service.tracking.state import Mode
 from service.tracking.updates import JUDGE_INTERVAL_S
-from studies.campaign.observatory import Observatory
 
 N_MODES = 594
 CONTROLLED = (400, N_MODES)

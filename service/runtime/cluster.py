@@ -45,7 +45,7 @@ EMPTY_S = 20.0
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Of mallopt(3)."""
 
-PACKAGES = ("service", "sim_rtc", "studies")
+PACKAGES = ("service", "sim_rtc", "pyrcal_studies")
 """Whose code a task may run."""
 
 

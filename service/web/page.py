@@ -56,7 +56,7 @@ SWAGGER: Final = Path(__file__).parent / "swagger"
 """Swagger UI, which shows what REST answers and tries it out: no observatory needs the internet."""
 
 OPENAPI: Final = Path(__file__).parent / "openapi.json"
-"""What REST answers: ``python -m studies.pages`` writes it."""
+"""What REST answers: ``python -m pyrcal_studies.pages`` writes it."""
 
 HEADERS: Final = {
     # its own files and its own service: nothing inline, no other host

@@ -2,7 +2,7 @@
 
 Records leave as they are: a view names the fields of one, in boundary units. A registration, or its
 1 σ, leaves as its four parameters; a number that is not finite is null. The OpenAPI document takes
-types and descriptions from the records themselves when it is written: ``studies.openapi``.
+types and descriptions from the records themselves when it is written: ``pyrcal_studies.openapi``.
 """
 
 from __future__ import annotations

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal_studies.tabulated_fill import FILLS, registered, sampled
 from service.model.instrument import TabulatedModes
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from studies.tabulated_fill import FILLS, registered, sampled
 from tests.numerics import small_basis, small_instrument
 
 TRUTH = Misregistration(shift_x_subap=0.9, shift_y_subap=-0.35)
@@ -58,7 +58,7 @@ def errors_percent(table, measured, end, fill):
 @pytest.mark.parametrize("fill", ["zeros", "nearest sample"])
 def test_leaving_out_the_slopes_near_its_end_cures_a_bad_fill(table, measured, end, fill):
     """Zeros cost 9 to 17 % of one of these large subapertures; the rule takes nine tenths away
-    (``python -m studies.tabulated_fill``: on the full telescope 0.055 % are left of 4 %).
+    (``python -m pyrcal_studies.tabulated_fill``: on the full telescope 0.055 % are left of 4 %).
     """
     with_all, without = errors_percent(table, measured, end, fill)
     assert without < with_all / 5

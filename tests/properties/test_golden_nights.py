@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.campaign.golden import INSTRUMENT, nights_in, read, replayed
+from pyrcal_studies.campaign.golden import INSTRUMENT, nights_in, read, replayed
 
 FOLDER = Path(__file__).parents[1] / "data" / "golden"
 

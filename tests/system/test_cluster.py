@@ -34,7 +34,7 @@ def campaign(rows, *words):
         [
             sys.executable,
             "-m",
-            "studies.campaign.system_nights",
+            "pyrcal_studies.campaign.system_nights",
             *NIGHTS,
             f"--output={rows}",
             *words,
@@ -115,7 +115,7 @@ def test_nights_without_any_worker_left_are_played_here_and_rows_are_resumed(tmp
 
 def test_a_worker_of_another_pyrcal_is_named(tmp_path):
     other = tmp_path / "other"
-    for package in ("service", "sim_rtc", "studies", "pyrcal"):
+    for package in ("service", "sim_rtc", "pyrcal_studies", "pyrcal"):
         shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("manual"))
     with (other / "service" / "errors.py").open("a") as file:
         file.write("# of another day\n")

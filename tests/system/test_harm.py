@@ -1,4 +1,4 @@
-"""What studies.faults and studies.restarts measure at length, in short: it stays so."""
+"""What pyrcal_studies measure at length, faults and restarts, in short: it stays so."""
 
 import re
 import subprocess
@@ -27,7 +27,7 @@ def run(*words):
 
 @pytest.mark.parametrize("fault", ["RTC killed", "link half open", "disk refuses"])
 def test_a_fault_is_named_and_passes(fault):
-    status, text = run("studies.faults", "--only", fault)
+    status, text = run("pyrcal_studies.faults", "--only", fault)
     # a loaded machine may name it later than asked; nothing else may be broken
     broken = re.sub(r"named after [0-9.]+ s, expected [0-9.]+ s", "-", text).splitlines()[-1]
     assert status == 0 or broken.endswith("| - |"), text
@@ -36,7 +36,7 @@ def test_a_fault_is_named_and_passes(fault):
 
 def test_what_was_acknowledged_is_there_after_each_of_six_kills(tmp_path):
     words = ("--rounds", "6", "--seed", "7", "--output", str(tmp_path / "rounds.jsonl"))
-    status, text = run("studies.restarts", *words)
+    status, text = run("pyrcal_studies.restarts", *words)
     assert status == 0, text
     assert "6 kills" in text
     assert "0 broken" in text

@@ -12,7 +12,14 @@ import pytest
 @pytest.mark.timeout(1800)
 def test_the_rehearsal_of_the_paper_writes_a_report_and_does_nothing_twice(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    command = [sys.executable, "-m", "studies.heritier2018", "--quick", "--output", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "pyrcal_studies.heritier2018",
+        "--quick",
+        "--output",
+        str(tmp_path),
+    ]
     first = subprocess.run(command, capture_output=True, text=True, check=True)
     report = Path(first.stdout.strip())
     assert "100%" in first.stderr

@@ -9,11 +9,11 @@ import httpx
 import pytest
 from fastapi import Request
 
+from pyrcal_studies.openapi import document
 from service.api import create_app
 from service.web import authentication, page
 from service.web.authentication import COOKIE, Hosts, Refusal, Refusals
 from service.web.keys import KeyFile, KeyScope
-from studies.openapi import document
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot, assert_problem
 from tests.unit.test_api_admission import serving
 from tests.unit.tracking.situations import POLICY

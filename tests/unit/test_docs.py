@@ -19,13 +19,13 @@ from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import command_line, with_negative_numbers
 from pyrcal.offline.system_file import load_system
+from pyrcal_studies.campaign.__main__ import campaign_parser
+from pyrcal_studies.demo.arguments import demo_parser
 from service.api import create_app
 from service.config import load_instrument, load_settings
 from service.tracking.alarms import ALARMS
 from service.web import page
 from sim_rtc.options import parse_options
-from studies.campaign.__main__ import campaign_parser
-from studies.demo.arguments import demo_parser
 from tests.unit.test_api import assert_problem, service
 from tests.unit.test_house import ROOT
 

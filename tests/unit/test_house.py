@@ -61,7 +61,7 @@ def test_nothing_is_there_that_nobody_calls():
     tool = vulture.Vulture(
         ignore_decorators=["@*.get", "@*.post", "@*.put", "@*.delete", "@*_validator*"]
     )
-    tool.scavenge([str(ROOT / name) for name in (*HELD, "sim_rtc", "studies", "benchmarks")])
+    tool.scavenge([str(ROOT / name) for name in (*HELD, "sim_rtc", "pyrcal_studies", "benchmarks")])
     idle = {
         item.name
         for item in tool.get_unused_code()

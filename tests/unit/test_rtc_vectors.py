@@ -7,6 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from pyrcal_studies.contract_tables import MESSAGES, rows_of
 from service import wire
 from service.errors import WireError
 from service.tracking.alarms import ALARMS
@@ -14,7 +15,6 @@ from service.wire import CommandKind, Keys
 from service.wire.codec import MESSAGE_LIMIT
 from sim_rtc.computer.reconstructors import Staging, Terms
 from sim_rtc.computer.telemetry import Batch, Identity, frames_of
-from studies.contract_tables import MESSAGES, rows_of
 from tests.vectors import FOLDER, PAGE, Vector, anchors_of, packed, vectors
 
 EVERY = vectors()

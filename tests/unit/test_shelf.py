@@ -9,7 +9,8 @@ from tests.unit.test_house import ROOT
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 FOLDERS = (
-    "service|pyrcal|check_rtc|sim_rtc|cacao_bridge|studies|benchmarks|tests|examples|deploy|docs"
+    "service|pyrcal|check_rtc|sim_rtc|cacao_bridge|pyrcal_studies|benchmarks|tests|examples|deploy"
+    "|docs"
 )
 NAMED = re.compile(rf"`((?:{FOLDERS})/[\w./-]*\w\.(?:py|toml|md|yml|json|js))`")
 DECISIONS = sorted((DOCS / "decisions").glob("0*.md"))

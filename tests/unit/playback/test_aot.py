@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pyrcal.playback.aot import read_telemetry
+from pyrcal_studies.campaign.small import SMALL
 from service.config import load_instrument
 from service.errors import MatrixError
 from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation
-from studies.campaign.small import SMALL
 
 aotpy = pytest.importorskip("aotpy")
 

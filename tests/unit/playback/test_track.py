@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pyrcal.__main__ import main
+from pyrcal_studies.campaign.small import SMALL
+from pyrcal_studies.campaign.telemetry import LINE_FRACTIONS
 from service.config import load_instrument
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
-from studies.campaign.small import SMALL
-from studies.campaign.telemetry import LINE_FRACTIONS
 
 RATE_HZ = 1000.0
 TRUE = {

@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign.golden_night import SETTINGS
+from pyrcal_studies.campaign.observatory import Observatory
+from pyrcal_studies.campaign.small import latencies_of
 from service.archive.serialisation import TrackingFile
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
@@ -14,9 +17,6 @@ from service.runtime.worker.records import Compute
 from service.tracking.products import MatrixState
 from service.tracking.resume import saved_of
 from service.tracking.state import Mode
-from studies.campaign.golden_night import SETTINGS
-from studies.campaign.observatory import Observatory
-from studies.campaign.small import latencies_of
 from tests.unit.runtime.small import COMPUTE, SIGMA, conditions, loop_settings, small_instrument
 from tests.unit.runtime.test_workbench import ALPHA, dithered_window, open_loop
 

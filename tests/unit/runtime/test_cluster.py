@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
+from pyrcal_studies.campaign.rows import played
 from service.errors import ClusterError, ModelError
 from service.runtime import cluster as module
 from service.runtime.cluster import Cluster, own_versions
-from studies.campaign.rows import played
 
 LocalCluster = pytest.importorskip("distributed").LocalCluster  # of the extra that setup installs
 
@@ -87,6 +87,6 @@ def test_without_the_extra_it_is_said_what_to_install(monkeypatch):
 def test_nobody_imports_dask_who_has_not_asked_for_it():
     code = (
         "import sys, service.runtime.cluster, service.runtime.worker, service.cli.serve; "
-        "import studies.campaign.rows; sys.exit('dask' in sys.modules)"
+        "import pyrcal_studies.campaign.rows; sys.exit('dask' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], env=os.environ).returncode == 0

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Observatory
+from pyrcal_studies.campaign.observatory_dome import Dome
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.errors import ConfigurationError
@@ -13,8 +15,6 @@ from service.runtime.worker import OpticsWorker
 from service.tracking.state import Mode
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
-from studies.campaign.observatory import Observatory
-from studies.campaign.observatory_dome import Dome
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 
 LAW = '\n[law]\nrotation_deg = "azimuth - 12.984 + 0.25 * (elevation - 60)"\n'

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from pyrcal.offline.matrix import fit_matrix
+from pyrcal_studies.campaign.golden_night import SETTINGS, WORDS
+from pyrcal_studies.campaign.observatory import Observatory
+from pyrcal_studies.campaign.small import latencies_of
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.estimation.reference import Reference
@@ -19,9 +22,6 @@ from service.tracking.state import Mode
 from service.tracking.validity import Validity
 from sim_rtc.telescope.imperfections import SETS
 from sim_rtc.telescope.linear import LinearPlant
-from studies.campaign.golden_night import SETTINGS, WORDS
-from studies.campaign.observatory import Observatory
-from studies.campaign.small import latencies_of
 
 FILE = Path(__file__).parents[2] / "data" / "lenslets.toml"
 ALPHA = Misregistration(

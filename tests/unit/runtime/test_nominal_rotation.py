@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Observatory
 from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
@@ -16,7 +17,6 @@ from service.runtime.workers import WorkerPool
 from service.tracking import events as ev
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.state import Mode
-from studies.campaign.observatory import Observatory
 from tests.states import tracker_state
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 from tests.unit.runtime.test_supervisor import running

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Observatory
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.estimation.description import LOW_MODES
@@ -16,7 +17,6 @@ from service.runtime.worker import OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking.registration import Source
 from service.tracking.state import Mode
-from studies.campaign.observatory import Observatory
 from tests.unit.runtime.handmade import take_sums
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 from tests.unit.runtime.test_streams import DESCRIPTION, MANY, N_MANY, RING, driven

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.acquisition import Start
+from pyrcal_studies.campaign.observatory import Observatory
 from service.archive import Archive
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
@@ -18,8 +20,6 @@ from service.tracking.mode_limits import ModeProof
 from service.tracking.operation_records import AcquisitionStage
 from service.tracking.resume import restored
 from service.tracking.state import Mode, TrackerState
-from studies.campaign.acquisition import Start
-from studies.campaign.observatory import Observatory
 from tests.states import changed, tracker_state
 from tests.unit.tracking.operations.test_acquisition import Acquiring
 from tests.unit.tracking.situations import START_NS

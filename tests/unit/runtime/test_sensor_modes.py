@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Observatory
+from pyrcal_studies.campaign.observatory_dome import Dome
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.errors import ModelError
@@ -19,8 +21,6 @@ from service.tracking.resume import resumed, saved_of
 from service.tracking.sending import why_unsendable
 from service.tracking.state import LoopState, Mode, TrackerState
 from sim_rtc.options import parse_options
-from studies.campaign.observatory import Observatory
-from studies.campaign.observatory_dome import Dome
 from tests.unit.runtime.small import COMPUTE
 
 FILE = """

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from studies.campaign.acquisition import Start, play
-from studies.campaign.acquisition_table import wrong
+from pyrcal_studies.campaign.acquisition import Start, play
+from pyrcal_studies.campaign.acquisition_table import wrong
 
 SMALL = Path(__file__).parents[2] / "system" / "small.toml"
 

@@ -1,7 +1,7 @@
 """How acquisitions are counted."""
 
-from studies.campaign.acquisition import RANGE, Start
-from studies.campaign.acquisition_table import table, wrong
+from pyrcal_studies.campaign.acquisition import RANGE, Start
+from pyrcal_studies.campaign.acquisition_table import table, wrong
 
 ROW = {
     "instrument": "flao-lbt",

@@ -3,13 +3,20 @@
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign import fault_nights
+from pyrcal_studies.campaign.fault_nights import (
+    AT_ONCE,
+    LASTING,
+    FaultNight,
+    Night,
+    deeds_of,
+    worse,
+)
+from pyrcal_studies.campaign.observatory_dome import Moment
+from pyrcal_studies.campaign.small import latencies_of
+from pyrcal_studies.campaign.trouble import Trouble, strike
 from service.tracking import commands as cmd
 from service.tracking.state import Mode
-from studies.campaign import fault_nights
-from studies.campaign.fault_nights import AT_ONCE, LASTING, FaultNight, Night, deeds_of, worse
-from studies.campaign.observatory_dome import Moment
-from studies.campaign.small import latencies_of
-from studies.campaign.trouble import Trouble, strike
 from tests.system.night import INSTRUMENT
 
 WORDS = (f"--instrument={INSTRUMENT}", "--plant=linear", "--n-controlled=45", "--seed=1")

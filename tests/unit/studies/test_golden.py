@@ -3,14 +3,21 @@
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign.golden import (
+    INSTRUMENT,
+    Teller,
+    first_difference,
+    nights_in,
+    read,
+    written,
+)
+from pyrcal_studies.campaign.golden_codec import decoded, encoded
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.products import ModeSet
 from service.tracking.state import Mode
 from service.wire import DitherKind
-from studies.campaign.golden import INSTRUMENT, Teller, first_difference, nights_in, read, written
-from studies.campaign.golden_codec import decoded, encoded
 from tests.states import tracker_state
 from tests.unit.tracking.situations import (
     ALPHA,

@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from studies import jump_flags
-from studies.jump_flags import Night
+from pyrcal_studies import jump_flags
+from pyrcal_studies.jump_flags import Night
 
 
 def test_a_window_in_which_it_jumps_is_between_both_places():

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.campaign.mistold import CASES, MistoldDome, play, table
+from pyrcal_studies.campaign.mistold import CASES, MistoldDome, play, table
 
 SMALL = str(Path(__file__).parents[2] / "system" / "small.toml")
 BY_NAME = {case.name: case for case in CASES}

@@ -6,8 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
+from pyrcal_studies.noisy_figure import draw, shown_columns
 from service.errors import ConfigurationError, MatrixError
-from studies.noisy_figure import draw, shown_columns
 from tests.numerics import small_instrument
 
 

@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Latencies, Observatory
+from pyrcal_studies.campaign.observatory_checks import Outcome, Swap, published, true_radius
+from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, replayed
+from pyrcal_studies.campaign.system_measures import row_of
 from service.config import load_settings
 from service.config.policy import policy_of
 from service.errors import CommandError
@@ -15,10 +19,6 @@ from service.tracking import events as ev
 from service.tracking.products import MatrixState
 from service.tracking.state import Mode
 from service.wire import DitherRequest
-from studies.campaign.observatory import Latencies, Observatory
-from studies.campaign.observatory_checks import Outcome, Swap, published, true_radius
-from studies.campaign.observatory_dome import START_NS, Dome, replayed
-from studies.campaign.system_measures import row_of
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED, small_instrument
 
 WORDS = [

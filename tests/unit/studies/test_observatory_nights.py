@@ -6,10 +6,10 @@ import sys
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign import system_nights
+from pyrcal_studies.campaign.system_cases import Case, Plan
+from pyrcal_studies.campaign.system_table import line_of, table
 from sim_rtc.options import parse_options
-from studies.campaign import system_nights
-from studies.campaign.system_cases import Case, Plan
-from studies.campaign.system_table import line_of, table
 from tests.unit.runtime.small import INSTRUMENT, N_CONTROLLED
 
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.campaign.observatory import Latencies, Observatory
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.model.misregistration import BOUNDARY_SCALE
 from service.runtime.worker import OpticsWorker
 from service.tracking.state import Mode
-from studies.campaign.observatory import Latencies, Observatory
 from tests.unit.runtime.small import COMPUTE, INSTRUMENT, N_CONTROLLED
 
 GIVEN = {

@@ -6,15 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign.kept_night import DOWN_S
+from pyrcal_studies.campaign.observatory_checks import Swap
+from pyrcal_studies.campaign.other_campaign import differing
+from pyrcal_studies.campaign.other_modes import came_of, corrected_s, longest, names, smoothed
+from pyrcal_studies.campaign.other_night import OtherNight, Plan
+from pyrcal_studies.campaign.other_truth import Kind, Truth
 from service.errors import LinkError
 from service.model.misregistration import Misregistration
 from service.tracking.state import Level, LogEntry
-from studies.campaign.kept_night import DOWN_S
-from studies.campaign.observatory_checks import Swap
-from studies.campaign.other_campaign import differing
-from studies.campaign.other_modes import came_of, corrected_s, longest, names, smoothed
-from studies.campaign.other_night import OtherNight, Plan
-from studies.campaign.other_truth import Kind, Truth
 
 SMALL = {"instrument": "tests/system/small.toml", "n_controlled": 45, "n_target": 60}
 

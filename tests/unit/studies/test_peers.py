@@ -7,13 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
-from service.config import load_instrument
-from service.model.kinds import Stop
-from studies.peers_cases import LARGE, Case, bench, cases, digest, mirror_points
-from studies.peers_files import LISTINGS, turned, write_instrument, write_reference
-from studies.peers_fits import KEPT_ANSWERS, Answer, Question, error, kept_answers
-from studies.peers_page import page
-from studies.peers_pushpull import (
+from pyrcal_studies.peers_cases import LARGE, Case, bench, cases, digest, mirror_points
+from pyrcal_studies.peers_files import LISTINGS, turned, write_instrument, write_reference
+from pyrcal_studies.peers_fits import KEPT_ANSWERS, Answer, Question, error, kept_answers
+from pyrcal_studies.peers_page import page
+from pyrcal_studies.peers_pushpull import (
     Bench,
     Measured,
     detector_from_pupil,
@@ -23,6 +21,8 @@ from studies.peers_pushpull import (
     write_job,
     write_product,
 )
+from service.config import load_instrument
+from service.model.kinds import Stop
 
 BENCH = Bench(
     diameter_m=8.0,

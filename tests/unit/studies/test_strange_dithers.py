@@ -3,9 +3,9 @@
 import pytest
 from threadpoolctl import threadpool_limits
 
-from studies.campaign.observatory import Latencies
-from studies.campaign.strange_nights import StrangeNight
-from studies.campaign.strange_rtc import Mischief
+from pyrcal_studies.campaign.observatory import Latencies
+from pyrcal_studies.campaign.strange_nights import StrangeNight
+from pyrcal_studies.campaign.strange_rtc import Mischief
 
 WORDS = [
     "--instrument=tests/system/small.toml",

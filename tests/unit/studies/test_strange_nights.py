@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign.observatory_dome import Moment
+from pyrcal_studies.campaign.strange_nights import _plan, beyond, deeds_of
+from pyrcal_studies.campaign.strange_rtc import DIALECTS, Mischief, dialect_of
 from service.estimation.frames import FrameBlock
-from studies.campaign.observatory_dome import Moment
-from studies.campaign.strange_nights import _plan, beyond, deeds_of
-from studies.campaign.strange_rtc import DIALECTS, Mischief, dialect_of
 
 MASK = np.array([[0, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1], [0, 1, 1, 0]], dtype=bool)
 N_SLOPES = 2 * int(MASK.sum())

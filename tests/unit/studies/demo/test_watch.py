@@ -5,9 +5,9 @@ import time
 import httpx
 import pytest
 
-from studies.demo.children import Child
-from studies.demo.truth import TruthFile
-from studies.demo.watch import (
+from pyrcal_studies.demo.children import Child
+from pyrcal_studies.demo.truth import TruthFile
+from pyrcal_studies.demo.watch import (
     HEADING,
     HOLD_S,
     STRETCH,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from studies.heritier2018 import telescope
+from pyrcal_studies.heritier2018 import telescope
 from tests.numerics import small_basis, small_instrument
 
 

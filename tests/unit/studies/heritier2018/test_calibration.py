@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pyrcal_studies.heritier2018 import telescope
+from pyrcal_studies.heritier2018.calibration import STROKE_M, Measurement
+from pyrcal_studies.heritier2018.matrices import column_gains, correlations
+from pyrcal_studies.heritier2018.reconstructors import MeasuredReconstructor, synthetic_matrix
+from pyrcal_studies.heritier2018.store import Store, in_order
+from pyrcal_studies.heritier2018.telescope import Occasion
 from service.model.misregistration import Misregistration
-from studies.heritier2018 import telescope
-from studies.heritier2018.calibration import STROKE_M, Measurement
-from studies.heritier2018.matrices import column_gains, correlations
-from studies.heritier2018.reconstructors import MeasuredReconstructor, synthetic_matrix
-from studies.heritier2018.store import Store, in_order
-from studies.heritier2018.telescope import Occasion
 
 ALPHA = Misregistration(shift_x_subap=0.2, rotation_rad=0.01, magnification=0.99)
 DAY = Occasion(daytime=True, seed=3, imperfections="ideal", vibrations=True, magnitude=2.0)

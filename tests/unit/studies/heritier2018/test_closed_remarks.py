@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from studies.heritier2018.closed_remarks import noise_remark, shaken_remark, spread_nm
+from pyrcal_studies.heritier2018.closed_remarks import noise_remark, shaken_remark, spread_nm
 
 
 def test_within_our_own_spread_nothing_needs_a_reason() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.heritier2018.crew import carry_out
-from studies.heritier2018.store import Record, Store, Task
+from pyrcal_studies.heritier2018.crew import carry_out
+from pyrcal_studies.heritier2018.store import Record, Store, Task
 
 DONE: list[str] = []
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.heritier2018.curves import COSTLY_NM, Curve, border_tolerances
-from studies.heritier2018.plan import FULL, QUICK, SWEEPS
-from studies.heritier2018.reconstructors import Kind
+from pyrcal_studies.heritier2018.curves import COSTLY_NM, Curve, border_tolerances
+from pyrcal_studies.heritier2018.plan import FULL, QUICK, SWEEPS
+from pyrcal_studies.heritier2018.reconstructors import Kind
 
 ROTATION, SHIFT, MAGNIFICATION = SWEEPS
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pyrcal_studies.heritier2018 import telescope
+from pyrcal_studies.heritier2018.closing import RAMP_GAINS, GainTuning
+from pyrcal_studies.heritier2018.loops import LoopRun, Over, statistics, wavefront_error_nm
+from pyrcal_studies.heritier2018.psf import strehl
+from pyrcal_studies.heritier2018.reconstructors import Kind, ModelReconstructor
+from pyrcal_studies.heritier2018.store import Record, Store, Task, in_order
+from pyrcal_studies.heritier2018.telescope import Occasion
 from service.model.misregistration import Misregistration
-from studies.heritier2018 import telescope
-from studies.heritier2018.closing import RAMP_GAINS, GainTuning
-from studies.heritier2018.loops import LoopRun, Over, statistics, wavefront_error_nm
-from studies.heritier2018.psf import strehl
-from studies.heritier2018.reconstructors import Kind, ModelReconstructor
-from studies.heritier2018.store import Record, Store, Task, in_order
-from studies.heritier2018.telescope import Occasion
 
 NIGHT = Occasion(daytime=False, seed=1, imperfections="ideal", magnitude=5.0, seeing_arcsec=0.3)
 """Calm enough for 30 modes."""

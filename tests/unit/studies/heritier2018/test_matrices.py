@@ -3,14 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.heritier2018.matrices import (
+from pyrcal_studies.heritier2018.matrices import (
     column_gains,
     condition,
     correlations,
     noisy_singular_values,
     singular_values,
 )
-from studies.heritier2018.matrix_figures import slope_maps
+from pyrcal_studies.heritier2018.matrix_figures import slope_maps
 
 
 def test_gains_of_scaled_columns_are_their_scales() -> None:

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from studies.heritier2018 import page
+from pyrcal_studies.heritier2018 import page
 
 
 def test_text_is_text_whatever_it_holds() -> None:

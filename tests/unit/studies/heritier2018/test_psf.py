@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pyrcal_studies.heritier2018.psf import FIELD, H_BAND_M, OVERSAMPLING, Camera, marechal, strehl
 from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import SETS
-from studies.heritier2018.psf import FIELD, H_BAND_M, OVERSAMPLING, Camera, marechal, strehl
 from tests.numerics import small_basis, small_instrument
 
 

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pyrcal_studies.heritier2018.plan import FULL, TRUTH, fits_from_random_starts, joint_fit
+from pyrcal_studies.heritier2018.registration import errors, fitted_alpha, is_right, random_starts
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from studies.heritier2018.plan import FULL, TRUTH, fits_from_random_starts, joint_fit
-from studies.heritier2018.registration import errors, fitted_alpha, is_right, random_starts
 
 
 def found(alpha: Misregistration) -> dict[str, np.ndarray]:

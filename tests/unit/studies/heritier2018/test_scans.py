@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from studies.heritier2018.scans import pull_reason
-from studies.heritier2018.telescope import beyond_actuators_subap
+from pyrcal_studies.heritier2018.scans import pull_reason
+from pyrcal_studies.heritier2018.telescope import beyond_actuators_subap
 
 
 def test_errors_beyond_sigma_are_the_telescopes_only_if_the_ideal_one_is_free_of_them() -> None:

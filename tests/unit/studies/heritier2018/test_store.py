@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.heritier2018.store import Record, Store, Task, in_order
+from pyrcal_studies.heritier2018.store import Record, Store, Task, in_order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.heritier2018 import paper
-from studies.heritier2018.simulator import optimum
-from studies.heritier2018.table2 import columns_by_part_nm, order_word, shares_nm
+from pyrcal_studies.heritier2018 import paper
+from pyrcal_studies.heritier2018.simulator import optimum
+from pyrcal_studies.heritier2018.table2 import columns_by_part_nm, order_word, shares_nm
 
 
 def test_the_papers_table_is_quoted_row_by_row() -> None:

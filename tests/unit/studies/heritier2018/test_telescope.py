@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pyrcal_studies.heritier2018.calibration import Answer
+from pyrcal_studies.heritier2018.plan import AROUND, FULL, TRUTH, Variant, around_runs, in_simulator
+from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
+from pyrcal_studies.heritier2018.registration import Found, resolved
+from pyrcal_studies.heritier2018.store import Store
+from pyrcal_studies.heritier2018.telescope import DRAWN, Occasion
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
-from studies.heritier2018.calibration import Answer
-from studies.heritier2018.plan import AROUND, FULL, TRUTH, Variant, around_runs, in_simulator
-from studies.heritier2018.reconstructors import synthetic_matrix
-from studies.heritier2018.registration import Found, resolved
-from studies.heritier2018.store import Store
-from studies.heritier2018.telescope import DRAWN, Occasion
 
 NIGHT = Occasion(daytime=False, seed=1, imperfections=DRAWN)
 

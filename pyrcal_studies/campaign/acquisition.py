@@ -1,0 +1,206 @@
+"""Acquisitions of the whole service from registrations it knows nothing of, in simulated time.
+
+Run: ``python -m pyrcal_studies.campaign.acquisition --plant linear --starts 0:100 --output
+var/acquisition.jsonl --table table.md``; starts that are there already are not run again. Each
+start draws its registration uniformly from ±1.5 subapertures, ±6 deg and ±5 %; the loop is closed
+on the matrix of a perfect registration, and nobody tells the service anything.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from pyrcal_studies.campaign.acquisition_table import table
+from pyrcal_studies.campaign.observatory import Observatory
+from pyrcal_studies.campaign.rows import Row, RowFile, range_of, tell
+from pyrcal_studies.campaign.small import bench_of
+from pyrcal_studies.campaign.system_nights import GAINS
+from service.config import load_settings
+from service.config.policy import policy_of
+from service.estimation.openloop import WideCaptureEstimate
+from service.model.misregistration import BOUNDARY_SCALE
+from service.tracking.events import WideCaptureFitted
+from service.tracking.operation_records import AcquisitionStage
+from service.tracking.state import Mode
+
+RANGE = np.array([1.5, 1.5, 6.0, 0.05])
+"""Of the registrations that are drawn, boundary units."""
+
+_SEED = 1905
+_LOOK_S = 0.5
+_HOLDS_S = 4.0
+"""For so long the loop must hold: one that has slipped is found out and opened in three."""
+
+_OVER = (AcquisitionStage.TRACKING, AcquisitionStage.FAILED, AcquisitionStage.ABORTED)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """What is run; two starts that are equal give the same row."""
+
+    instrument: str = "flao-lbt"
+    plant: str = "linear"
+    truth: str = "ideal"
+    """The simulator's set of imperfections."""
+
+    seed: int = 0
+    magnitude: float = 10.0
+    gain: float = 0.4
+    n_controlled: int = 400
+    """Modes in the loop as it is found, and to come back to."""
+
+    within_s: float = 90.0
+    sampling: int = 3
+    """Of the service's model: pupil points per subaperture, and nodes."""
+
+    @property
+    def alpha(self) -> NDArray[np.float64]:
+        """``(4,)`` where the mirror truly lies, boundary units."""
+        rng = np.random.default_rng([_SEED, self.seed])
+        return np.asarray(rng.uniform(-1.0, 1.0, 4) * RANGE + [0.0, 0.0, 0.0, 1.0])
+
+    @property
+    def words(self) -> list[str]:
+        """The simulator's command line."""
+        alpha = ",".join(f"{value:.5f}" for value in self.alpha)
+        return [
+            f"--instrument={self.instrument}",
+            f"--plant={self.plant}",
+            f"--imperfections={self.truth}",
+            f"--mag={self.magnitude}",
+            f"--seed={self.seed}",
+            f"--gain={self.gain}",
+            f"--n-controlled={self.n_controlled}",
+            f"--alpha={alpha}",
+        ]
+
+
+def play(start: Start) -> Row:
+    """Run one start until it tracks, fails, or its time is over."""
+    begun = time.monotonic()
+    with threadpool_limits(1):
+        settings = load_settings(None, {}, {"control.n_modes_target": start.n_controlled})
+        bench = bench_of(start.instrument, start.sampling)
+        linear = start.plant == "linear"
+        night = Observatory(start.words, policy_of(settings), Mode.AUTO, bench, with_poles=linear)
+        over_s = None
+        while night.time_s < start.within_s and not _ended(night, over_s):
+            night.advance(_LOOK_S)
+            stage = night.state.operations.acquisition.stage
+            over_s = (over_s or night.time_s) if stage in _OVER else None
+    acquisition, registration = night.state.operations.acquisition, night.state.alpha.registration
+    row: Row = {
+        "stage": str(acquisition.stage),
+        "text": acquisition.text,
+        "time_s": over_s or night.time_s,
+        "attempts": acquisition.attempt,
+        "n_modes": night.dome.moments[-1].n_controlled,
+        "closed": night.dome.moments[-1].closed,
+        "wavefront_nm": _wavefront_nm(night),
+        "true": (night.dome.alpha.vector * BOUNDARY_SCALE).tolist(),
+        "error": None,
+        "sigma": None,
+        "log": [entry.text for entry in night.state.log if entry.name.startswith("acquisition")],
+    }
+    row["far"] = [
+        _far(event.found, night)
+        for _, event in night.events
+        if isinstance(event, WideCaptureFitted)
+    ]
+    if registration is not None:
+        error = registration.alpha.vector - night.dome.alpha.vector
+        row["error"] = (error * BOUNDARY_SCALE).tolist()
+        row["sigma"] = (registration.sigma * BOUNDARY_SCALE).tolist()
+    row["radii"] = [swap.radius for swap in night.swaps]
+    return asdict(start) | row | {"took_s": time.monotonic() - begun}
+
+
+def _wavefront_nm(night: Observatory) -> float:
+    """Return the RMS of the last second."""
+    last = [m.wavefront_nm for m in night.dome.moments if m.time_s > night.time_s - 1.0]
+    return float(np.sqrt(np.mean(np.square(last))))
+
+
+def _ended(night: Observatory, over_s: float | None) -> bool:
+    """Return whether it is over: one that tracks has to hold, or it is no acquisition."""
+    if over_s is None:
+        return False
+    tracking = night.state.operations.acquisition.stage is AcquisitionStage.TRACKING
+    return not tracking or night.time_s >= over_s + _HOLDS_S
+
+
+def _far(found: WideCaptureEstimate, night: Observatory) -> Row:
+    """Return how far off a window with the loop open was, and what it saw."""
+    error = found.estimate.alpha.vector - night.dome.alpha.vector
+    gains = np.abs(found.estimate.optical_gain)
+    return {
+        "modes": [min(found.estimate.modes), max(found.estimate.modes)],
+        "error": (error * BOUNDARY_SCALE).tolist(),
+        "unexplained": found.unexplained,
+        "gains": [float(gains.min()), float(gains.max())],
+        "n_starts": found.n_starts,
+    }
+
+
+def main() -> int:
+    """Run what is missing, then print the table."""
+    given = _parser().parse_args()
+    file = RowFile(given.output)
+    for start in file.missing(_starts(given)):
+        row = play(start)
+        file.add(row)
+        sys.stderr.write(f"{start.seed}: {row['text']}\n")
+    text = table(file.rows)
+    tell(text, given.table, "python -m pyrcal_studies.campaign.acquisition")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pyrcal_studies.campaign.acquisition",
+        description="Lets the service find registrations from nothing, and counts how it ended.",
+    )
+    parser.add_argument(
+        "--output", type=Path, default=Path("acquisition.jsonl"), help="rows, resumed"
+    )
+    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    parser.add_argument("--instrument", default="flao-lbt", metavar="NAME|FILE")
+    parser.add_argument("--plant", choices=("linear", "diffractive"), default="linear")
+    parser.add_argument("--truth", default="ideal", metavar="NAME")
+    parser.add_argument("--starts", type=range_of, default=range(2), metavar="FIRST:END")
+    parser.add_argument("--mag", type=float, default=10.0)
+    parser.add_argument("--gain", type=float, help="default: 0.4 linear, 0.6 diffractive")
+    parser.add_argument("--n-controlled", type=int, default=400)
+    parser.add_argument("--within", type=float, default=90.0, metavar="S")
+    parser.add_argument(
+        "--sampling", type=int, default=3, help="of the service's model (default: %(default)s)"
+    )
+    return parser
+
+
+def _starts(given: argparse.Namespace) -> Iterator[Start]:
+    for seed in given.starts:
+        yield Start(
+            instrument=given.instrument,
+            plant=given.plant,
+            truth=given.truth,
+            seed=seed,
+            magnitude=given.mag,
+            gain=GAINS[given.plant] if given.gain is None else given.gain,
+            n_controlled=given.n_controlled,
+            within_s=given.within,
+            sampling=given.sampling,
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,409 @@
+"""What came of the demo: the estimate against the truth, the loop before and after, as a table."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from pyrcal_studies.demo.truth import TruthFile
+from service.model.misregistration import PARAMETERS
+
+TOLERANCE = {
+    "shift_x_subap": 0.02,
+    "shift_y_subap": 0.02,
+    "rotation_deg": 0.05,
+    "magnification": 0.002,
+}
+"""Largest error of an estimate the demo calls good, of 30 subapertures across the pupil or more."""
+
+TOLERANCE_ACROSS_SUBAP = 30.0
+"""Fewer may be turned or magnified by more: their edge moves as far."""
+
+MAX_ERROR_IN_SIGMA = 4.0
+
+LONG_S = 5.0
+"""What has been missing for so long is missing."""
+
+WORKER_BEHIND = "worker-behind"
+"""The alarm that says so: the estimate may come late, and the demo waits for it."""
+
+MODEL = "model"
+"""Name of what the service waits for until its model is prepared."""
+
+REAL_TIME = 0.9
+"""A simulator below this share of real time is called slow."""
+
+View = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Circumstances:
+    """What the demo has seen from outside: it tells why something did not come out right."""
+
+    seconds_to_ready: float | None = None
+    """From the start until model and simulator were prepared; None: they never were."""
+
+    seconds_to_first_applied: float | None = None
+    """After that; None: no matrix of the service has been applied."""
+
+    pace: float | None = None
+    """Seconds of telemetry that the simulator made in a second; None: not known."""
+
+    unanswered_s: float = 0.0
+    """How long the service has not answered."""
+
+    frameless_s: float = 0.0
+    """How long the service has received no frame."""
+
+    untold_s: float = 0.0
+    """How long the simulator has written nothing."""
+
+    endings: tuple[str, ...] = ()
+    """Of processes that have ended, and their last words."""
+
+    wanted_ratio: float = 1.0
+    """Wavefront error at the start over that at the end which is wanted at least."""
+
+    across_subap: float = TOLERANCE_ACROSS_SUBAP
+    """Subapertures across the pupil."""
+
+    refusal: str | None = None
+    """Why the last refused window was; None: not known."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Stage:
+    """The loop under one reconstructor."""
+
+    id: str | None = None
+    n_modes: int | None = None
+    wavefront_error_nm: float | None = None
+    """From the simulator's truth."""
+
+    worst_pole_radius: float | None = None
+    """As the service's gate predicts it within 3 sigma."""
+
+
+@dataclass(slots=True, kw_only=True)
+class Report:
+    """The figures of one run."""
+
+    true_alpha: dict[str, float] | None = None
+    estimated_alpha: dict[str, float] | None = None
+    sigma: dict[str, float] | None = None
+    """1 σ, the model-error floor included."""
+
+    floor: dict[str, float] | None = None
+    """The model error that no integration removes, 1 σ: part of ``sigma``."""
+
+    error: dict[str, float] | None = None
+    error_in_sigma: dict[str, float] | None = None
+    start: Stage = field(default_factory=Stage)
+    first_update: Stage = field(default_factory=Stage)
+    target_modes: Stage = field(default_factory=Stage)
+    wavefront_ratio: float | None = None
+    """Wavefront error at the start over that with more modes."""
+
+    reconstructors_published: int = 0
+    reconstructors_applied: int = 0
+    reconstructors_refused_by_gate: int = 0
+    reconstructors_rejected_by_rtc: int = 0
+    swaps: list[View] = field(default_factory=list)
+    frames_received: int = 0
+    frames_lost: int = 0
+    seconds_to_ready: float | None = None
+    seconds_to_first_applied: float | None = None
+    """After all was ready."""
+
+    pace: float | None = None
+    """Seconds of telemetry that the simulator made in a second."""
+
+    alarms: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    """Why it failed, as far as it can be seen."""
+
+    @property
+    def good(self) -> bool:
+        """Whether the main job was done."""
+        return not self.failures
+
+    def to_json(self) -> str:
+        """Return the report as one JSON object."""
+        return json.dumps({**asdict(self), "good": self.good}, indent=2)
+
+
+def make_report(
+    state: View | None,
+    reconstructors: list[View],
+    truth: TruthFile,
+    circumstances: Circumstances,
+) -> Report:
+    """Compare what the service says with what was true."""
+    report = Report(
+        seconds_to_ready=circumstances.seconds_to_ready,
+        seconds_to_first_applied=circumstances.seconds_to_first_applied,
+        pace=circumstances.pace,
+    )
+    if state is None:
+        report.failures.append("the service never answered")
+    else:
+        report.frames_received = state["link"]["frames_received"]
+        report.frames_lost = state["link"]["frames_lost"]
+        report.alarms = [f"{alarm['name']}: {alarm['text']}" for alarm in state["alarms"]]
+        report.swaps = truth.swaps
+        _count(report, reconstructors)
+        _stages(report, reconstructors, truth)
+        _compare(report, state, truth)
+        if circumstances.unanswered_s > LONG_S:
+            report.failures.append(
+                f"the service has not answered for {circumstances.unanswered_s:.0f} s"
+            )
+        _judge(report, circumstances)
+    if report.failures:
+        report.reasons = [*circumstances.endings, *_reasons(state, circumstances)]
+    return report
+
+
+def _reasons(state: View | None, circumstances: Circumstances) -> Iterator[str]:
+    """Yield what may have kept the service from its job."""
+    if state is None:
+        return
+    waited_for = waits(state)
+    if MODEL in waited_for:
+        yield f"the service was not ready: {waited_for[MODEL]}"
+        return
+    if circumstances.untold_s > LONG_S:
+        yield f"the simulator has made nothing for {circumstances.untold_s:.0f} s"
+    if circumstances.unanswered_s <= LONG_S:
+        yield from _of_frames(state, circumstances.frameless_s)
+    for alarm in state["alarms"]:
+        if alarm["name"] == WORKER_BEHIND:
+            yield f"too slow: {alarm['text']}"
+    if circumstances.pace is not None and circumstances.pace < REAL_TIME:
+        yield f"too slow: the simulator made {circumstances.pace:.2f} s of telemetry a second"
+    yield from _of_windows(state, circumstances.refusal)
+    told = {alarm["name"] for alarm in state["alarms"]}
+    yield from (f"waiting: {text}" for name, text in waited_for.items() if name not in told)
+
+
+def waits(state: View) -> dict[str, str]:
+    """Return what the service waits for, and whom, by name."""
+    return {
+        wait["name"]: f"for the {wait['responsible']}: {wait['text']}"
+        for wait in state["waiting_for"]
+    }
+
+
+def _of_frames(state: View, frameless_s: float) -> Iterator[str]:
+    if state["link"]["frames_received"] == 0:
+        yield "no frames: none has reached the service"
+    elif frameless_s > LONG_S:
+        yield f"no frames: the last reached the service {frameless_s:.0f} s ago"
+
+
+def _of_windows(state: View, refusal: str | None) -> Iterator[str]:
+    accepted, refused = state["windows_accepted"], state["windows_refused"]
+    if refused > accepted:
+        last = "" if refusal is None else f"; the last: {refusal}"
+        yield f"refused windows: {refused} of {accepted + refused}{last}"
+    elif accepted == 0 and state["registration"] is None:
+        yield "no window of telemetry was finished"
+
+
+def _count(report: Report, reconstructors: list[View]) -> None:
+    own = [r for r in reconstructors if r["parent"] is not None]
+    report.reconstructors_published = sum(r["published_ns_utc"] is not None for r in own)
+    report.reconstructors_applied = sum(r["applied_frame_seq"] is not None for r in own)
+    report.reconstructors_refused_by_gate = sum(r["state"] == "refused" for r in own)
+    report.reconstructors_rejected_by_rtc = sum(r["state"] == "rejected" for r in own)
+
+
+def _stages(report: Report, reconstructors: list[View], truth: TruthFile) -> None:
+    foreign = [r for r in reconstructors if r["parent"] is None]
+    applied = [r for r in reconstructors if r["applied_frame_seq"] is not None]
+    if foreign:
+        report.start = _stage(foreign[0], truth)
+    if applied:
+        report.first_update = _stage(applied[0], truth)
+    larger = [
+        _stage(r, truth)
+        for r in applied
+        if report.start.n_modes and r["n_modes"] > report.start.n_modes
+    ]
+    if larger:
+        # one applied just before the end has no wavefront error yet
+        seen = [stage for stage in larger if stage.wavefront_error_nm is not None]
+        report.target_modes = (seen or larger)[-1]
+        before_nm, after_nm = (
+            stage.wavefront_error_nm for stage in (report.start, report.target_modes)
+        )
+        if before_nm and after_nm:
+            report.wavefront_ratio = before_nm / after_nm
+
+
+def _stage(record: View, truth: TruthFile) -> Stage:
+    gate = record["gate"]
+    return Stage(
+        id=record["id"],
+        n_modes=record["n_modes"],
+        wavefront_error_nm=truth.wavefront_error_nm(record["id"]),
+        worst_pole_radius=None if gate is None else gate["worst_pole_radius"],
+    )
+
+
+def _compare(report: Report, state: View, truth: TruthFile) -> None:
+    known, last = state["registration"], truth.last
+    if last is not None:
+        report.true_alpha = {name: last[name] for name in PARAMETERS}
+    if known is None or report.true_alpha is None:
+        return
+    true = report.true_alpha
+    report.estimated_alpha, report.sigma = known["alpha"], known["sigma"]
+    report.floor = known["floor"]
+    report.error = {name: known["alpha"][name] - true[name] for name in PARAMETERS}
+    report.error_in_sigma = {name: report.error[name] / known["sigma"][name] for name in PARAMETERS}
+
+
+def _judge(report: Report, circumstances: Circumstances) -> None:
+    """Say in words everything that is not as it should be."""
+    fail, wanted = report.failures.append, circumstances.wanted_ratio
+    report.failures += _estimate_failures(report, circumstances.across_subap)
+    start, first, target = report.start, report.first_update, report.target_modes
+    if not _recovered(start.worst_pole_radius, first.worst_pole_radius):
+        fail("the stability margin has not recovered")
+    if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
+        fail("the wavefront error with more modes is not below that of the start")
+    elif report.wavefront_ratio is not None and report.wavefront_ratio < wanted:
+        fail(
+            f"the wavefront error of the start is {report.wavefront_ratio:.2f} times that with "
+            f"more modes, expected {wanted:g} times"
+        )
+    for swap in report.swaps:
+        if swap["frames_skipped"]:
+            fail(f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}")
+    report.failures += [f"alarm {text}" for text in report.alarms if not _is_slowness(text)]
+
+
+def _tolerances(across_subap: float) -> dict[str, float]:
+    wider = max(TOLERANCE_ACROSS_SUBAP / across_subap, 1.0)
+    return {
+        name: round(allowed if name.endswith("_subap") else wider * allowed, 4)
+        for name, allowed in TOLERANCE.items()
+    }
+
+
+def _estimate_failures(report: Report, across_subap: float) -> list[str]:
+    if report.error is None or report.error_in_sigma is None:
+        return ["no estimate of the registration"]
+    failures, tolerances = [], _tolerances(across_subap)
+    for name in PARAMETERS:
+        if abs(report.error[name]) > tolerances[name]:
+            failures.append(
+                f"{name} is off by {report.error[name]:+.5f}, allowed {tolerances[name]}"
+            )
+        if abs(report.error_in_sigma[name]) > MAX_ERROR_IN_SIGMA:
+            failures.append(f"{name} is off by {report.error_in_sigma[name]:+.1f} sigma")
+    return failures
+
+
+def _is_slowness(alarm: str) -> bool:
+    """Return whether an alarm only says that the machine is slow: that is told, and no failure."""
+    return alarm.startswith(f"{WORKER_BEHIND}: ")
+
+
+def _recovered(start: float | None, first: float | None) -> bool:
+    """Return whether an update has the better margin.
+
+    A worker without time never judges the matrix it replaces; the gate has judged the update.
+    """
+    return first is not None and (start is None or _less(first, start))
+
+
+def _less(value: float | None, limit: float | None) -> bool:
+    return value is not None and limit is not None and math.isfinite(value) and value < limit
+
+
+def table(report: Report) -> str:
+    """Return the closing table."""
+    lines = ["", "registration       true        estimated    sigma       error      in sigma"]
+    lines += [f"  {name:15}" + _row(report, name) for name in PARAMETERS]
+    lines += ["", "loop                           modes   wavefront error   worst pole radius"]
+    for label, stage in (
+        ("at the start", report.start),
+        ("after the first update", report.first_update),
+        ("with more modes", report.target_modes),
+    ):
+        lines.append(_stage_row(label, stage))
+    lines += _before_and_after(report)
+    seconds = report.seconds_to_first_applied
+    first = "never" if seconds is None else f"{seconds:.1f} s after it was ready"
+    ready = report.seconds_to_ready
+    lines += [
+        "",
+        "never ready" if ready is None else f"ready {ready:.1f} s after the start",
+        f"reconstructors: {report.reconstructors_published} published, "
+        f"{report.reconstructors_applied} applied, {report.reconstructors_refused_by_gate} refused "
+        f"by the gate, {report.reconstructors_rejected_by_rtc} rejected by the RTC; "
+        f"first applied {first}",
+        f"frames: {report.frames_received} received, {report.frames_lost} lost",
+    ]
+    lines += [
+        f"swap to {swap['cm_id']}: {swap['frames_skipped']} frames skipped, wavefront peak "
+        f"{swap['peak_before_nm']:.0f} nm before, {swap['peak_after_nm']:.0f} nm after"
+        for swap in report.swaps
+    ]
+    lines.append("")
+    lines += [f"FAILED: {text}" for text in report.failures] or ["GOOD: the main job was done"]
+    lines += [f"because: {text}" for text in report.reasons]
+    return "\n".join(lines)
+
+
+def _before_and_after(report: Report) -> list[str]:
+    before_nm, after_nm = report.start.wavefront_error_nm, report.target_modes.wavefront_error_nm
+    if not before_nm or not after_nm:
+        return []
+    return [
+        "",
+        "wavefront error         before  "
+        f"{_bar(before_nm, before_nm)} {before_nm:4.0f} nm   Strehl ratio at 1.65 um "
+        f"{strehl_ratio(before_nm):.2f}",
+        f"                         after  {_bar(after_nm, before_nm)} {after_nm:4.0f} nm   "
+        f"{'':24}{strehl_ratio(after_nm):.2f}   {before_nm / after_nm:.2f} times less",
+    ]
+
+
+def _bar(value_nm: float, whole_nm: float) -> str:
+    return ("#" * round(30.0 * min(value_nm / whole_nm, 1.0))).ljust(30)
+
+
+def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
+    """Return the share of the light that an image keeps in its peak: Marechal's approximation."""
+    return math.exp(-((2.0 * math.pi * error_nm / wavelength_nm) ** 2))
+
+
+def _row(report: Report, name: str) -> str:
+    true = report.true_alpha
+    if true is None:
+        return "  not known"
+    if report.estimated_alpha is None or report.sigma is None or report.error is None:
+        return f"{true[name]:+11.5f}    no estimate"
+    in_sigma = (report.error_in_sigma or {})[name]
+    return (
+        f"{true[name]:+11.5f} {report.estimated_alpha[name]:+14.5f} {report.sigma[name]:9.5f} "
+        f"{report.error[name]:+11.5f} {in_sigma:+9.2f}"
+    )
+
+
+def _stage_row(label: str, stage: Stage) -> str:
+    if stage.id is None:
+        return f"  {label:28} never reached"
+    error, radius = stage.wavefront_error_nm, stage.worst_pole_radius
+    return (
+        f"  {label:28} {stage.n_modes:5d}   "
+        f"{'-' if error is None else f'{error:8.1f} nm':>15}   "
+        f"{'not judged' if radius is None else f'{radius:.3f}':>17}"
+    )

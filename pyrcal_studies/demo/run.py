@@ -1,0 +1,255 @@
+"""One demo from its checks to its verdict: what the two processes are told, and when it is over."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import httpx
+
+from pyrcal_studies.demo.arguments import FORWARDED, REPEATED
+from pyrcal_studies.demo.children import children, interrupted_by_any_end
+from pyrcal_studies.demo.report import table
+from pyrcal_studies.demo.truth import TruthFile
+from pyrcal_studies.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, TelemetryObserver
+from service.config.instrument_schema import InstrumentFile, SlopesTable, read_instrument_file
+from service.errors import ConfigurationError, shown
+from service.model.kinds import KarhunenLoeve, LoopFacts
+
+LOG = "service.log"
+OWN = "flao-lbt"
+"""The instrument of the demo unless another is asked for."""
+
+WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
+"""Of the wavefront error before and after, where the night begins far away: of FLAO, and of any
+other telescope, whose modes leave what they leave."""
+
+FEW_MODES, FEW_RATIO = 170, 1.05
+"""Of a telescope with fewer modes, which begins with seven tenths of them: all of them leave 1.17
+times less than that (variance by N^(-√3/2), Noll 1976), and a third of it in decibels is asked."""
+
+PLACE = """\
+The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
+FAR = f"""\
+{PLACE} With that matrix a
+loop of 400 modes diverges, so the RTC begins with 120. WFE is what the simulator knows to be left.
+"""
+OTHER_FAR = f"""\
+{PLACE} The RTC begins
+with 120 modes, or with seven tenths of them all where that is fewer. WFE is what the simulator
+knows to be left.
+"""
+LARGE = """\
+This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
+fast as this machine goes: at the highest rate that it holds or, where a dither needs more, in slow
+motion. Until all is ready takes minutes: modes (kept on disk afterwards), D and its derivatives,
+and the simulator's own matrices: some 9 GB beside 6 of the service's.
+"""
+
+HELD_GFLOP_S = 30.0
+"""Of products of a matrix with few frames, what half a processor of two cores does."""
+
+CHECK_WITHIN_S = 60.0
+
+
+def run_demo(options: argparse.Namespace) -> int:
+    """Run the demo; return 0 if the main job was done, else 1.
+
+    Raises
+    ------
+    ConfigurationError
+        If an argument makes no sense; nothing has been started then.
+    """
+    service_words, sim_words = _commands(options)
+    _check(options, sim_words)
+    _emptied(options.dir)
+    url = f"http://127.0.0.1:{options.port}"
+    _say(f"service    pyrcal {' '.join(service_words)}")
+    _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
+    _say(f"REST       {url}/v1/state   logs and truth: {options.dir}\n")
+    large = _too_large(options)
+    if large is not None:
+        _say(LARGE.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
+    if _is_far(options):
+        _say(_beginning(options))
+    commands = {
+        "service": ["-m", "service", *service_words],
+        "simulator": ["-m", "sim_rtc", *sim_words],
+    }
+    with (
+        httpx.Client(base_url=url, timeout=ANSWER_WITHIN_S) as client,
+        interrupted_by_any_end(),
+        children(options.dir, commands) as started,
+    ):
+        truth = TruthFile(options.dir / "truth.jsonl")
+        watch = TelemetryObserver(client, truth, started, _promise(options), _say)
+        try:
+            watch.run()
+        except KeyboardInterrupt:
+            _say("\nstopping")
+        report = watch.closing_report()
+    _say(table(report))
+    if options.plot is not None:
+        from pyrcal_studies.demo.figure import draw
+
+        draw(report, truth, options.plot)
+    if options.json is not None:
+        options.json.write_text(report.to_json() + "\n", encoding="utf-8")
+    return 0 if report.good else 1
+
+
+def _is_far(options: argparse.Namespace) -> bool:
+    """Return whether the night begins far away: nothing is said of another telescope or sky."""
+    told = any(getattr(options, name) is not None for name in ("alpha", "plant", "scene"))
+    return not (told or options.near)
+
+
+def _beginning(options: argparse.Namespace) -> str:
+    """Return what a night that begins far away begins with; 400 modes are FLAO's."""
+    return FAR if options.instrument == OWN else OTHER_FAR
+
+
+class _Large(NamedTuple):
+    """A linear plant that no ordinary machine runs in real time."""
+
+    rate_hz: float
+    """Of its frames."""
+
+    gflop_s: float
+    """Of the products of its slopes and modes, by which it was judged."""
+
+
+def _too_large(options: argparse.Namespace) -> _Large | None:
+    """Return what it takes where that is more than a machine has; None: it keeps real time.
+
+    Each frame is multiplied by R and by D. How fast is in its file; who does not say is small.
+    """
+    if options.plant == "diffractive":
+        return None
+    said = read_instrument_file(options.instrument)
+    rate_hz = said.section(LoopFacts).said.frame_rate_hz
+    if rate_hz is None:
+        return None
+    gflop_s = 4e-9 * rate_hz * _n_slopes(said) * said.section(KarhunenLoeve).said.n_modes
+    return _Large(rate_hz, gflop_s) if gflop_s > HELD_GFLOP_S else None
+
+
+def _n_slopes(said: InstrumentFile) -> float:
+    """Return about how many slopes a file's sensor has."""
+    kind = said.section(SlopesTable).said.kind
+    return float(kind.n_planes * math.pi / 4 * _across_subap(said) ** 2)
+
+
+def _across_subap(said: InstrumentFile) -> float:
+    return float(said.section(said.kind.table).said.pupil_diameter)
+
+
+def _promise(options: argparse.Namespace) -> Promise:
+    large = _too_large(options)
+    return Promise(
+        seconds=options.seconds,
+        whole=any(getattr(options, name) for name in ("jump", "drift", "fault")),
+        real_time=options.plant != "diffractive" and large is None,
+        wanted_ratio=_wanted_ratio(options),
+        across_subap=_across_subap(read_instrument_file(options.instrument)),
+        held_rate=options.instrument != OWN,
+        large=large is not None,
+        asked_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
+    )
+
+
+def _wanted_ratio(options: argparse.Namespace) -> float:
+    if not _is_far(options) or _too_large(options) is not None:
+        return 1.0
+    if options.instrument == OWN:
+        return WANTED_RATIO
+    n_modes = read_instrument_file(options.instrument).section(KarhunenLoeve).said.n_modes
+    return OTHER_RATIO if n_modes > FEW_MODES else FEW_RATIO
+
+
+def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
+    """Refuse what cannot be run before anything is started or emptied.
+
+    Raises
+    ------
+    ConfigurationError
+        With one line that says what was found and what was expected.
+    """
+    read_instrument_file(options.instrument)
+    for name, file in (("--json", options.json), ("--plot", options.plot)):
+        if file is not None and (file.is_dir() or not file.absolute().parent.is_dir()):
+            raise ConfigurationError(f"{name} {file}: expected a file in a folder that exists")
+    if options.plot is not None and find_spec("matplotlib") is None:
+        raise ConfigurationError("--plot: found no matplotlib; expected the extra 'plots'")
+    if options.port == options.zenoh_port:
+        raise ConfigurationError(f"--port and --zenoh-port: both {options.port}, expected two")
+    for name, port in (("--port", options.port), ("--zenoh-port", options.zenoh_port)):
+        try:
+            socket.create_server(("127.0.0.1", port)).close()
+        except OSError as error:
+            raise ConfigurationError(
+                f"{name} {port}: cannot listen on 127.0.0.1:{port}: {error.strerror or error}; "
+                "choose another, the service would not start"
+            ) from error
+    # the simulator alone knows what it understands, and the service does not know the simulator
+    checked = subprocess.run(
+        [sys.executable, "-m", "sim_rtc.options", *sim_words],
+        capture_output=True,
+        text=True,
+        timeout=CHECK_WITHIN_S,
+        check=False,
+    )
+    if checked.returncode != 0:
+        raise ConfigurationError(checked.stderr.strip().removeprefix("sim_rtc: "))
+
+
+def _emptied(directory: Path) -> None:
+    """Begin with an empty directory; one that no earlier demo has filled is left alone.
+
+    Raises
+    ------
+    ConfigurationError
+        If it holds something else, or is no directory.
+    """
+    try:
+        if directory.exists() and any(directory.iterdir()) and not (directory / LOG).exists():
+            raise ConfigurationError(f"--dir {directory}: holds other files; name a new directory")
+        shutil.rmtree(directory, ignore_errors=True)
+        directory.mkdir(parents=True)
+    except OSError as error:
+        raise ConfigurationError(f"--dir {directory}: {error.strerror or error}") from error
+
+
+def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
+    endpoint = f"tcp/127.0.0.1:{options.zenoh_port}"
+    service = ["run", "--mode", "auto", "--listen", endpoint, "--port", str(options.port)]
+    service += ["--data-dir", str(options.dir / "data"), "--instrument", options.instrument]
+    simulator = ["--connect", endpoint, "--seed", str(options.seed)]
+    simulator += ["--instrument", options.instrument]
+    simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
+    if options.instrument != OWN:
+        simulator.append("--held-rate")
+    large = _too_large(options)
+    if large is not None:
+        simulator.append(f"--rate={large.rate_hz:g}")
+    if _is_far(options):
+        simulator.append("--far")
+    for name in FORWARDED:
+        value = getattr(options, name)
+        if value is not None:
+            simulator.append(f"--{name}={value}")
+    for name in REPEATED:
+        simulator += [f"--{name}={value}" for value in getattr(options, name) or ()]
+    return service, simulator
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(shown(text, keep="\n") + "\n")
+    sys.stdout.flush()

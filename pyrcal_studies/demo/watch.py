@@ -1,0 +1,381 @@
+"""Looking at REST and the truth while the demo runs, and knowing when it is over."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+
+from pyrcal_studies.demo.children import Child
+from pyrcal_studies.demo.report import (
+    MODEL,
+    REAL_TIME,
+    TOLERANCE_ACROSS_SUBAP,
+    WORKER_BEHIND,
+    Circumstances,
+    Report,
+    make_report,
+    waits,
+)
+from pyrcal_studies.demo.truth import Line, TruthFile
+from service.model.misregistration import PARAMETERS
+
+POLL_S = 0.5
+LINE_S = 2.0
+HEADING_EVERY = 20
+
+FRESH_S = 1.5
+"""An answer older than this is not shown as if it were one of now."""
+
+ANSWER_WITHIN_S = 1.0
+
+PREPARE_WITHIN_S = 180.0
+"""Until service and simulator are ready; a slow machine without a cache needs a third of it."""
+
+LARGE_WITHIN_S = 1800.0
+"""The same of a telescope of thousands of modes."""
+
+USUAL_RATE_HZ = 1000.0
+"""Of the simulated RTC, where the machine holds it."""
+
+HOLD_S = 5.0
+"""All must have been right for so long before the demo ends by itself."""
+
+SILENCE_S = 5.0
+"""Truth or frames that have not grown for so long have stopped: the clock goes on without them."""
+
+STRETCH = 6.0
+"""A machine that does not keep real time may take so many times longer than asked for."""
+
+SLOW_STRETCH = 2.0
+"""... and so many times the telemetry: where the simulator is slow, the service is."""
+
+_LINE_S = 0.5
+"""Loop time between two lines of the truth: one more than the wall clock allows may be there."""
+
+View = dict[str, Any]
+
+
+class Stopwatch:
+    """Seconds since all was ready: those of the telemetry, where a slow machine makes it late."""
+
+    def __init__(self, now_s: float, telemetry_ns: int) -> None:
+        self._start_s = self._now_s = self._grown_s = now_s
+        self._telemetry_ns = telemetry_ns
+        self._idle_s = 0.0
+        self.telemetry_s = 0.0
+        """Loop time the simulator has gone through."""
+
+    def look(self, now_s: float, telemetry_ns: int) -> None:
+        """Take note of the wall clock and of the simulator's; a step of the latter is left out."""
+        step_s = (telemetry_ns - self._telemetry_ns) / 1e9
+        if step_s != 0.0:
+            self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _LINE_S)
+            self._grown_s = now_s
+        elif now_s - self._grown_s > SILENCE_S:
+            self._idle_s += now_s - self._now_s
+        self._now_s, self._telemetry_ns = now_s, telemetry_ns
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds by the clock on the wall."""
+        return self._now_s - self._start_s
+
+    @property
+    def spent_s(self) -> float:
+        """Seconds that count; a simulator that stands still does not stop the clock."""
+        return min(self.wall_s, self.telemetry_s + self._idle_s)
+
+    @property
+    def silent_s(self) -> float:
+        """How long the simulator has written nothing."""
+        return self._now_s - self._grown_s
+
+    @property
+    def pace(self) -> float | None:
+        """Seconds of telemetry a second; None: too early to say."""
+        return self.telemetry_s / self.wall_s if self.wall_s > SILENCE_S else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Promise:
+    """How long the demo takes, and whether it may end before."""
+
+    seconds: float | None
+    """After all is ready; None: until Ctrl-C."""
+
+    whole: bool
+    """Something is to happen at a time of its own: all the seconds are wanted."""
+
+    real_time: bool
+    """The simulator keeps real time on an ordinary machine."""
+
+    large: bool = False
+    """Thousands of modes: until all is ready takes minutes."""
+
+    asked_rate_hz: float = USUAL_RATE_HZ
+    """Frames a second that the simulator is asked for."""
+
+    wanted_ratio: float = 1.0
+    """Wavefront error before over after."""
+
+    across_subap: float = TOLERANCE_ACROSS_SUBAP
+    """Subapertures across the pupil."""
+
+    held_rate: bool = False
+    """The simulator runs at the highest rate that this machine holds."""
+
+
+class TelemetryObserver:
+    """Looks at REST and the truth file, and prints."""
+
+    def __init__(
+        self,
+        client: httpx.Client,
+        truth: TruthFile,
+        started: Sequence[Child],
+        promise: Promise,
+        say: Callable[[str], None],
+    ) -> None:
+        self._client = client
+        self._truth = truth
+        self._children = started
+        self._promise = promise
+        self._say = say
+        self._state: View | None = None
+        self._reconstructors: list[View] = []
+        self._begun_s = self._answered_s = self._frames_grown_s = time.monotonic()
+        self._frames = 0
+        self._ready_s: float | None = None
+        self._stopwatch: Stopwatch | None = None
+        self._first_applied_s: float | None = None
+        self._right_since_s: float | None = None
+        self._behind = False
+        self._said: set[str] = set()
+
+    def run(self) -> None:
+        """Wait until all is ready, then watch until all has come out right or time is up."""
+        if not self._prepared():
+            return
+        n_lines, next_line_s = 0, 0.0
+        while not self._is_over():
+            self._look()
+            if time.monotonic() >= next_line_s:
+                self._say_lines(n_lines)
+                n_lines, next_line_s = n_lines + 1, time.monotonic() + LINE_S
+            time.sleep(POLL_S)
+
+    def report(self, refusal: str | None = None) -> Report:
+        """Return the figures as they stand now; ``refusal``: of the last window."""
+        clock, now_s = self._stopwatch, time.monotonic()
+        circumstances = Circumstances(
+            seconds_to_ready=self._ready_s,
+            seconds_to_first_applied=self._first_applied_s,
+            pace=None if clock is None else clock.pace,
+            unanswered_s=now_s - self._answered_s,
+            frameless_s=0.0 if clock is None else now_s - self._frames_grown_s,
+            untold_s=0.0 if clock is None else clock.silent_s,
+            endings=self._endings(),
+            wanted_ratio=self._promise.wanted_ratio,
+            across_subap=self._promise.across_subap,
+            refusal=refusal,
+        )
+        return make_report(self._state, self._reconstructors, self._truth, circumstances)
+
+    def closing_report(self) -> Report:
+        """Return the figures at the end, with what only the service's log can say."""
+        self._truth.read()
+        report = self.report()
+        return report if report.good else self.report(self._last_refusal())
+
+    def _last_refusal(self) -> str | None:
+        try:
+            log = self._client.get("/v1/events").raise_for_status().json()["log"]
+        except (httpx.HTTPError, ValueError):
+            return None
+        return next((e["text"] for e in reversed(log) if e["name"] == "window.refused"), None)
+
+    def _prepared(self) -> bool:
+        """Wait for the model and the simulated telescope; return whether both are there."""
+        next_line_s = 0.0
+        within_s = LARGE_WITHIN_S if self._promise.large else PREPARE_WITHIN_S
+        while (waited_s := time.monotonic() - self._begun_s) < within_s:
+            self._look()
+            last = self._truth.last
+            if self._endings():
+                return False
+            if last is not None and self._state is not None and MODEL not in waits(self._state):
+                self._ready_s = waited_s
+                self._frames_grown_s = time.monotonic()
+                self._stopwatch = Stopwatch(self._frames_grown_s, last["t_ns_utc"])
+                self._say(f"{waited_s:7.1f}  ready: the clock starts\n")
+                return True
+            if waited_s >= next_line_s:
+                self._say(f"{waited_s:7.1f}  preparing: {awaited(self._state)}")
+                next_line_s = waited_s + LINE_S
+            time.sleep(POLL_S)
+        return False
+
+    def _is_over(self) -> bool:
+        clock, promise = self._stopwatch, self._promise
+        if clock is None or promise.seconds is None:
+            return any(child.name == "service" for child in self._children if child.ended)
+        right_s = 0.0 if self._right_since_s is None else clock.spent_s - self._right_since_s
+        if self._endings() or (right_s >= HOLD_S and not promise.whole):
+            return True
+        patience = 1.0 if self._right_since_s is not None else self._patience(clock)
+        over = clock.spent_s >= patience * promise.seconds
+        return over or clock.wall_s >= STRETCH * promise.seconds
+
+    def _patience(self, clock: Stopwatch) -> float:
+        """Return how many times the seconds asked for a slow machine is given, of telemetry."""
+        if self._behind:
+            return STRETCH
+        return SLOW_STRETCH if clock.pace is not None and clock.pace < REAL_TIME else 1.0
+
+    def _look(self) -> None:
+        self._truth.read()
+        last = self._truth.last
+        if self._stopwatch is not None and last is not None:
+            self._stopwatch.look(time.monotonic(), last["t_ns_utc"])
+        for ending in self._endings():
+            self._say_once(f"         {ending}")
+        try:
+            state = self._client.get("/v1/state").raise_for_status().json()
+            shelf = self._client.get("/v1/reconstructors").raise_for_status().json()
+        except (httpx.HTTPError, ValueError):
+            self._right_since_s = None
+            return
+        self._state, self._reconstructors = state, shelf["reconstructors"]
+        self._answered_s = time.monotonic()
+        if self._stopwatch is not None:
+            self._take_note(state, self._stopwatch)
+
+    def _take_note(self, state: View, clock: Stopwatch) -> None:
+        """Follow what has become of the frames, of the first matrix and of the promise."""
+        if state["link"]["frames_received"] != self._frames:
+            self._frames = state["link"]["frames_received"]
+            self._frames_grown_s = self._answered_s
+        applied = any(r["applied_frame_seq"] is not None for r in self._reconstructors)
+        if applied and self._first_applied_s is None:
+            self._first_applied_s = clock.wall_s
+        self._behind = any(alarm["name"] == WORKER_BEHIND for alarm in state["alarms"])
+        if not self.report().good:
+            self._right_since_s = None
+        elif self._right_since_s is None:
+            self._right_since_s = clock.spent_s
+
+    def _say_lines(self, n_lines: int) -> None:
+        if n_lines % HEADING_EVERY == 0:
+            self._say(HEADING)
+        clock = self._stopwatch
+        slow = slow_line(
+            None if clock is None else clock.pace,
+            real_time=self._promise.real_time,
+            behind=self._behind,
+        )
+        if slow is not None:
+            self._say_once(slow)
+        slower = (
+            rate_line(self._state, self._promise.asked_rate_hz) if self._promise.held_rate else None
+        )
+        if slower is not None:
+            self._say_once(slower)
+        seconds = 0.0 if clock is None else clock.wall_s
+        silent_s = time.monotonic() - self._answered_s
+        if silent_s > FRESH_S:
+            self._say(f"{seconds:7.1f}  no answer from the service for {silent_s:.0f} s")
+        else:
+            self._say(live_line(seconds, self._state, self._truth.last))
+
+    def _endings(self) -> tuple[str, ...]:
+        return tuple(ending for child in self._children if (ending := child.ended) is not None)
+
+    def _say_once(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._say(line)
+
+
+HEADING = (
+    "   time   frames  lost |  shift x        shift y        rotation         magnification    |"
+    "  age |   WFE  poles | matrix in use\n"
+    "      s                |  subap          subap          deg                               |"
+    "    s |    nm        |"
+)
+
+_FORMATS = {
+    "shift_x_subap": "{:+.4f}±{:.4f}",
+    "shift_y_subap": "{:+.4f}±{:.4f}",
+    "rotation_deg": "{:+.4f}±{:.4f}",
+    "magnification": "{:.5f}±{:.5f}",
+}
+
+
+def live_line(seconds: float, state: dict[str, Any] | None, truth: Line | None) -> str:
+    """Return one line of the running table."""
+    if state is None:
+        return f"{seconds:7.1f}  the service is starting"
+    link, known = state["link"], state["registration"]
+    registration = " not known yet".ljust(66)
+    age = "    -"
+    if known is not None:
+        cells = [
+            _FORMATS[name].format(known["alpha"][name], known["sigma"][name]) for name in PARAMETERS
+        ]
+        registration = " {:14} {:14} {:16} {:18}".format(*cells)
+        age = f"{known['age_s']:5.1f}"
+    error = "    -" if truth is None else f"{truth['wavefront_error_nm']:5.0f}"
+    margin = state["margin"]
+    poles = "    -" if margin is None else f"{margin['worst_pole_radius']:.3f}"
+    lost = link["frames_lost"]
+    return (
+        f"{seconds:7.1f} {link['frames_received']:8d} {lost:5d} |{registration}|{age} |"
+        f" {error}  {poles} | {_matrix(state)}"
+    )
+
+
+def awaited(state: dict[str, Any] | None) -> str:
+    """Return what keeps the clock from starting."""
+    if state is None:
+        return "the service is starting"
+    if MODEL in (waited_for := waits(state)):
+        return waited_for[MODEL]
+    return "the simulated telescope is being prepared"
+
+
+def rate_line(state: dict[str, Any] | None, asked_hz: float = USUAL_RATE_HZ) -> str | None:
+    """Return at which rate the loop runs where this machine holds no more; None: as asked for."""
+    rtc = None if state is None else state["rtc"]
+    if rtc is None or (held_hz := rtc["frame_rate_hz"]) >= asked_hz:
+        return None
+    return f"         simulated at {held_hz:g} Hz of {asked_hz:g}: what this machine holds"
+
+
+def slow_line(pace: float | None, *, real_time: bool, behind: bool) -> str | None:
+    """Return what to say where it takes longer than asked for; None: it does not."""
+    if pace is not None and pace < REAL_TIME:
+        who = "this machine is slow: the simulator" if real_time else "the simulated telescope"
+        return f"         {who} runs at {pace:.1f} of real time; this takes longer"
+    if behind:
+        return "         this machine is slow: the service's worker is behind; this takes longer"
+    return None
+
+
+def _matrix(state: dict[str, Any]) -> str:
+    alarms = " ".join([*(f"[{alarm['name']}]" for alarm in state["alarms"]), *_waits(state)])
+    if not state["ready"]:
+        return f"- {state['ready_reason']} {alarms}"
+    if state["rtc"] is None:
+        return f"- no RTC {alarms}"
+    return f"{state['in_use'] or '-'} ({state['rtc']['n_controlled']} modes) {alarms}"
+
+
+def _waits(state: dict[str, Any]) -> list[str]:
+    """Return what is waited for besides the end of alarms."""
+    known = {alarm["name"] for alarm in state["alarms"]}
+    names = [wait["name"] for wait in state.get("waiting_for", ()) if wait["name"] not in known]
+    return [f"waits for {', '.join(names)}"] if names else []

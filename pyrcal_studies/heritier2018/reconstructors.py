@@ -1,0 +1,171 @@
+"""Reconstructors of the study: from the model, from a measurement, from a fit to one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal_studies.heritier2018 import telescope
+from pyrcal_studies.heritier2018.calibration import Measurement
+from pyrcal_studies.heritier2018.registration import FitRun, Found, fitted_alpha, resolved
+from pyrcal_studies.heritier2018.store import Record, Store, Task
+from pyrcal_studies.heritier2018.telescope import Occasion
+from service.control.gains import CalibrationGains
+from service.control.reconstructor import Inversion, Prior, invert, invert_with_prior
+from service.model.interaction import InteractionModel
+from service.model.misregistration import Misregistration
+
+INVERSION_COST_S = 3.0
+
+
+class Kind(StrEnum):
+    """How a matrix is inverted."""
+
+    TRUNCATED = "truncated SVD"
+    MAP = "MAP"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelReconstructor:
+    """Inverse of the model's matrix at a registration that is taken for granted."""
+
+    occasion: Occasion
+    """Whose noise the prior knows."""
+
+    alpha: Misregistration | Found
+    n_modes: int
+    kind: Kind = Kind.TRUNCATED
+
+    @property
+    def passes(self) -> int:
+        """How often the light meets the mirror whose commands it gives."""
+        return self.occasion.passes
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return f"reconstructor of the model, {self.n_modes} modes, {self.kind}"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return INVERSION_COST_S
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """Nothing but the model, and the fit where that says where it lies."""
+        return (self.alpha.fit,) if isinstance(self.alpha, Found) else ()
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        alpha = resolved(self.alpha, store)
+        matrix = synthetic_matrix(alpha) * self.occasion.passes
+        if self.kind is Kind.TRUNCATED:
+            return _record(invert(matrix, self.n_modes))
+        seen = telescope.optics(self.occasion, alpha)
+        prior = Prior(
+            variance_m2=telescope.basis().variance_m2,
+            slope_noise=telescope.detector(self.occasion, seen).sigma.astype(np.float64),
+        )
+        return _record(invert_with_prior(matrix, self.n_modes, prior))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredReconstructor:
+    """Inverse of the measured matrix itself, its noise included."""
+
+    measurement: Measurement
+
+    @property
+    def passes(self) -> int:
+        """How often the light met the mirror when it was measured."""
+        return self.measurement.occasion.passes
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return "reconstructor of the measured matrix"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return 1.0
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """The measurement."""
+        return self.measurement.parts
+
+    @property
+    def n_modes(self) -> int:
+        """Modes it controls."""
+        return self.measurement.n_modes
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        return _record(invert(self.measurement.matrix(store), self.n_modes))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedReconstructor:
+    """Inverse of the model's matrix at the registration that a fit found."""
+
+    fit: FitRun
+    n_modes: int
+    tuned: bool
+    """Whether the columns have the gains of the measurement."""
+
+    @property
+    def passes(self) -> int:
+        """How often the light met the mirror when the fitted matrix was measured."""
+        return self.fit.measurement.occasion.passes
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        tuned = ", gains tuned" if self.tuned else ""
+        return f"synthetic reconstructor, {self.n_modes} modes{tuned}"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return INVERSION_COST_S
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """The fit."""
+        return (self.fit,)
+
+    def compute(self, store: Store) -> Record:
+        """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
+        fit = store.read(self.fit)
+        matrix = synthetic_matrix(fitted_alpha(fit))
+        if self.tuned:
+            matrix = calibration_gains(fit, matrix.shape[1]).tuned(matrix)
+        return _record(invert(self.passes * matrix, self.n_modes))
+
+
+AnyReconstructor = ModelReconstructor | MeasuredReconstructor | FittedReconstructor
+
+
+def calibration_gains(fit: Record, n_basis: int) -> CalibrationGains:
+    """Return the gains that a fit found, for every mode of the basis."""
+    modes = np.arange(len(fit["gains"]))
+    return CalibrationGains.of_modes(fit["gains"], modes, n_basis)
+
+
+def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:
+    """Return the model's matrix ``(n_slopes, n_modes)`` for light that meets the mirror once."""
+    model = InteractionModel(telescope.instrument(), telescope.basis())
+    return np.asarray(model.interaction_matrix(alpha), dtype=np.float64)
+
+
+def _record(inversion: Inversion) -> Record:
+    return {
+        "matrix": inversion.matrix,
+        "condition_number": np.array(inversion.condition_number),
+        "n_truncated": np.array(inversion.n_truncated),
+    }

@@ -59,7 +59,7 @@ class Circumstances:
     """How long the service has received no frame."""
 
     untold_s: float = 0.0
-    """How long the simulator has written nothing."""
+    """How long the simulator has made nothing."""
 
     endings: tuple[str, ...] = ()
     """Of processes that have ended, and their last words."""

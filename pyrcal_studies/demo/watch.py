@@ -45,10 +45,14 @@ HOLD_S = 5.0
 """All must have been right for so long before the demo ends by itself."""
 
 SILENCE_S = 5.0
-"""Truth or frames that have not grown for so long have stopped: the clock goes on without them."""
+"""If neither truth nor frames have grown for so long, they have stopped: the clock goes on without
+them."""
 
 STRETCH = 6.0
-"""A machine that does not keep real time may take so many times longer than asked for."""
+"""A machine that does not keep real time may take so many times longer than asked for..."""
+
+LARGE_STRETCH = 30.0
+"""... and one on which a telescope of thousands of modes runs in slow motion."""
 
 SLOW_STRETCH = 2.0
 """... and so many times the telemetry: where the simulator is slow, the service is."""
@@ -63,19 +67,24 @@ class Stopwatch:
     """Seconds since all was ready: those of the telemetry, where a slow machine makes it late."""
 
     def __init__(self, now_s: float, telemetry_ns: int) -> None:
-        self._start_s = self._now_s = self._grown_s = now_s
+        self._start_s = self._now_s = self._grown_s = self._alive_s = now_s
         self._telemetry_ns = telemetry_ns
         self._idle_s = 0.0
         self.telemetry_s = 0.0
         """Loop time the simulator has gone through."""
 
-    def look(self, now_s: float, telemetry_ns: int) -> None:
-        """Take note of the wall clock and of the simulator's; a step of the latter is left out."""
+    def look(self, now_s: float, telemetry_ns: int, frames_grown_s: float | None = None) -> None:
+        """Take note of the wall clock and of the simulator's; a step of the latter is left out.
+
+        ``frames_grown_s``: when the service has last received a frame, by the wall clock: in slow
+        motion lines of the truth are far apart.
+        """
         step_s = (telemetry_ns - self._telemetry_ns) / 1e9
         if step_s != 0.0:
             self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _LINE_S)
             self._grown_s = now_s
-        elif now_s - self._grown_s > SILENCE_S:
+        self._alive_s = max(self._grown_s, frames_grown_s or 0.0)
+        if now_s - self._alive_s > SILENCE_S:
             self._idle_s += now_s - self._now_s
         self._now_s, self._telemetry_ns = now_s, telemetry_ns
 
@@ -91,8 +100,8 @@ class Stopwatch:
 
     @property
     def silent_s(self) -> float:
-        """How long the simulator has written nothing."""
-        return self._now_s - self._grown_s
+        """How long the simulator has made nothing."""
+        return self._now_s - self._alive_s
 
     @property
     def pace(self) -> float | None:
@@ -228,7 +237,8 @@ class TelemetryObserver:
             return True
         patience = 1.0 if self._right_since_s is not None else self._patience(clock)
         over = clock.spent_s >= patience * promise.seconds
-        return over or clock.wall_s >= STRETCH * promise.seconds
+        stretch = LARGE_STRETCH if promise.large else STRETCH
+        return over or clock.wall_s >= stretch * promise.seconds
 
     def _patience(self, clock: Stopwatch) -> float:
         """Return how many times the seconds asked for a slow machine is given, of telemetry."""
@@ -240,7 +250,7 @@ class TelemetryObserver:
         self._truth.read()
         last = self._truth.last
         if self._stopwatch is not None and last is not None:
-            self._stopwatch.look(time.monotonic(), last["t_ns_utc"])
+            self._stopwatch.look(time.monotonic(), last["t_ns_utc"], self._frames_grown_s)
         for ending in self._endings():
             self._say_once(f"         {ending}")
         try:

@@ -55,6 +55,15 @@ def test_a_simulator_that_stops_does_not_stop_the_clock():
     assert clock.silent_s == pytest.approx(20.0)
 
 
+def test_in_slow_motion_frames_say_that_the_simulator_goes_on():
+    """Half a second of loop time, a line of the truth, takes twelve seconds here."""
+    clock = Stopwatch(100.0, 0)
+    for n in range(1, 241):
+        clock.look(100.0 + n * 0.5, n // 24 * SECOND_NS // 2, 100.0 + n * 0.5 - 0.3)
+    assert clock.spent_s == pytest.approx(5.0)
+    assert clock.silent_s <= 0.5
+
+
 def test_a_step_of_the_simulators_clock_is_not_time_that_passed():
     clock = stopwatch((0.5, 0.5), (1.0, 3601.0), (1.5, 3601.5), (2.0, 12.0), (2.5, 12.5))
     assert clock.spent_s <= 2.5
@@ -113,8 +122,8 @@ class Scene:
             state["registration"]["age_s"] = 0.5
         return httpx.Response(200, json=state)
 
-    def watch(self, seconds=60.0, *, whole=False, started=()):
-        promise = Promise(seconds=seconds, whole=whole, real_time=True)
+    def watch(self, seconds=60.0, *, whole=False, large=False, started=()):
+        promise = Promise(seconds=seconds, whole=whole, real_time=True, large=large)
         truth = TruthFile(self.path)
         return TelemetryObserver(self.client, truth, list(started), promise, self.lines.append)
 
@@ -166,6 +175,13 @@ def test_a_machine_however_slow_comes_to_an_end(scene):
     scene.pace, scene.right_at_s = 0.01, 1e9
     scene.watch(seconds=20.0).run()
     assert scene.now_s == pytest.approx(6.0 + STRETCH * 20.0, abs=1.1)
+
+
+def test_thousands_of_modes_get_more_of_the_clock(scene):
+    scene.pace, scene.right_at_s = 0.05, 500.0
+    watch = scene.watch(seconds=20.0, large=True)
+    watch.run()
+    assert watch.closing_report().good
 
 
 def test_a_worker_that_is_behind_gets_more_time(scene):

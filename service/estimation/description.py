@@ -14,6 +14,11 @@ LOW_MODES = 30
 """Left out: tip, tilt and their like move the whole mirror by more than any slip."""
 
 
+EDGE_MEMORY_S, EDGE_MEMORY_OF_M = 0.25, 8.22
+"""Turbulence of higher modes has forgotten itself after this on a pupil so wide, a slip has not; on
+a wider one the wind takes as much longer to cross a mode."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Actuators:
     """Where the actuators are, and how far each mode moves them."""
@@ -52,6 +57,9 @@ class Description:
     kind: SignalKind = SignalKind.XY
     """What the signals are."""
 
+    diameter_m: float = EDGE_MEMORY_OF_M
+    """Of the pupil."""
+
     start: Misregistration = field(default_factory=Misregistration)
     """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
 
@@ -70,9 +78,15 @@ class EdgeWatch:
     """``(n_watched, n_watched)`` mean products of all others: a form of the command, their
     mean square, which tells how strong the turbulence is tonight."""
 
+    memory_s: float = EDGE_MEMORY_S
+    """Over which positions are averaged."""
+
 
 def edge_watch(
-    actuators: Actuators, mode_variance_m2: NDArray[np.float64], in_loop: NDArray[np.intp]
+    actuators: Actuators,
+    mode_variance_m2: NDArray[np.float64],
+    in_loop: NDArray[np.intp],
+    diameter_m: float = EDGE_MEMORY_OF_M,
 ) -> EdgeWatch | None:
     """Return what to watch in a loop of these modes; None when they are too few to say.
 
@@ -86,5 +100,8 @@ def edge_watch(
     shapes = strokes / expected[:, None]
     inner = shapes[~outer].T @ shapes[~outer] / np.count_nonzero(~outer)
     return EdgeWatch(
-        modes=high, outer=shapes[outer].astype(np.float32), inner=inner.astype(np.float32)
+        modes=high,
+        outer=shapes[outer].astype(np.float32),
+        inner=inner.astype(np.float32),
+        memory_s=EDGE_MEMORY_S * max(diameter_m / EDGE_MEMORY_OF_M, 1.0),
     )

@@ -145,17 +145,14 @@ SLIPPED_RATIO = 4.5
 """Averaged position of an outer actuator, in σ of turbulence, that no healthy loop shows."""
 
 SUSPECT_RATIO = 2.5
-"""What no healthy loop shows for longer than ``SUSPECT_FOR_S``; below it, a ring that had slipped
+"""What no healthy loop shows for longer than ``SUSPECT_FOR``; below it, a ring that had slipped
 is back."""
 
-SUSPECT_FOR_S = 0.5
+SUSPECT_FOR = 2.0
+"""Times the memory of positions."""
 
 LOOK_FRAMES = 50
 """One of so many frames is looked at, however long a block is."""
-
-_EDGE_MEMORY_S = 0.25
-"""Turbulence of higher modes has forgotten itself after this; a slip has not."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EdgeHealth(Detector):
@@ -209,15 +206,19 @@ def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> Edg
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
     each = zip(moved @ watch.outer.T, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
     for outer, mean_square, lasted_s in each:
-        health = _seen(health, outer, float(mean_square), float(lasted_s))
+        health = _seen(health, outer, float(mean_square), float(lasted_s), watch.memory_s)
     return health
 
 
 def _seen(
-    health: EdgeHealth, outer: NDArray[np.float32], inner: float, lasted_s: float
+    health: EdgeHealth,
+    outer: NDArray[np.float32],
+    inner: float,
+    lasted_s: float,
+    memory_s: float,
 ) -> EdgeHealth:
     """Return the health after positions of the ring that stand for so much time."""
-    fade = float(np.exp(-lasted_s / _EDGE_MEMORY_S))
+    fade = float(np.exp(-lasted_s / memory_s))
     position = (1.0 - fade) * outer
     if health.position is not None:
         position += fade * health.position
@@ -225,7 +226,7 @@ def _seen(
     turbulence = float(np.sqrt(power))
     ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
-    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR_S
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR * memory_s
     return EdgeHealth(
         position=position,
         turbulence=turbulence,

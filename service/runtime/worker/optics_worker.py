@@ -156,6 +156,7 @@ class OpticsWorker:
             mode_information=information(linearisation),
             kind=self._model.instrument.slopes.kind,
             products=linearisation.matrix.T @ linearisation.matrix,
+            diameter_m=self._model.instrument.diameter_m,
             start=self._start,
         )
 

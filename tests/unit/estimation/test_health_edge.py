@@ -30,8 +30,8 @@ def actuators() -> Actuators:
 
 
 @cache
-def watch() -> EdgeWatch:
-    found = edge_watch(actuators(), basis().variance_m2, np.arange(N_MODES))
+def watch(diameter_m: float = 8.22) -> EdgeWatch:
+    found = edge_watch(actuators(), basis().variance_m2, np.arange(N_MODES), diameter_m)
     assert found is not None
     return found
 
@@ -52,11 +52,11 @@ def outer_actuator_by(step_m: float) -> np.ndarray:
     return np.linalg.lstsq(basis().mode_to_actuator, strokes, rcond=None)[0]
 
 
-def seen(commands: np.ndarray) -> list[EdgeHealth]:
+def seen(commands: np.ndarray, diameter_m: float = 8.22) -> list[EdgeHealth]:
     health, found = EdgeHealth(), []
     for k, command in enumerate(commands):
         rows = np.repeat(command[None], 10, axis=0)
-        health = observe_edge(health, block_of(rows[:, :1], rows, None, 10 * k), watch())
+        health = observe_edge(health, block_of(rows[:, :1], rows, None, 10 * k), watch(diameter_m))
         found.append(health)
     return found
 
@@ -67,6 +67,13 @@ def test_turbulence_of_any_strength_is_no_slip(strength):
         found = seen(turbulence(seed, strength=strength))
         assert not any(health.slipped for health in found)
         assert max(health.ratio for health in found[100:]) < 2.5
+
+
+def test_turbulence_that_the_wind_takes_longer_to_carry_across_is_no_slip():
+    """As modes of 39 m see it: with the memory for 8 m its positions stand far out."""
+    commands = np.concatenate([turbulence(seed, memory_s=0.05 * 39.0 / 8.22) for seed in range(8)])
+    assert max(health.ratio for health in seen(commands, 39.0)[400:]) < 1.7
+    assert max(health.ratio for health in seen(commands)[400:]) > SUSPECT_RATIO
 
 
 def test_an_outer_actuator_that_stays_five_wavelengths_away_has_slipped_and_may_come_back():

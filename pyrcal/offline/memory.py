@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pyrcal.offline.models import deciding_sampling
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.memory import GB, PROGRAM_BYTES, work_of
@@ -47,8 +48,8 @@ def check_reconstruction(
 def bytes_of_fit(instrument: Instrument, n_modes: int, *, gain_map: bool = False) -> float:
     """Return what a fit of ``n_modes`` columns takes at its largest, the program included."""
     kind = kind_of(instrument)
-    pupil = instrument_pupil(instrument, kind.fine_sampling * instrument.binning)
-    fineness = Fineness(n_nodes=kind.fine_sampling * instrument.binning)
+    sampling = deciding_sampling(instrument) * instrument.binning
+    pupil, fineness = instrument_pupil(instrument, sampling), Fineness(n_nodes=sampling)
     sensor = kind.sensor(instrument, pupil, fineness)
     made = work_of(instrument, sensor, pupil, n_matrices=1).memory_bytes
     n_unknowns = _USUAL_UNKNOWNS + _OF_GAIN_MAP * gain_map

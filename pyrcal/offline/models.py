@@ -35,7 +35,12 @@ telescope the right stop has left 0.83 to 0.94 of what the wrong one does, noise
 shift of 0.08 subaperture on; at no shift the two differ by less than 0.01."""
 
 FAR_BETTER = 0.7
-"""The same of influence functions, of which none is quite the mirror's."""
+"""The same of influence functions and centroids, of which none is quite the bench's."""
+
+MOST_ACROSS = 160
+"""Points across the pupil of a simulator's black and white map that a fit takes as they are: of 16
+subapertures with six points each, three points left 0.0014 subapertures of error, 3.7 σ, six 0.0001
+(docs/results/peers.md). Beyond, a step is too small a part of the pupil to matter."""
 
 SENSOR_STEP = 0.05
 """Of the difference that stands for a derivative by the sensor's number, its logarithm."""
@@ -67,6 +72,20 @@ class Other:
 
     believed: float
     """Share of χ² below which it is believed rather than the file."""
+
+
+def deciding_sampling(instrument: Instrument) -> int:
+    """Return how many pupil points a subaperture has in the model that decides a fit.
+
+    As many as a map of the pupil that knows no partly lit point, as simulators have it, as long as
+    that is no more than ``MOST_ACROSS`` in all: fewer points make its steps grey.
+    """
+    usual, pupil = kind_of(instrument).fine_sampling, instrument.pupil
+    if pupil is None or np.any((pupil.lit > 0.0) & (pupil.lit < 1.0)):
+        return usual
+    points = round(instrument.subaperture_m / (instrument.binning * pupil.pitch_m))
+    across = instrument.wfs.n_subapertures * instrument.binning * points
+    return max(usual, points) if across <= MOST_ACROSS else usual
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,7 +137,7 @@ class FitModels:
     @cached_property
     def fine(self) -> InteractionModel:
         """Decides."""
-        return self.model(kind_of(self.instrument).fine_sampling)
+        return self.model(deciding_sampling(self.instrument))
 
     def matrix(self, model: InteractionModel, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D of one of the models, ``(n_slopes, n_modes)``, and count it."""

@@ -33,6 +33,7 @@ from service.model.kinds import Stop
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration, rotation
 from service.model.modes import karhunen_loeve_basis
 from service.model.sensors.shack_hartmann.description import ShackHartmann
+from service.model.sensors.shack_hartmann.table import Centroid
 
 Array = NDArray[Any]
 
@@ -110,6 +111,7 @@ def told_instrument(peer: str, measured: Measured, strokes: Array | None) -> Ins
         n_subapertures=about.wfs.n_subapertures,
         wavelength_m=measured.wavelength_m,
         valid_subapertures=measured.valid,
+        centroid=Centroid.GRADIENT,
     )
     return replace(about, name=peer, wfs=lenslets)
 

@@ -223,6 +223,9 @@ class FitModels:
             Other(words=words, believed=BETTER): replace(self, instrument=other)
             for words, other in others.items()
         }
+        for words, sensor in kind_of(about).other_sensors(about.wfs).items():
+            other = Other(words=words, believed=FAR_BETTER)
+            found[other] = replace(self, instrument=replace(about, wfs=sensor))
         if isinstance(self.basis, ModalBasis):
             gaussian = isinstance(self.basis.surface, ThinPlate)
             mirror = about.analytic_mirror

@@ -154,6 +154,7 @@ SUSPECT_FOR = 2.0
 LOOK_FRAMES = 50
 """One of so many frames is looked at, however long a block is."""
 
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EdgeHealth(Detector):
     """Forgetting means of what the two parts of the mirror do."""

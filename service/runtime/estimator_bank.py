@@ -115,9 +115,7 @@ def _of_modes(loop: LoopContext, rtc: Status) -> LoopContext:
     in_loop = in_loop[in_loop < known.n_modes]
     edge = None
     if rtc.in_loop and known.actuators is not None:
-        edge = edge_watch(
-            known.actuators, known.mode_variance_m2, in_loop, known.diameter_m
-        )
+        edge = edge_watch(known.actuators, known.mode_variance_m2, in_loop, known.diameter_m)
     if dither is not None:
         dither = replace(dither, own=tuple(mode not in rtc.in_loop for mode in dither.modes))
     still = np.setdiff1d(np.arange(rtc.n_controlled), in_loop)

@@ -56,7 +56,7 @@ def errors(model, ours, brute, lit):
     return np.linalg.norm((ours - theirs)[rows], axis=0) / np.linalg.norm(theirs[rows], axis=0)
 
 
-@pytest.mark.parametrize("centroid", Centroid)
+@pytest.mark.parametrize("centroid", COUNTED)
 def test_the_matrix_is_that_of_spots_transformed(lenslets, basis, centroid):
     """Full lenslets: 0.5 % are the sums over pixels here, 1 % of mode 60 the model's three points.
 

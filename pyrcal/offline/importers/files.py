@@ -62,6 +62,9 @@ class Reported:
     pupil_diameter_subap: float | None = None
     """Of the pupil's image; None: as wide as the mask."""
 
+    centroid: str | None = None
+    """Of a Shack-Hartmann; None: not told, as the instrument file takes it."""
+
     order: str = "xy"
     """Of the slopes, as its user would list them; the fit finds another."""
 
@@ -145,6 +148,8 @@ def _sensor(
     if reported.sensor == "pyramid":
         modulation = reported.modulation_lambda_over_d
         table["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
+    elif reported.centroid is not None:
+        table["centroid"] = reported.centroid
     if reported.pupil_diameter_subap is not None:
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
     notes += _narrow(matrix, valid)

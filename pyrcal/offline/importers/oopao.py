@@ -41,11 +41,12 @@ SAVED = {
     "wfs": (
         *("tag", "nSubap", "modulation", "n_pix_separation", "binning", "postProcessing"),
         *("validI4Q", "valid_subapertures", "pixel_scale", "n_pix_subap", "threshold_cog"),
+        "is_geometric",
     ),
 }
 """Attributes that are looked at, of each object; what an object lacks does not concern it."""
 
-_OPTIONAL = {"pupilReflectivity", "altitude", "sign", "flip_", "flip_lr"}
+_OPTIONAL = {"pupilReflectivity", "altitude", "sign", "flip_", "flip_lr", "is_geometric"}
 
 _OF_SENSOR = {
     **dict.fromkeys(
@@ -218,11 +219,11 @@ def _lenslets(
     wfs: Any,  # noqa: ANN401
     notes: list[str],
 ) -> tuple[dict[str, Any], NDArray[np.bool_], dict[str, Any]]:
-    if getattr(wfs, "is_geometric", False):
-        notes.append("wfs.is_geometric: mean gradients are fitted with a model of spots")
     threshold = float(wfs.threshold_cog)
     centroid: dict[str, Any] = {"centroid": "cog"}
-    if threshold > 0.0:
+    if getattr(wfs, "is_geometric", False):
+        centroid = {"centroid": "gradient"}
+    elif threshold > 0.0:
         centroid = {"centroid": "threshold", "threshold": threshold, "partly_lit": "leave out"}
     notes.append("slopes of OOPAO's lenslets are in a unit of their own: one gain of all modes")
     sensor = {

@@ -79,6 +79,7 @@ def _reported(options: argparse.Namespace) -> Reported:
         wavelength_m=options.wavelength_m,
         modulation_lambda_over_d=options.modulation,
         pupil_diameter_subap=options.pupil_subap,
+        centroid="gradient" if options.source == "synim" else None,
         unit=getattr(options, "unit", UNIT if options.source in {"specula", "synim"} else None),
     )
 

@@ -265,6 +265,10 @@ class SensorKind(ABC):
         """Return recipes that this one may be taken for, by what a file would say of them."""
         return {}
 
+    def other_sensors(self, sensor: Any) -> dict[str, SensorDescription]:  # noqa: ANN401 - its own
+        """Return sensors that this one may be taken for, by what a file would say of them."""
+        return {}
+
     @abstractmethod
     def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
         """Return its class in AOT files, and the fields that only this class is given."""

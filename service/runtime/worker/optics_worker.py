@@ -146,30 +146,30 @@ class OpticsWorker:
 
     def describe(self) -> Description:
         """Return the expected telemetry, and prepare for the first fit."""
-        linearisation = self._first()
+        linearisation, model = self._first(), self._model
         self._sensor.keep(linearisation)
         return Description(
-            n_slopes=self._model.n_slopes,
-            n_modes=self._model.basis.n_modes,
-            mode_variance_m2=self._model.basis.variance_m2,
-            actuators=actuators_of(self._model),
+            n_slopes=model.n_slopes,
+            n_modes=model.basis.n_modes,
+            mode_variance_m2=model.basis.variance_m2,
+            actuators=actuators_of(model),
             mode_information=information(linearisation),
-            kind=self._model.instrument.slopes.kind,
+            kind=model.instrument.slopes.kind,
             products=linearisation.matrix.T @ linearisation.matrix,
-            diameter_m=self._model.instrument.diameter_m,
+            diameter_m=model.instrument.diameter_m,
             start=self._start,
         )
 
     def _first(self) -> Linearisation:
         """Return the linearisation about the nominal registration, prepared once for all."""
-        sampling, start = self._compute.sampling, self._start
+        start = self._start
 
         def computed() -> dict[str, NDArray[np.float32]]:
             found = self._sensor.linearise(start)
             return {name: getattr(found, name) for name in names}
 
         names = ("matrix", "derivatives", "stretches")[: 3 if self._compute.anamorphosis else 2]
-        what = ("linearisation", *sampling, start.vector.tolist(), *names[2:])
+        what = ("linearisation", *self._compute.sampling, start.vector.tolist(), *names[2:])
         kept = self._disk_cache.arrays(self._model.instrument, what, computed)
         return Linearisation(alpha=start, **kept, noise_shape=self._model.noise_shape)
 
@@ -180,8 +180,7 @@ class OpticsWorker:
 
         Where the linearisation at hand is too far away, the coarse model leads to within reach of
         one new, fine linearisation. A working point that does not give the optical gains that were
-        measured is followed first. Slopes that cannot be those of the instrument file are refused
-        with what they look like.
+        measured is followed first. Slopes of another instrument are refused: what they look like.
         """
         begun = start or self._start
         outcome = self._fitted(spectra, loop, begun)

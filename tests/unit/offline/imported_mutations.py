@@ -121,6 +121,7 @@ PEERS = {
                 stop="telescope",
                 obscuration_ratio=0.2,
                 wavelength_m=600e-9,
+                centroid="gradient",
                 unit="nm",
             ),
         ),

@@ -5,6 +5,7 @@ has moved by 0.2 of its subapertures and turned by 2 degrees: saved as docs/inte
 """
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,9 @@ from pyrcal.__main__ import main
 from pyrcal.offline.importers.imported import Imported, oriented
 from pyrcal.offline.importers.oopao import SAVED, from_saved, registration_of, to_oopao
 from pyrcal.offline.importers.saved import read_npz
+from pyrcal.offline.models import deciding_sampling
 from service.errors import ConfigurationError, MatrixError
+from service.model.instrument import PupilMap
 from service.model.misregistration import Misregistration
 from tests.unit.test_house import ROOT
 
@@ -33,7 +36,7 @@ def imported_of(saved, **other):
     return from_saved({**saved, **{name.replace("__", "."): v for name, v in other.items()}}, "it")
 
 
-@pytest.mark.parametrize(("kind", "gain"), [("pyramid", 1.0), ("lenslets", 1.24)])
+@pytest.mark.parametrize(("kind", "gain"), [("pyramid", 1.02), ("lenslets", 1.24)])
 def test_what_oopao_saved_is_imported_and_fitted(kind, gain, tmp_path, capsys):
     folder = tmp_path / "bench"
     assert main(["import", "oopao", str(DATA / f"oopao-{kind}.npz"), "--output", str(folder)]) == 0
@@ -46,6 +49,27 @@ def test_what_oopao_saved_is_imported_and_fitted(kind, gain, tmp_path, capsys):
     assert np.median(fit.gains) == pytest.approx(gain, abs=0.01)
     assert np.all(np.abs(fit.alpha.vector - TRUE) < 3 * fit.sigma)
     assert np.all(fit.sigma < [0.002, 0.002, np.deg2rad(0.02), 0.001])
+
+
+def test_geometric_lenslets_are_mean_gradients(tmp_path):
+    saved = read_npz(DATA / "oopao-lenslets.npz")
+    found = imported_of(saved, wfs__is_geometric=np.array(True))
+    assert found.tables["wfs"]["centroid"] == "gradient"
+    pyrcal.load_instrument(found.save(tmp_path / "geometric").instrument)
+
+
+def test_a_black_and_white_pupil_decides_on_its_own_points(saved, tmp_path):
+    """Four for each of 8 subapertures; a grey one, or one of very many, is as fine as usual."""
+    instrument = pyrcal.load_instrument(imported_of(saved).save(tmp_path / "bench").instrument)
+    assert deciding_sampling(instrument) == 4
+    lit = instrument.pupil.lit.copy()
+    lit[lit.shape[0] // 2, 0] = 0.5
+    grey = replace(instrument, pupil=replace(instrument.pupil, lit=lit))
+    assert deciding_sampling(grey) == 3
+    finer = PupilMap(
+        lit=np.kron(instrument.pupil.lit, np.ones((6, 6))), pitch_m=instrument.pupil.pitch_m / 6
+    )
+    assert deciding_sampling(replace(instrument, pupil=finer)) == 3
 
 
 def test_the_notes_stand_in_the_instrument_file(saved):

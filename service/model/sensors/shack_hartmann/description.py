@@ -52,7 +52,7 @@ def shack_hartmann_of(table: ShackHartmannTable) -> ShackHartmann:
     ------
     ModelError
         One line that begins with the key: a threshold that is missing, has no meaning, or meets
-        partly lit subapertures.
+        partly lit subapertures; mean gradients of a laser's spots.
     """
     thresholded = table.centroid is Centroid.THRESHOLD
     if thresholded and table.threshold is None:
@@ -64,6 +64,11 @@ def shack_hartmann_of(table: ShackHartmannTable) -> ShackHartmann:
         raise ModelError(
             f'threshold: found {table.threshold:g} beside centroid = "{table.centroid}", expected '
             'centroid = "threshold" or no threshold'
+        )
+    if table.centroid is Centroid.GRADIENT and table.laser is not None:
+        raise ModelError(
+            'centroid: found "gradient" beside a laser star, expected "cog", "weighted" or '
+            '"threshold": a mean gradient knows no elongated spots'
         )
     if thresholded and table.partly_lit is PartlyLit.USE:
         raise ModelError(
@@ -129,4 +134,5 @@ def point_variances(sensor: ShackHartmann, subaperture_m: float) -> tuple[float,
 
 
 def _usual(centroid: Centroid) -> PartlyLit:
-    return PartlyLit.LEAVE_OUT if centroid is Centroid.THRESHOLD else PartlyLit.USE
+    cut_widely = centroid in (Centroid.THRESHOLD, Centroid.GRADIENT)
+    return PartlyLit.LEAVE_OUT if cut_widely else PartlyLit.USE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import override
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from service.model.instrument import Instrument
+    from service.model.instrument import Instrument, SensorDescription
     from service.model.pupil import PupilGrid
     from service.model.sensors.kind import Term
     from service.model.sensors.sensor import Fineness
@@ -114,6 +115,12 @@ class ShackHartmannKind(SensorKind):
     def coarsest_sampling(self, sensor: ShackHartmann) -> int:
         # from one point to the next a mode of a few subapertures is no cubic any more
         return 2
+
+    @override
+    def other_sensors(self, sensor: ShackHartmann) -> dict[str, SensorDescription]:
+        if sensor.centroid is not Centroid.CENTRE_OF_GRAVITY or sensor.laser is not None:
+            return {}
+        return {'centroid = "gradient"': replace(sensor, centroid=Centroid.GRADIENT)}
 
     @override
     def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:

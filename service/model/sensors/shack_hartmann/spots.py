@@ -92,7 +92,7 @@ class Spots:
         """Return how much each pixel counts, of spots ``(n, n_pixels, n_pixels)`` in full light."""
         light = full / full.max(axis=(1, 2), keepdims=True)
         match self.centroid:
-            case Centroid.CENTRE_OF_GRAVITY:
+            case Centroid.CENTRE_OF_GRAVITY | Centroid.GRADIENT:
                 return np.ones_like(light)
             case Centroid.THRESHOLD:
                 return np.asarray(light >= self.threshold, np.float64)

@@ -17,8 +17,9 @@ from service.model.sensors.shack_hartmann.description import (
     shack_hartmann_in,
 )
 from service.model.sensors.shack_hartmann.elongated import ElongatedSpots, blur_of, elongation_rad
+from service.model.sensors.shack_hartmann.gradients import MeanGradients
 from service.model.sensors.shack_hartmann.spots import Spots
-from service.model.sensors.shack_hartmann.table import LaserStar
+from service.model.sensors.shack_hartmann.table import Centroid, LaserStar
 
 if TYPE_CHECKING:
     from service.model.sensors.kind import Term
@@ -50,7 +51,8 @@ def spots_of(wfs: ShackHartmann, width_m: float, lenslets: NDArray[np.bool_]) ->
         "threshold": wfs.threshold,
     }
     if wfs.laser is None:
-        return Spots(**pixels)
+        made = MeanGradients if wfs.centroid is Centroid.GRADIENT else Spots
+        return made(**pixels)
     line_m = width_m * (np.arange(len(lenslets)) - (len(lenslets) - 1) / 2)
     places_m = np.stack(np.meshgrid(line_m, line_m), axis=-1)
     blur = blur_of(wfs.laser, places_m, wfs.wavelength_m / width_m)

@@ -23,6 +23,9 @@ class Centroid(StrEnum):
     THRESHOLD = "threshold"
     """Pixels below ``threshold`` do not count."""
 
+    GRADIENT = "gradient"
+    """None: the mean gradient over the lenslet's light, which no pixels cut."""
+
 
 class PartlyLit(StrEnum):
     """What becomes of subapertures that the edge of the pupil cuts."""
@@ -73,7 +76,8 @@ class ShackHartmannNumbers(Read):
 
     centroid: Centroid = Centroid.CENTRE_OF_GRAVITY
     """How a spot's place is made of its pixels: `cog`, all of them with their light; `weighted`,
-    times the spot of a flat wavefront; `threshold`, without the faint ones."""
+    times the spot of a flat wavefront; `threshold`, without the faint ones; `gradient`, of a
+    geometric simulator: no pixels, the mean gradient of the wavefront over the lenslet's light."""
 
     threshold: Annotated[float, Gt(0.0), Lt(1.0)] | None = None
     """With `threshold` only: pixels fainter than this share of the spot's brightest do not

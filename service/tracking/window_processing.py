@@ -280,12 +280,16 @@ def refused_text(context: StepContext) -> str | None:
 
 
 def _missing_text(context: StepContext) -> str:
-    registration, dither = context.registration, context.dither
-    if dither is None or dither.start_seq is None:
+    registration, dither, rtc = context.registration, context.dither, context.rtc
+    if dither is None or dither.start_seq is None or rtc is None:
         return ""
     since_ns = max(registration.window_ns_utc if registration else 0, dither.asked_ns_utc)
     patience_s = max(NONE_FOR_S, 3.0 * (dither.window_s or 0.0))
     if context.now_ns - since_ns < patience_s * SECOND_NS:
+        return ""
+    # an RTC in slow motion has not played a window yet
+    played_s = None if rtc.seq is None else (rtc.seq - dither.start_seq) / rtc.frame_rate_hz
+    if played_s is not None and played_s < 3.0 * (dither.window_s or 0.0):
         return ""
     return f"no window was accepted for {patience_s:.0f} s although a dither runs"
 

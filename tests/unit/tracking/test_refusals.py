@@ -11,6 +11,7 @@ from service.tracking.alarms import WINDOWS_REFUSED
 from service.tracking.operations.running import ServiceState, operating
 from service.tracking.state import Mode
 from service.tracking.window_processing import IN_A_ROW
+from service.wire import DitherStatus
 from tests.unit.tracking.situations import ALPHA, Story, dither_answered, moved, rtc
 
 MISSING = "150 of 2000 frames missing, more than 5%: check the link to the RTC"
@@ -140,3 +141,15 @@ def test_a_dither_of_a_minute_without_any_window_is_one_as_well(story):
         assert "no window was accepted for 60 s although a dither runs" in text_of(story)
     story.see(n_windows=IN_A_ROW)
     assert WINDOWS_REFUSED not in story.alarms
+
+
+def test_in_slow_motion_a_dither_has_a_minute_of_its_own(story):
+    """After 70 s by the clock the RTC has played half a second of it."""
+    plays = story.state.dithers.dither
+    story.tell(dither_answered(plays.id, accepted=True, reason="", start_seq=1))
+    shown = DitherStatus(request=plays.request, start_seq=1)
+    for k in range(70):
+        story.tell(rtc(seq=1 + 7 * k, dither=shown), after_s=1.0)
+    assert WINDOWS_REFUSED not in story.alarms
+    story.tell(rtc(seq=60_000, dither=shown), after_s=1.0)
+    assert "no window was accepted for 60 s" in text_of(story)

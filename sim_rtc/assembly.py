@@ -26,7 +26,7 @@ from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
-from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz
+from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_motion
 from sim_rtc.options import Options
 from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.telescope.detector import Detector, PixelDetector, binned
@@ -147,10 +147,11 @@ def at_held_rate(options: Options, instrument: Instrument) -> Options:
         instrument.slopes.kind.n_planes * n_valid,
         n_modes,
         options.n_controlled(n_modes, most_of(instrument)),
+        options.frame_rate_hz,
     )
     held_hz = held_rate_hz(options.frame_rate_hz, one_frame_s)
     if held_hz < min(DITHERED_FROM_HZ, options.frame_rate_hz):
-        return replace(options, given_speed=held_hz / options.frame_rate_hz)
+        return replace(options, given_speed=slow_motion(options.frame_rate_hz, one_frame_s))
     return replace(options, frame_rate_hz=held_hz)
 
 

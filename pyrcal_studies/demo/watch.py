@@ -51,7 +51,7 @@ them."""
 STRETCH = 6.0
 """A machine that does not keep real time may take so many times longer than asked for..."""
 
-LARGE_STRETCH = 30.0
+LARGE_STRETCH = 60.0
 """... and one on which a telescope of thousands of modes runs in slow motion."""
 
 SLOW_STRETCH = 2.0

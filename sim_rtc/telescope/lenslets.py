@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from service.errors import ConfigurationError
 from service.model.pupil import PupilGrid
 from service.model.sensors.shack_hartmann.description import ShackHartmann
 from service.model.sensors.shack_hartmann.table import Centroid
@@ -33,7 +34,13 @@ noise of its pixels would be divided by nothing."""
 
 
 class DiffractiveLenslets:
-    """The light on the pixels behind the lenslets, at one shift of the pupil's image."""
+    """The light on the pixels behind the lenslets, at one shift of the pupil's image.
+
+    Raises
+    ------
+    ConfigurationError
+        If the sensor has mean gradients, and so no spots.
+    """
 
     def __init__(
         self,
@@ -42,6 +49,11 @@ class DiffractiveLenslets:
         subaperture_m: float,
         shift_subap: tuple[float, float] = (0.0, 0.0),
     ) -> None:
+        if wfs.centroid is Centroid.GRADIENT:
+            raise ConfigurationError(
+                'wfs.centroid: found "gradient" with --plant diffractive, expected spots, "cog" or '
+                "another centroid, or --plant linear: a mean gradient has no light"
+            )
         self._wfs, self._pupil, self._subaperture_m = wfs, pupil, subaperture_m
         self.shift_subap = shift_subap
         """(x, y) by which the pupil's image is moved."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
+from service.errors import ConfigurationError
 from service.model.modes import modal_basis
 from service.model.pupil import fully_lit_subapertures, instrument_pupil, valid_subapertures
 from service.model.sensors.registry import kind_of
@@ -50,7 +51,13 @@ def test_light_of_a_full_lenslet_is_what_its_field_holds(lenslets):
     np.testing.assert_allclose(np.median(light[full]), 0.966**2, rtol=0.03)
 
 
-@pytest.mark.parametrize("centroid", Centroid)
+def test_mean_gradients_have_no_spots(lenslets):
+    about = replace(lenslets, wfs=replace(lenslets.wfs, centroid=Centroid.GRADIENT))
+    with pytest.raises(ConfigurationError, match='found "gradient" with --plant diffractive'):
+        sensor_of(about)
+
+
+@pytest.mark.parametrize("centroid", sorted(set(Centroid) - {Centroid.GRADIENT}))
 def test_small_wavefronts_move_spots_as_those_by_brute_force(lenslets, centroid):
     """3 %: four points for a lenslet, and two samples of the light for a pixel."""
     about = replace(lenslets, wfs=replace(lenslets.wfs, centroid=centroid, threshold=0.02))

@@ -249,6 +249,8 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
     ``r = S - γ D(α) C``. Where slopes are not equally noisy, Z is weighted by their variance. When
     ``step`` is not small the caller linearises anew at the estimate.
     """
+    window, every_mode = spectra, linearisation.matrix
+    spectra, linearisation = _of_moved_modes(spectra, linearisation, loop)
     matrix = linearisation.matrix
     coupling = loop.reconstructor @ matrix
     slopes = spectra.slopes[:, 0]
@@ -286,11 +288,28 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         session=spectra.session,
         modes=spectra.plan.modes,
         gain_sigma=_modulus_sigma(gains, every[n:, n:]),
-        weak=_weak(spectra),
-        answers_as=_answers_as(spectra, matrix),
-        dither_m=_total_dither_m(spectra),
+        weak=_weak(window),
+        answers_as=_answers_as(window, every_mode),
+        dither_m=_total_dither_m(window),
         window_s=spectra.window_s,
     )
+
+
+_FEW_MOVED = 6
+"""Fewer than one mode in so many: then it pays to leave out those that stand still."""
+
+
+def _of_moved_modes(
+    spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop
+) -> tuple[Spectra, Linearisation]:
+    """Return both without modes that nothing moves, where that is most of a large telescope."""
+    moves = np.any(spectra.commands, axis=(0, 1)) | np.any(spectra.dither, axis=0)
+    moves[: len(loop.reconstructor)] = True
+    if _FEW_MOVED * np.count_nonzero(moves) > len(moves):
+        return spectra, linearisation
+    moved = np.flatnonzero(moves)
+    few = replace(spectra, commands=spectra.commands[:, :, moved], dither=spectra.dither[:, moved])
+    return few, linearisation.of_modes(moved)
 
 
 def _instrument(spectra: Spectra, coupling: Array, loop: ClosedLoop, gains: Array) -> Array:

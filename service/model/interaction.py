@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Generic, Self, TypeVar
 
@@ -71,6 +71,16 @@ class Linearisation:
         if self.stretches is None:
             return self.derivatives
         return np.concatenate([self.derivatives, self.stretches])
+
+    def of_modes(self, modes: NDArray[np.intp]) -> Linearisation:
+        """Return the same of some modes ``(n,)`` alone."""
+        stretches = None if self.stretches is None else self.stretches[:, :, modes]
+        return replace(
+            self,
+            matrix=self.matrix[:, modes],
+            derivatives=self.derivatives[:, :, modes],
+            stretches=stretches,
+        )
 
     def matrix_at(self, alpha: Misregistration) -> NDArray[np.float32]:
         """Return D at a registration close by, to first order, ``(n_slopes, n_modes)``."""

@@ -205,6 +205,31 @@ def test_a_wrong_model_shows_in_the_misfit():
     assert min(e.misfit for e in settled(BRIGHT, other)) > 5.0
 
 
+def test_modes_that_stand_still_change_nothing():
+    """Of an ELT most do; they are left out of the sums."""
+    spectra, about = bright_windows()[0], small_linearisation()
+    n_slopes, n_modes = about.matrix.shape
+    wide = [(0, 0), (0, 9 * n_modes)]
+    other = np.random.default_rng(1).normal(size=(5, n_slopes, 9 * n_modes)).astype(np.float32)
+    other *= np.abs(about.matrix).max()
+    many = replace(
+        about,
+        matrix=np.hstack([about.matrix, other[0]]),
+        derivatives=np.concatenate([about.derivatives, other[1:]], axis=2),
+    )
+    still = replace(
+        spectra,
+        commands=np.pad(spectra.commands, [(0, 0), *wide]),
+        dither=np.pad(spectra.dither, wide),
+    )
+    few, found = (
+        fit_window(window, lin, BRIGHT.loop) for window, lin in ((spectra, about), (still, many))
+    )
+    np.testing.assert_allclose(found.alpha.vector, few.alpha.vector, atol=1e-6)
+    np.testing.assert_allclose(found.covariance, few.covariance, rtol=1e-3)
+    assert (found.weak, found.dither_m) == (few.weak, pytest.approx(few.dither_m))
+
+
 def test_an_estimate_says_which_window_it_is_of():
     spectra = bright_windows()[0]
     estimate = fit_window(spectra, small_linearisation(), BRIGHT.loop)

@@ -242,7 +242,7 @@ class TelemetryObserver:
 
     def _patience(self, clock: Stopwatch) -> float:
         """Return how many times the seconds asked for a slow machine is given, of telemetry."""
-        if self._behind:
+        if self._behind or self._promise.large:
             return STRETCH
         return SLOW_STRETCH if clock.pace is not None and clock.pace < REAL_TIME else 1.0
 

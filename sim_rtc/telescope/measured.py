@@ -39,7 +39,7 @@ from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
 from service.model.slopes import rtc_mask, to_conventions, to_rtc
 from sim_rtc.telescope.atmosphere import PhaseResponse
-from sim_rtc.telescope.imperfections import Imperfections, SlopeErrors
+from sim_rtc.telescope.imperfections import SETS, Imperfections, SlopeErrors
 from sim_rtc.telescope.linear import LinearOptics, optical_gain, sampling_of
 from sim_rtc.telescope.plant import Plant
 
@@ -186,7 +186,7 @@ class MeasuredPlant(Plant):
         ``passes`` says how often the light meets the mirror in the scene. ``sky_diameter_m`` is the
         diameter of the telescope whose turbulence the pupil sees; None: see ``sky_diameter``.
         """
-        imperfections = imperfections or Imperfections()
+        imperfections = imperfections or SETS["ideal"]
         self._instrument = instrument = replace(instrument, frames=None)
         self._basis, self._passes = basis, np.float32(passes)
         self.measured = measured
@@ -205,7 +205,7 @@ class MeasuredPlant(Plant):
         self.valid = valid_subapertures(instrument)
         self.pixels = kind_of(instrument).pixels(instrument, self.valid)
         self.slope_errors = SlopeErrors(
-            self.pixels, Imperfections(), np.random.default_rng(0), instrument.slopes
+            self.pixels, SETS["ideal"], np.random.default_rng(0), instrument.slopes
         )
         self.sensor_opd_m = np.zeros(len(self._points), dtype=np.float32)
         self._sensor = kind_of(instrument).sensor(instrument, self._pupil, Fineness())

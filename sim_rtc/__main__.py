@@ -23,6 +23,7 @@ from sim_rtc.faults import ComputerFaults, FaultPlan
 from sim_rtc.link.link import Link
 from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
+from sim_rtc.telescope.measured import MeasuredPlant
 from sim_rtc.truth import TruthRecorder, write_snapshot
 
 _REPORT_PERIOD_S = 10.0
@@ -43,13 +44,15 @@ def _build_and_run(options: Options, stopped: threading.Event) -> int:
         return _replay(options.replay, options, stopped)
     instrument = load_instrument(options.instrument)
     _check_writable(options.truth)
-    if options.held_rate and options.plant == "linear":
+    if options.held_rate and options.plant != "diffractive":
         options = at_held_rate(options, instrument)
     # Nested threading makes small products slower, and the service needs the other core.
     with threadpool_limits(1):
         telescope = build_telescope(
             options, instrument, batch_frames=message_frames(options.frame_rate_hz)
         )
+        if isinstance(telescope.plant, MeasuredPlant):
+            _report_matrix(telescope.plant, options)
         if options.snapshot is not None:
             write_snapshot(telescope, options.snapshot)
             return 0
@@ -100,6 +103,24 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
             watch.look(batch)
             n_batches += 1
         watch.report()
+
+
+def _report_matrix(plant: MeasuredPlant, options: Options) -> None:
+    """Log what was decided about a measured matrix, and what is not known of it."""
+    for note in plant.measured.notes:
+        _log.info("matrix.note", text=note)
+    if not plant.knows_orientation:
+        text = (
+            'slopes.orientation is "auto": the sensor sees only what the measured modes can make '
+            "of the turbulence; state the orientation that pyrcal fit finds to add the rest"
+        )
+        _log.info("matrix.note", text=text)
+    if options.alpha is None:
+        text = (
+            "the true registration is not known: compare the service's with that of pyrcal fit "
+            f"{options.instrument} {options.matrix}"
+        )
+        _log.info("matrix.truth-unknown", text=text)
 
 
 def _replay(path: Path, options: Options, stopped: threading.Event) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 from service.errors import ConfigurationError, ModelError
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.instrument import Instrument, TabulatedModes
+from service.model.interaction import RtcInteractionModel
 from service.model.kinds import KarhunenLoeve, Normalisation
 from service.model.misregistration import Misregistration
-from service.model.modes import ModalBasis, analytic_basis
+from service.model.modes import Basis, ModalBasis, analytic_basis
 from service.model.pointing_law import ANGLES
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
@@ -24,7 +26,11 @@ from service.model.surface import mirror_surface
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor
+from sim_rtc.computer.reconstructors import (
+    identity_of,
+    initial_reconstructor,
+    own_reconstructor,
+)
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_motion
 from sim_rtc.options import Options
@@ -34,6 +40,7 @@ from sim_rtc.telescope.diffractive import DiffractivePlant
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.influence import read_influence
 from sim_rtc.telescope.linear import LinearPlant
+from sim_rtc.telescope.measured import MeasuredPlant, read_measured_matrix, sky_diameter
 from sim_rtc.telescope.mirror import MirrorDrive
 from sim_rtc.telescope.plant import Departures, Optics, Plant
 from sim_rtc.telescope.registration import (
@@ -66,8 +73,8 @@ class Telescope:
     weights: NDArray[np.float64]
     """``(n_points,)`` share of the pupil's area at each point of the plant."""
 
-    mode_to_actuator: NDArray[np.float64]
-    """``(n_actuators, n_modes)`` of the basis."""
+    mode_to_actuator: NDArray[np.float64] | None
+    """``(n_actuators, n_modes)`` of the basis; None if the modes are tables of shapes."""
 
     drive: MirrorDrive | None
     """Limits and lag of the mirror; None: it obeys at once."""
@@ -90,13 +97,15 @@ class Telescope:
         )
 
 
-def _modes(instrument: Instrument) -> ModalBasis:
-    """Return the modes of an analytic mirror, from the folder that the service keeps its own in.
+def _modes(options: Options, instrument: Instrument) -> Basis:
+    """Return the modes of the mirror, from the folder that the service keeps its own in.
 
     They are found on the finest subapertures: coarser ones could not tell them from one another.
     """
     kept = DiskCache(usual_folder(os.environ)).basis(instrument)
-    return kept if isinstance(kept, ModalBasis) else analytic_basis(instrument)
+    if isinstance(kept, ModalBasis) or options.plant == "measured":
+        return kept
+    return analytic_basis(instrument)
 
 
 def _law_of(options: Options, instrument: Instrument) -> Callable[[float], Misregistration] | None:
@@ -124,11 +133,9 @@ def _law_of(options: Options, instrument: Instrument) -> Callable[[float], Misre
     return nominal
 
 
-def _binned(
-    options: Options, basis: ModalBasis, instrument: Instrument
-) -> tuple[ModalBasis, Instrument]:
+def _binned(options: Options, basis: Basis, instrument: Instrument) -> tuple[Basis, Instrument]:
     """Return modes and instrument in the subapertures that a preset bins."""
-    if options.binning == 1:
+    if options.binning == 1 or not isinstance(basis, ModalBasis):
         return basis, instrument
     coarse = binned(instrument, options.binning)
     surface = mirror_surface(coarse.analytic_mirror, coarse.subaperture_m)
@@ -195,23 +202,25 @@ def build_telescope(
     ConfigurationError
         If the instrument is not simulated, or more modes are to be controlled than it has.
     """
-    check_supported(instrument)
-    instrument = in_sensor_mode(options, instrument)
-    n_modes = instrument.modes.n_modes
-    n_controlled = options.n_controlled(n_modes, most_of(instrument))
+    instrument = _supported(options, instrument)
     plant_rng, sky_rng, noise_rng, alpha_rng = np.random.default_rng(options.seed).spawn(4)
-    basis, instrument = _binned(options, _modes(instrument), instrument)
-    plant = build_plant(options, instrument, basis, plant_rng)
+    basis, instrument = _binned(options, _modes(options, instrument), instrument)
+    n_modes = basis.n_modes
+    n_controlled = options.n_controlled(n_modes, most_of(instrument))
+    law = _law_of(options, instrument)
+    nominal = instrument.start if law is None else law(0.0)
+    draw = far_registration if options.far else random_registration
+    if options.plant == "measured":  # what is not given is not known: no true one is invented
+        start = options.alpha or nominal
+    else:
+        start = options.alpha or draw(alpha_rng, nominal.rotation_rad)
+    plant = build_plant(options, instrument, basis, plant_rng, start)
     sky = build_sky(options, instrument, basis, plant, sky_rng)
 
     def prepare(optics: Optics) -> None:
         for _, response in optics.responses if sky.played is None else ():
             sky.turbulence.prepare(response)
 
-    draw = far_registration if options.far else random_registration
-    law = _law_of(options, instrument)
-    nominal = instrument.start if law is None else law(0.0)
-    start = options.alpha or draw(alpha_rng, nominal.rotation_rad)
     schedule = Schedule(
         start=start,
         corners_s=() if law is None else options.elevation.corners_s,
@@ -222,24 +231,18 @@ def build_telescope(
         jumps=options.jumps,
     )
     optics = MovingOptics(plant, schedule, executor or background_executor(), prepare=prepare)
-    detector = Detector(
-        instrument,
-        images=optics.start().images,
-        valid=plant.valid,
-        magnitude=options.magnitude,
-        frame_rate_hz=options.frame_rate_hz,
-        camera=options.camera,
-        silent=plant.slope_errors.silent,
+    detector = build_detector(options, instrument, plant, optics.start())
+    identity = build_identity(options, instrument, plant)
+    reconstructor = build_reconstructor(
+        options, instrument, basis, plant, identity, n_controlled, nominal
     )
-    double_pass = options.scene.passes == 2
-    identity = replace(identity_of(instrument, plant.valid), double_pass=double_pass)
     return Telescope(
         feed=build_feed(options, plant, sky, optics, detector, noise_rng, batch_frames),
         plant=plant,
         optics=optics,
         detector=detector,
         identity=identity,
-        reconstructor=initial_reconstructor(instrument, basis, identity, n_controlled, nominal),
+        reconstructor=reconstructor,
         settings=LoopSettings(
             frame_rate_hz=options.frame_rate_hz,
             delay_frames=options.delay_frames,
@@ -248,10 +251,80 @@ def build_telescope(
             n_controlled_next=n_controlled,
         ),
         weights=plant.weights,
-        mode_to_actuator=basis.mode_to_actuator,
+        mode_to_actuator=basis.mode_to_actuator if isinstance(basis, ModalBasis) else None,
         drive=build_drive(options, instrument, basis),
         move=build_stage(options, optics),
     )
+
+
+def _supported(options: Options, instrument: Instrument) -> Instrument:
+    """Return the instrument in the mode of its sensor that is simulated.
+
+    A measured plant sends what was measured, whatever its order, axes and modes.
+    """
+    if options.plant != "measured":
+        check_supported(instrument)
+    return in_sensor_mode(options, instrument)
+
+
+def build_detector(
+    options: Options, instrument: Instrument, plant: Plant, optics: Optics
+) -> Detector:
+    """Return the detector: its noise, and the light that the status reports."""
+    magnitude = options.magnitude
+    if isinstance(plant, MeasuredPlant):
+        ratio = (options.sky_diameter_m or sky_diameter(instrument)) / instrument.diameter_m
+        magnitude -= 5.0 * math.log10(ratio)
+    detector = Detector(
+        instrument,
+        images=optics.images,
+        valid=plant.valid,
+        magnitude=magnitude,
+        frame_rate_hz=options.frame_rate_hz,
+        camera=options.camera,
+        silent=plant.slope_errors.silent,
+        # the light of a measured matrix was not measured with it
+        reports_light=not isinstance(plant, MeasuredPlant),
+    )
+    detector.sigma = np.abs(plant.listed(detector.sigma))
+    return detector
+
+
+def build_identity(options: Options, instrument: Instrument, plant: Plant) -> Identity:
+    """Return the names of system, basis and sensor configuration that the RTC reports."""
+    double_pass = options.scene.passes == 2
+    if not isinstance(plant, MeasuredPlant):
+        return replace(identity_of(instrument, plant.valid), double_pass=double_pass)
+    digest = plant.measured.sha256[:8]
+    return Identity(
+        system=instrument.name,
+        basis_id=instrument.basis_id or f"measured-{plant.measured.matrix.shape[1]}-{digest}",
+        config_id=instrument.config_id or f"measured-{digest}",
+        double_pass=double_pass,
+    )
+
+
+def build_reconstructor(
+    options: Options,
+    instrument: Instrument,
+    basis: Basis,
+    plant: Plant,
+    identity: Identity,
+    n_controlled: int,
+    nominal: Misregistration,
+) -> Reconstructor:
+    """Return the RTC's own reconstructor, in use at the start."""
+    if not isinstance(plant, MeasuredPlant):
+        return initial_reconstructor(instrument, basis, identity, n_controlled, nominal)
+    if options.own_matrix != "model":
+        return own_reconstructor(plant.measured.matrix[:, :n_controlled], identity)
+    if not plant.knows_orientation:
+        raise ConfigurationError(
+            f'--own-matrix model: {instrument.name}: found slopes.orientation = "auto"; expected '
+            "the orientation that pyrcal fit finds in the measured matrix"
+        )
+    model = RtcInteractionModel(instrument, basis).interaction_matrix(nominal)
+    return own_reconstructor(model[:, :n_controlled], identity, nominal)
 
 
 def build_stage(
@@ -265,16 +338,37 @@ def build_stage(
 
 
 def build_plant(
-    options: Options, instrument: Instrument, basis: ModalBasis, rng: np.random.Generator
+    options: Options,
+    instrument: Instrument,
+    basis: Basis,
+    rng: np.random.Generator,
+    start: Misregistration | None = None,
 ) -> Plant:
     """Return the plant of these options, for an instrument that is binned already.
+
+    ``start`` is the registration at which the matrix of a measured plant was taken; None: the
+    nominal one.
 
     Raises
     ------
     ConfigurationError
         If pixels are to be binned on a plant that cannot, or actuators to fail that the mirror does
-        not have, or the influence functions are not of this mirror.
+        not have, or the influence functions are not of this mirror, or the file of a measured
+        matrix cannot be used.
     """
+    if options.matrix is not None:
+        measured = read_measured_matrix(options.matrix, instrument, basis, dataset=options.dataset)
+        return MeasuredPlant(
+            instrument,
+            basis,
+            measured,
+            start=start or instrument.start,
+            passes=options.scene.passes,
+            sky_diameter_m=options.sky_diameter_m,
+            imperfections=options.imperfections,
+        )
+    if not isinstance(basis, ModalBasis):
+        raise ConfigurationError(f"{instrument.name}: found modes without actuators")
     cube, pitch_m = options.influence_cube, options.influence_pitch_m
     made: Departures = {
         "rng": rng,
@@ -308,7 +402,7 @@ def departures_of(options: Options, instrument: Instrument) -> Imperfections:
 def build_sky(
     options: Options,
     instrument: Instrument,
-    basis: ModalBasis,
+    basis: Basis,
     plant: Plant,
     rng: np.random.Generator,
 ) -> Sky:
@@ -337,10 +431,21 @@ def build_sky(
     return Sky(turbulence=Turbulence(layers, seeing), vibrations=vibrations, played=played)
 
 
-def build_drive(options: Options, instrument: Instrument, basis: ModalBasis) -> MirrorDrive | None:
-    """Return the mirror's limits and lag; None for a linear plant's ideal one."""
-    if options.plant == "linear" and not options.needs_drive:
+def build_drive(options: Options, instrument: Instrument, basis: Basis) -> MirrorDrive | None:
+    """Return the mirror's limits and lag; None for a linear plant's ideal one.
+
+    Raises
+    ------
+    ConfigurationError
+        If limits are asked for of a mirror whose actuators are not known.
+    """
+    if options.plant != "diffractive" and not options.needs_drive:
         return None
+    if not isinstance(basis, ModalBasis):
+        raise ConfigurationError(
+            f"--rise-ms, --actuator-stroke, --actuator-bend: {instrument.name} has tables of "
+            "modes; expected actuators (mirror.layout)"
+        )
     return MirrorDrive(
         instrument.analytic_mirror,
         basis.mode_to_actuator,

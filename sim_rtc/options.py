@@ -45,7 +45,31 @@ class Options:
         "mode of the sensor, by its name in the instrument file (default: the first there)",
     )
     plant: str = option(
-        "--plant", "model of the telescope", default="linear", choices=["linear", "diffractive"]
+        "--plant",
+        "model of the telescope; measured: the interaction matrix of --matrix",
+        default="linear",
+        choices=["linear", "diffractive", "measured"],
+    )
+    matrix: Path | None = option(
+        "--matrix FILE",
+        "measured interaction matrix of --plant measured, as pyrcal import writes it and pyrcal "
+        "fit reads it",
+        Path,
+    )
+    dataset: str | None = option(
+        "--dataset NAME", "array of that file (default: interaction_matrix)"
+    )
+    own_matrix: str | None = option(
+        "--own-matrix",
+        "reconstructor at the start with --plant measured: pseudo-inverse of the first measured "
+        "columns, or of the model at the nominal registration (default: measured)",
+        choices=["measured", "model"],
+    )
+    sky_diameter_m: float | None = option(
+        "--sky-diameter M",
+        "with --plant measured: diameter of the telescope whose turbulence and star the pupil sees "
+        "(default: that of the instrument file, or 8 m if that is a bench of less than 0.5 m)",
+        within(0.01, 100.0),
     )
     alpha: Misregistration | None = several(
         "--alpha X,Y,ROT_DEG,MAG",
@@ -403,7 +427,7 @@ class Options:
     @property
     def speed(self) -> float:
         """Loop time over wall-clock time; a diffractive telescope takes the time it needs."""
-        usual = 1.0 if self.plant == "linear" else 0.0
+        usual = 0.0 if self.plant == "diffractive" else 1.0
         return usual if self.given_speed is None else self.given_speed
 
     @property
@@ -471,14 +495,21 @@ class Options:
             for one in fields(Imperfections)
             if (given := getattr(self, one.name, None)) is not None
         }
+        if self.plant == "measured" and (named or changes):
+            found = ", ".join(sorted({*named, *changes}))
+            raise ConfigurationError(
+                f"--plant measured: found imperfections ({found}); expected none but "
+                "--optical-gain: the measured matrix has those of the bench"
+            )
         if self.optical_gain is not None:
-            if self.plant != "linear":
+            if self.plant == "diffractive":
                 raise ConfigurationError(
                     f"--optical-gain: found --plant {self.plant}, whose own light decides it; "
-                    "expected --plant linear"
+                    "expected --plant linear or measured"
                 )
             changes["lowest_optical_gain"], changes["highest_optical_gain"] = self.optical_gain
-        return replace(SETS[named.pop() if named else "usual"], **changes)
+        usual = "ideal" if self.plant == "measured" else "usual"
+        return replace(SETS[named.pop() if named else usual], **changes)
 
     @property
     def mirror_faults(self) -> MirrorFaults:
@@ -517,6 +548,7 @@ class Options:
             )
         if self.far and self.alpha is not None:
             raise ConfigurationError("--far: found beside --alpha; expected one of them")
+        self._check_measured()
         if self.influence_pitch_m is not None and self.influence_cube is None:
             raise ConfigurationError(
                 "--influence-pitch: found alone; expected --influence beside it"
@@ -531,6 +563,52 @@ class Options:
             if isinstance(value, property):
                 getattr(chosen, name)
         return chosen
+
+    def _check_measured(self) -> None:
+        """Refuse options that do not fit together with a measured plant, or without one."""
+        if self.plant != "measured":
+            options = {
+                "--matrix": self.matrix,
+                "--dataset": self.dataset,
+                "--own-matrix": self.own_matrix,
+                "--sky-diameter": self.sky_diameter_m,
+            }
+            _refuse_given(options, "expected --plant measured beside it")
+            return
+        if self.matrix is None:
+            raise ConfigurationError("--plant measured: expected --matrix FILE beside it")
+        unusable = {
+            "--far": self.far,
+            "--spiders": self.spiders,
+            "--influence": self.influence_cube,
+            "--dead-actuators": self.dead_actuators,
+            "--stuck-actuators": self.stuck_actuators,
+            "--preset": self.preset,
+        }
+        _refuse_given(unusable, "a measured plant is as it was measured; expected another --plant")
+        moving = {
+            "--jump": self.jumps,
+            "--drift": self.drift.vector.any(),
+            "--flexure": self.flexure.vector.any(),
+            "--walk": self.walk.vector.any(),
+            "--stage": self.stage,
+        }
+        if self.alpha is None:
+            reason = "the registration of a measured matrix is not known; expected --alpha beside "
+            _refuse_given(moving, f"{reason}it, as pyrcal fit finds it in that matrix")
+
+
+def _refuse_given(options: dict[str, Any], reason: str) -> None:
+    """Refuse the first of these options that was given.
+
+    Raises
+    ------
+    ConfigurationError
+        Naming the option and the reason.
+    """
+    for name, value in options.items():
+        if value:
+            raise ConfigurationError(f"{name}: {reason}")
 
 
 def parse_options(given: Sequence[str] | None = None) -> Options:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.errors import ConfigurationError
+from service.model.misregistration import PARAMETERS
 from service.model.slopes import slopes_of
 from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, Background
@@ -146,7 +147,7 @@ class TruthRecorder(Background):
                 "kind": "truth",
                 "t_ns_utc": self._clock.end_of_exposure_ns(end_seq),
                 "seq": end_seq,
-                **last.optics.alpha.to_boundary(),
+                **self._alpha(last),
                 "seeing_arcsec": self._seeing_arcsec(end_seq),
                 "wavefront_error_nm": round(float(np.sqrt(np.mean(np.square(errors_nm)))), 3),
                 "wavefront_error_peak_nm": round(max(errors_nm), 3),
@@ -163,6 +164,13 @@ class TruthRecorder(Background):
         while self._recent and self._recent[0][0] < end_seq - self._swap_frames:
             self._recent.popleft()
         self._last = last
+
+    def _alpha(self, batch: Batch) -> dict[str, float | None]:
+        """Return the true registration; None for each number that nobody knows."""
+        options = self._options
+        if options is not None and options.plant == "measured" and options.alpha is None:
+            return dict.fromkeys(PARAMETERS)
+        return dict(batch.optics.alpha.to_boundary())
 
     def _seeing_arcsec(self, seq: int) -> float | None:
         if self._options is None:
@@ -211,6 +219,7 @@ def setup_of(options: Options) -> dict[str, Any]:
     )
     return {
         "plant": options.plant,
+        "matrix": None if options.matrix is None else str(options.matrix),
         "influence": options.influence_cube,
         "instrument": options.instrument,
         "seed": options.seed,
@@ -317,7 +326,9 @@ def _moment(telescope: Telescope, batch: Batch, frame: int) -> Moment:
     n, side = len(plant.valid), math.isqrt(light.size)
     share = light.reshape(-1)[plant.pixels].mean()
     maps = np.full((2, n, n), np.nan)
-    maps[:, plant.valid] = slopes_of(batch.slopes[0], plant.slope_errors.recipe.kind)
+    maps[:, plant.valid] = slopes_of(
+        plant.in_conventions(batch.slopes[0]), plant.slope_errors.recipe.kind
+    )
     left_nm = (opd_m - plant.weights @ opd_m) * 1e9
     return Moment(
         frame=frame,

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -21,7 +22,7 @@ from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
 from service.model.kinds import BasisKind, SignalKind
 from service.model.misregistration import Misregistration
-from service.model.modes import ModalBasis
+from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
 from service.wire import (
     TEXT_LIMIT,
@@ -233,17 +234,27 @@ def truncated_inverse(interaction: Array32) -> Array32:
 
 def initial_reconstructor(
     instrument: Instrument,
-    basis: ModalBasis,
+    basis: Basis,
     identity: Identity,
     n_controlled: int,
     aligned: Misregistration,
 ) -> Reconstructor:
     """Return the matrix before any flexure: the inverse of the model where all is aligned."""
     interaction = InteractionModel(instrument, basis).interaction_matrix(aligned)
-    matrix = truncated_inverse(interaction[:, :n_controlled])
-    name = f"initial-{n_controlled}-{checksum(matrix)[:8]}"
-    made_ns, alpha = time.time_ns(), aligned.to_boundary()
-    return Reconstructor.own(name, matrix, identity, created_ns=made_ns, alpha=alpha)
+    return own_reconstructor(interaction[:, :n_controlled], identity, aligned)
+
+
+def own_reconstructor(
+    interaction: NDArray[Any], identity: Identity, alpha: Misregistration | None = None
+) -> Reconstructor:
+    """Return the pseudo-inverse of D ``(n_slopes, n_controlled)`` as the RTC's own matrix.
+
+    ``alpha`` is the registration that D belongs to; None if it is not known.
+    """
+    matrix = truncated_inverse(interaction.astype(np.float32))
+    name = f"initial-{len(matrix)}-{checksum(matrix)[:8]}"
+    told = None if alpha is None else alpha.to_boundary()
+    return Reconstructor.own(name, matrix, identity, created_ns=time.time_ns(), alpha=told)
 
 
 def identity_of(instrument: Instrument, valid: NDArray[np.bool_]) -> Identity:

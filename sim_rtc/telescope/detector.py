@@ -69,10 +69,12 @@ class Detector:
         frame_rate_hz: float,
         camera: Camera | None = None,
         silent: NDArray[np.bool_] | None = None,
+        reports_light: bool = True,
     ) -> None:
         """Take the share of the light that each pixel detects, ``images`` in the sensor's shape.
 
-        ``silent`` ``(n_valid,)`` are subapertures that read 0, noise included.
+        ``silent`` ``(n_valid,)`` are subapertures that read 0, noise included. If ``reports_light``
+        is False, the status carries no flux.
         """
         camera = camera or Camera()
         self.electrons_per_frame: float = camera.electrons_per_frame(
@@ -80,7 +82,7 @@ class Detector:
         )
         """Detected on all pixels together while none is dead."""
         kind, sensor = instrument.slopes.kind, kind_of(instrument)
-        self._light = sensor.light(instrument)
+        self._light = sensor.light(instrument) if reports_light else None
         pixels = images.reshape(-1)[sensor.pixels(instrument, valid)]
         own = pixels.sum(axis=0) * self.electrons_per_frame
         if kind is SignalKind.XY:
@@ -103,7 +105,7 @@ class Detector:
 
     def flux(self, images: Array) -> bytes | None:
         """Return electrons per frame as a status tells them; None: nobody could read them."""
-        if isinstance(self._light, CannotTell):
+        if self._light is None or isinstance(self._light, CannotTell):
             return None
         counts = self._light.counts(images * self.electrons_per_frame)
         return counts.astype("<f4").tobytes()

@@ -27,7 +27,13 @@ from sim_rtc.telescope.detector import PixelDetector
 from sim_rtc.telescope.imperfections import SlopeErrors
 from sim_rtc.telescope.lenslets import LENSLET_SAMPLING, DiffractiveLenslets
 from sim_rtc.telescope.mirror import PlantSurface, TensionedPlate, heights
-from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registration_between
+from sim_rtc.telescope.plant import (
+    Departures,
+    Optics,
+    SimulatedPlant,
+    between,
+    registration_between,
+)
 
 Array32 = NDArray[np.float32]
 Array = NDArray[Any]
@@ -144,7 +150,7 @@ class DiffractiveOptics(Optics):
         return self.errors.applied((slopes - self.slopes_at_rest).astype(np.float32, copy=False))
 
 
-class DiffractivePlant(Plant):
+class DiffractivePlant(SimulatedPlant):
     """A sensor and a mirror with all that linear algebra leaves out."""
 
     def __init__(

@@ -22,7 +22,13 @@ from service.model.sensors.sensor import Fineness
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import Imperfections
 from sim_rtc.telescope.mirror import DrawnSurface, modal_content
-from sim_rtc.telescope.plant import Departures, Optics, Plant, between, registration_between
+from sim_rtc.telescope.plant import (
+    Departures,
+    Optics,
+    SimulatedPlant,
+    between,
+    registration_between,
+)
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -78,13 +84,13 @@ class LinearOptics(Optics):
         )
 
 
-class LinearPlant(Plant):
+class LinearPlant(SimulatedPlant):
     """A sensor and a thin-plate mirror, each slightly unlike the service's model of them."""
 
     def __init__(
         self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
     ) -> None:
-        sampling, n_nodes = _sampling(instrument), _NODES * instrument.binning
+        sampling, n_nodes = sampling_of(instrument), _NODES * instrument.binning
         super().__init__(instrument, basis, instrument_pupil(instrument, sampling), made)
         self._sensor = kind_of(instrument).sensor(
             replace(instrument, wfs=self._wfs),
@@ -126,7 +132,7 @@ class LinearPlant(Plant):
         return DrawnSurface(mirror=mirror, subaperture_m=self._instrument.subaperture_m), strokes
 
 
-def _sampling(instrument: Instrument) -> int:
+def sampling_of(instrument: Instrument) -> int:
     """Return points along a subaperture, of which K ``(n_slopes, n_points)`` has a size to keep."""
     n_valid = int(valid_subapertures(instrument).sum())
     n_slopes = instrument.slopes.kind.n_planes * n_valid

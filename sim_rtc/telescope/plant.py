@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Required, Self, TypedDict
+from typing import Any, Required, Self, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,59 @@ class Departures(TypedDict, total=False):
 class Plant(ABC):
     """A telescope, at any registration."""
 
+    _instrument: Instrument
+    _points: Array
+
+    points_m: Array
+    """``(n_points, 2)`` where the phase is sampled in the pupil, metres."""
+
+    pitch_m: float
+    """Distance between neighbouring points, metres."""
+
+    weights: Array
+    """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
+
+    valid: NDArray[np.bool_]
+    """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
+
+    pixels: NDArray[np.intp]
+    """``(n_pixels, n_valid)`` where their pixels stand in the light."""
+
+    slope_errors: SlopeErrors
+    """What the sensor makes of correct light and slopes."""
+
+    sensor_opd_m: Array32
+    """``(n_points,)`` static OPD that the sensor sees and the science does not."""
+
+    @abstractmethod
+    def optics(self, alpha: Misregistration) -> Optics:
+        """Return the optics at ``alpha``; takes seconds."""
+
+    def listed(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Return rows ``(n_slopes, ...)`` of conventions.md as this telescope lists its slopes."""
+        return rows
+
+    def in_conventions(self, slopes: NDArray[Any]) -> NDArray[Any]:
+        """Return slopes ``(n_slopes, ...)`` of this telescope as conventions.md lists them."""
+        return slopes
+
+    def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
+        """Return by how much the pupil images move on the sensor, subapertures."""
+        if self._instrument.stop is Stop.TELESCOPE:
+            return (0.0, 0.0)
+        return (alpha.shift_x_subap, alpha.shift_y_subap)
+
+    def _on_mirror(self, alpha: Misregistration) -> Array:
+        """Return where each point of the pupil lies on the mirror, ``(n_points, 2)``."""
+        points = self._points
+        if self._instrument.stop is Stop.TELESCOPE:
+            points = points - alpha.vector[:2]
+        return self._instrument.with_anamorphosis(alpha).on_mirror(points)
+
+
+class SimulatedPlant(Plant):
+    """A telescope simulated from its instrument file, with imperfections the file omits."""
+
     def __init__(
         self, instrument: Instrument, basis: ModalBasis, pupil: PupilGrid, made: Departures
     ) -> None:
@@ -105,43 +158,21 @@ class Plant(ABC):
         faults = made.get("faults") or MirrorFaults()
         self._weights = np.column_stack(disobedient(self._surface, strokes, faults))
         self._points = distorted(pupil.points, pupil.weights, imperfections)
-        self.points_m: Array = self._points * width_m
-        """``(n_points, 2)`` where the phase is sampled in the pupil, metres."""
-        self.pitch_m: float = width_m / pupil.sampling
-        """Distance between neighbouring points, metres."""
-        self.weights: Array = pupil.weights
-        """``(n_points,)`` share of the pupil's area at each point; sums to 1."""
-        self.valid: NDArray[np.bool_] = valid_subapertures(instrument)
-        """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
-        self.pixels: NDArray[np.intp] = kind_of(instrument).pixels(instrument, self.valid)
-        """``(n_pixels, n_valid)`` where their pixels stand in the light."""
+        self.points_m = self._points * width_m
+        self.pitch_m = width_m / pupil.sampling
+        self.weights = pupil.weights
+        self.valid = valid_subapertures(instrument)
+        self.pixels = kind_of(instrument).pixels(instrument, self.valid)
         self.slope_errors = SlopeErrors(self.pixels, imperfections, pixel_rng, instrument.slopes)
-        """What the sensor makes of correct light and slopes."""
-        self.sensor_opd_m: Array32 = non_common_path(
-            self._points, self.weights, imperfections, path_rng
-        )
-        """``(n_points,)`` static OPD that the sensor sees and the science does not."""
-
-    @abstractmethod
-    def optics(self, alpha: Misregistration) -> Optics:
-        """Return the optics at ``alpha``; takes seconds."""
+        self.sensor_opd_m = non_common_path(self._points, self.weights, imperfections, path_rng)
 
     @abstractmethod
     def _own_surface(self, mirror: Mirror, strokes: Array) -> tuple[PlantSurface, Array]:
         """Return the surface of a mirror without measured influence functions, and its strokes."""
 
-    def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
-        """Return by how much the pupil images move on the sensor, subapertures."""
-        if self._instrument.stop is Stop.TELESCOPE:
-            return (0.0, 0.0)
-        return (alpha.shift_x_subap, alpha.shift_y_subap)
-
     def _render(self, alpha: Misregistration) -> tuple[Array32, Array32]:
         """Return modes ``(n_points, n_modes)`` and stuck actuators ``(n_points,)``, seen once."""
-        points = self._points
-        if self._instrument.stop is Stop.TELESCOPE:
-            points = points - alpha.vector[:2]
-        on_mirror = self._instrument.with_anamorphosis(alpha).on_mirror(points)
+        on_mirror = self._on_mirror(alpha)
         blocks = [
             self._surface.basis(on_mirror[start : start + _RENDER_ROWS]) @ self._weights
             for start in range(0, len(on_mirror), _RENDER_ROWS)

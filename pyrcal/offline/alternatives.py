@@ -176,7 +176,7 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
     if not all(few.tells(few.own, rate) for rate in rates):
         return
     (x, y), share, moved = _fitted_as_well(few, *rates)
-    explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
+    explained = few.residual_fraction * float(np.sqrt(max(1.0 - share, 0.0)))
     off = float(np.hypot(x, y))
     shift = float(np.hypot(*alpha.vector[:2])) if about.stop is Stop.MIRROR else 0.0
     notable = max(NOTABLE_OFFSET_SUBAP, NOTABLE_OFFSET_SHARE * shift)

@@ -20,6 +20,7 @@ from service.archive.serialisation import to_json
 from service.config import Settings, load_settings
 from service.config.policy import keeping_of
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
+from service.files.documents import json_text
 from service.tracking.products import MatrixState
 
 DONE, DAMAGED = 0, 1
@@ -61,7 +62,7 @@ def _open_archive(settings: Settings) -> Iterator[Archive]:
 
 def _list(every: tuple[Item, ...], *, as_json: bool) -> int:
     if as_json:
-        print(json.dumps([asdict(item) for item in every], indent=2))
+        print(json_text([asdict(item) for item in every], indent=2))
         return DONE
     for item in every:
         print(shown(_line(item)))
@@ -98,7 +99,7 @@ def _show(archive: Archive, every: tuple[Item, ...], product_id: str, *, as_json
         "record": {} if record is None else json.loads(to_json(record)),
     }
     if as_json:
-        print(json.dumps(document, indent=2))
+        print(json_text(document, indent=2))
     else:
         of_record = document.pop("record")
         for name, value in {**document, **of_record}.items():
@@ -119,7 +120,7 @@ def _verify(archive: Archive, every: tuple[Item, ...], *, as_json: bool) -> int:
             "index": fault,
             "damaged": [asdict(one) for one in wrong],
         }
-        print(json.dumps(document, indent=2))
+        print(json_text(document, indent=2))
     else:
         for one in wrong:
             print(shown(f"DAMAGED {one.kind} {one.id}: {one.path}: {one.found}"))
@@ -149,7 +150,7 @@ def _prune(settings: Settings, *, dry_run: bool, as_json: bool) -> int:
             if dry_run or entry is not None:
                 gone.append((item, why))
     if as_json:
-        print(json.dumps([{**asdict(item), "why": why} for item, why in gone], indent=2))
+        print(json_text([{**asdict(item), "why": why} for item, why in gone], indent=2))
     else:
         for item, why in gone:
             print(shown(f"{_line(item)}  {'would go' if dry_run else 'removed'}: {why}"))

@@ -17,6 +17,7 @@ from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.config import Settings, load_instrument, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
+from service.files.documents import json_text
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import ModalBasis, modal_basis
@@ -154,7 +155,7 @@ def _summary(path: Path, bundle: Bundle, *, as_json: bool) -> str:
     if as_json:
         arrays = {name: list(values.shape) for name, values in bundle.arrays.items()}
         found = {"id": bundle.id, "sha256": bundle.sha256, "arrays": arrays, **bundle.facts}
-        return json.dumps(found, indent=2)
+        return json_text(found, indent=2)
     record = bundle.facts.get("record", {})
     lines = [
         f"{path}: sound; {bundle.id} of {bundle.facts.get('instrument')}",

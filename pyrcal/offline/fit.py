@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from pyrcal.offline.report import document, fill_fit
 from pyrcal.terminal import show_progress
 from service.config import load_instrument
 from service.errors import ConfigurationError, say
+from service.files.documents import json_text
 from service.files.whole import write_whole
 from service.model.instrument import Instrument
 from service.model.kinds import Method
@@ -57,7 +57,7 @@ def main(options: argparse.Namespace) -> int:
     if light is not None:
         report = replace(report, notes=(*report.notes, light.note))
     if options.json:
-        print(json.dumps(document(report), allow_nan=False))
+        print(json_text(document(report)))
         for note in report.notes:
             say(f"note: {note}")
     else:

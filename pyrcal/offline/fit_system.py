@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -25,6 +24,7 @@ from pyrcal.offline.system_report import SystemReport, document, fill_system, ta
 from pyrcal.terminal import show_progress
 from service.errors import MatrixError, PyrcalError
 from service.files.container import DATASET, opened
+from service.files.documents import json_text
 from service.files.whole import write_whole
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
@@ -52,7 +52,7 @@ def main(options: argparse.Namespace) -> int:
     report = fit_pairs(
         system, lambda pair, about: _fitted(system, pair, about, stored[pair], options.threads)
     )
-    print(json.dumps(document(report), allow_nan=False) if options.json else table(report))
+    print(json_text(document(report)) if options.json else table(report))
     if options.output is not None:
         write_whole(options.output, partial(fill_system, report=report))
     if options.plot is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import zipfile
 import zlib
@@ -20,6 +19,7 @@ from service.config import load_instrument, packaged_instrument
 from service.config.sources import read_toml, reference_parts
 from service.errors import ConfigurationError, MatrixError, PyrcalError
 from service.files import parse_alpha, parse_modes
+from service.files.documents import json_text
 from service.files.fit_folder import DOCUMENT, FIGURES, STAGE, STAGES, UPLOAD, FitRequest
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.kinds import Method
@@ -209,4 +209,4 @@ def _options(asked: Mapping[str, Any]) -> FitOptions:
 
 
 def _write(path: Path, found: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(found, allow_nan=False), encoding="utf-8")
+    path.write_text(json_text(found), encoding="utf-8")

@@ -22,6 +22,7 @@ from service.control.gains import CalibrationGains
 from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError
 from service.files.container import put_array, put_covariance
+from service.files.documents import json_text
 from service.model.kinds import Method, SlopeOrder
 from service.model.misregistration import (
     BOUNDARY_SCALE,
@@ -193,7 +194,7 @@ def fill_fit(file: h5py.File, report: FitReport) -> None:
         group["samples"], group["chi"] = scan.samples, scan.chi
     file.attrs.update(fit.alpha.to_boundary())
     file.attrs.update(_provenance(report))
-    file.attrs["document"] = json.dumps(document(report), allow_nan=False)
+    file.attrs["document"] = json_text(document(report))
 
 
 def _put_alternatives(file: h5py.File, fit: Fit) -> None:

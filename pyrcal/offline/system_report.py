@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +15,7 @@ from pyrcal.offline.system import System
 from pyrcal.offline.system_fit import SystemFit
 from service.errors import shown
 from service.files.container import put_array
+from service.files.documents import json_text
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 
 UNLIKELY = 1e-4
@@ -203,4 +203,4 @@ def fill_system(file: h5py.File, report: SystemReport) -> None:
         file["values"].attrs["parameters"] = [f"{one.owner}.{one.name}" for one in parameters]
     file.attrs["system"], file.attrs["verdict"] = report.system.name, report.verdict
     file.attrs["accepted"] = report.accepted
-    file.attrs["document"] = json.dumps(document(report), allow_nan=False)
+    file.attrs["document"] = json_text(document(report))

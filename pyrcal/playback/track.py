@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import os
 import sys
 from collections.abc import Callable, Iterable
@@ -26,6 +25,7 @@ from pyrcal.terminal import show_progress
 from service.config import load_instrument, load_settings
 from service.config.settings import Settings
 from service.errors import ConfigurationError, say
+from service.files.documents import json_text
 from service.files.recording import FORMAT, Message, Recording
 from service.files.whole import write_whole
 from service.model.instrument import Instrument
@@ -48,7 +48,7 @@ def main(options: argparse.Namespace) -> int:
     instrument = load_instrument(options.instrument)
     found = track(options.telemetry, instrument, settings)
     if options.json:
-        print(json.dumps(document(found, options.telemetry), allow_nan=False))
+        print(json_text(document(found, options.telemetry)))
     else:
         print(table(found))
     if options.output is not None:

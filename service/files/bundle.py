@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from service.errors import ConfigurationError, MatrixError, StorageError
 from service.files.container import opened
+from service.files.documents import plain
 from service.files.durable import flush
 from service.files.whole import write_whole
 
@@ -228,7 +229,7 @@ def _manifest(bundle: Bundle) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "id": bundle.id,
-        "facts": dict(bundle.facts),
+        "facts": plain(bundle.facts, finite=False),
         "arrays": {
             name: {"dtype": values.dtype.str, "shape": list(values.shape), **_sum_of(values)}
             for name, values in arrays.items()

@@ -4,25 +4,31 @@ The matrices are those of the FFT pyramid of tests/physics with Gaussians writte
 the model is in them.
 """
 
+import json
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
+from pyrcal.offline import alternatives, instrument_checks, models, pupil_checks
 from pyrcal.offline.advice import Grounds, recommendation
+from pyrcal.offline.fit_table import table
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import LeftOver
 from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.report import document, fill_fit, read_fit
 from pyrcal.offline.verdict import Refusal
 from service.estimation.reference import Reference
+from service.files.documents import json_text
+from service.files.whole import write_whole
 from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
 from service.model.pupil import lit_subapertures
 from service.model.slopes import SlopeRecipe
 from tests.unit.estimation.bench import ELSEWHERE, PLAIN, fit, instrument, matrix
-from tests.unit.offline.made import a_fit
+from tests.unit.offline.made import a_fit, a_report
 from tests.unit.offline.test_mistold import MODES, TRUTH, N, bench, masked, sigmas_off, zonal
 
 EXPLAIN = FitOptions(explain=True)
@@ -365,3 +371,28 @@ def test_a_fit_that_nobody_asked_to_explain_is_advised_all_the_same():
     found = fit(matrix(noise=0.05), instrument())
     assert found.alternatives == ()
     assert found.recommendation.startswith("use it")
+
+
+# --- written
+
+
+def test_a_fit_is_written_whichever_alternative_is_preferred(monkeypatch, tmp_path):
+    """Each passes its tests by limits that all pass, so its own numbers come to its flags."""
+    for module in (alternatives, instrument_checks, models, pupil_checks):
+        for name in ("BETTER", "FAR_BETTER"):
+            monkeypatch.setattr(module, name, np.inf, raising=False)
+    for name in ("NOTABLE_OFFSET_SUBAP", "NOTABLE_OFFSET_SHARE", "LEAST_OFFSET", "NOTABLE_AXES"):
+        monkeypatch.setattr(alternatives, name, -1.0)
+    monkeypatch.setattr(pupil_checks, "LEAST_EXPLAINED", -1.0)
+    found = explained(modal_bench(), modal())
+    preferred = [one.words for one in found.alternatives if one.preferred]
+    for words in ("off the sensor's middle", "than Sy", "stop =", "normalisation =", "influence ="):
+        assert any(words in one for one in preferred), preferred
+    for one in found.alternatives:
+        asked = replace(one, preferred=True, undecided=np.False_, share=np.float64(0.3))
+        report = a_report(replace(found, alternatives=(one, asked)))
+        assert json.loads(json_text(document(report)))["alternatives"][1]["preferred"] is True
+        write_whole(tmp_path / "fit.h5", partial(fill_fit, report=report))
+        assert read_fit(tmp_path / "fit.h5").accepted is found.accepted
+        (tmp_path / "fit.h5").unlink()
+        table(report)

@@ -151,6 +151,30 @@ def test_a_smooth_gain_over_the_pupil_is_found_when_asked_for():
     assert mapped.residual_fraction < fit(uneven).residual_fraction / 3.0
 
 
+GAIN_SHAPES = {
+    "along x": lambda x, y: x,
+    "along the diagonal": lambda x, y: (x + y) / np.sqrt(2.0),
+    "defocus": lambda x, y: x**2 + y**2 - 0.5,
+    "astigmatism": lambda x, y: x**2 - y**2,
+    "coma": lambda x, y: (3.0 * (x**2 + y**2) - 2.0) * x,
+}
+"""Odd and even over the pupil; x and y reach 1 at its edge."""
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+@pytest.mark.parametrize("shape", GAIN_SHAPES)
+def test_a_large_smooth_gain_moves_nothing_by_its_sigma_when_a_map_is_fitted(shape, share):
+    """Multiplied by D of the start, the map left magnification 8 and anamorphosis 21 sigma off."""
+    valid = fit(matrix()).valid
+    y, x = (np.stack(np.nonzero(valid)) - (len(valid) - 1) / 2) / (len(valid) / 2)
+    gain = 1.0 + share * GAIN_SHAPES[shape](x, y)
+    found = fit(matrix() * np.tile(gain, 2)[:, None], options=FitOptions(gain_map=True))
+    assert found.accepted
+    assert np.all(np.abs(error(found)) < 1.5 * found.sigma)
+    assert np.all(np.abs(found.alpha.stretches) < 1.5 * found.anamorphosis_sigma)
+    np.testing.assert_allclose(found.gain_map[valid], gain / gain.mean(), atol=0.02)
+
+
 @pytest.mark.parametrize("stretches", [(0.004, 0.0), (-0.003, 0.002), (0.02, -0.02)])
 def test_a_stretched_image_of_the_mirror_is_found_unasked(stretches):
     """2.8 % is more than any telescope's; the largest of GPAO is 1.9 %."""

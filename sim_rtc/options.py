@@ -235,6 +235,12 @@ class Options:
     ncpa_nm: float | None = option(
         "--ncpa NM", "static wavefront only the sensor sees, RMS", within(0.0, 300.0)
     )
+    model_error: float | None = option(
+        "--model-error RATIO",
+        "error of every mode, a smooth pattern of its own, about this share of its slopes; no "
+        "registration explains it, and the service does not know it",
+        within(0.0, 1.0),
+    )
     bad_pixels: int | None = option(
         "--bad-pixels N",
         "dead pixels: dark, and their subapertures read slopes of 0",

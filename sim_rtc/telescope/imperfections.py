@@ -1,7 +1,8 @@
 """How the telescope departs from its drawing.
 
 One record for every plant. A calibration must survive all of it, so each is an option with a
-default, and ``realistic`` is a mix of them all.
+default. ``realistic`` is a mix of them all, except for errors of the modes' shapes: those rehearse
+a bench whose model is poor.
 """
 
 from __future__ import annotations
@@ -59,6 +60,9 @@ class Imperfections:
 
     ncpa_nm: float = 0.0
     """Static wavefront that only the sensor sees, nm RMS."""
+
+    model_error: float = 0.0
+    """Error of every mode's shape, a smooth pattern of its own: RMS gradient over the mode's."""
 
 
 SETS = {
@@ -156,6 +160,58 @@ class SlopeErrors:
             read = slopes + signals_of_slopes(turned - before, self.recipe.kind)
         read[np.tile(self.silent, self.recipe.kind.n_planes)] = 0.0
         return np.asarray(read)
+
+
+_PATTERN_ORDER = 3
+"""Highest degree of the polynomials by which a mode's shape is wrong."""
+
+
+class ShapeErrors:
+    """Errors of the modes' shapes that no registration explains, each mode's own.
+
+    A mode is multiplied by one plus a random polynomial over the mirror. The polynomial is scaled
+    so that the gradient of the error has the given RMS over that of the mode: that is about the
+    share of a column of the interaction matrix that the model of the mode does not explain. The
+    errors stay on the mirror when its image moves.
+    """
+
+    def __init__(
+        self, lit: NDArray[np.bool_], n_modes: int, model_error: float, rng: np.random.Generator
+    ) -> None:
+        """Take which points of the pupil's grid ``(n, n)`` are lit: shapes are known there."""
+        self._model_error = model_error
+        powers = [(i, k - i) for k in range(1, _PATTERN_ORDER + 1) for i in range(k + 1)]
+        self._powers = np.array(powers)
+        self._weights = rng.standard_normal((len(powers), n_modes))
+        place = np.full(lit.shape, -1)
+        place[lit] = np.arange(lit.sum())
+        self._steps = np.concatenate(
+            [
+                np.column_stack([first.ravel(), second.ravel()])
+                for first, second in ((place[:, :-1], place[:, 1:]), (place[:-1], place[1:]))
+            ]
+        )
+        self._steps = self._steps[(self._steps >= 0).all(axis=1)]
+
+    def applied(self, shapes: Array32, on_mirror: Array) -> Array32:
+        """Return shapes ``(n_points, n_modes)`` with these errors.
+
+        ``on_mirror`` ``(n_points, 2)`` are the points where the shapes are seen, on the mirror.
+        """
+        if self._model_error == 0.0:
+            return shapes
+        at = on_mirror / np.abs(on_mirror).max()
+        terms = np.prod(at[:, None, :] ** self._powers, axis=2)
+        terms -= terms.mean(axis=0)
+        errors = shapes * (terms @ self._weights).astype(np.float32)
+        scale = self._model_error * self._roughness(shapes) / self._roughness(errors)
+        return np.asarray(shapes + errors * scale.astype(np.float32))
+
+    def _roughness(self, shapes: Array32) -> Array:
+        """Return the RMS step of each shape between neighbouring points, ``(n_modes,)``."""
+        first, second = self._steps.T
+        steps = (shapes[first] - shapes[second]).astype(np.float64)
+        return np.asarray(np.sqrt(np.mean(steps**2, axis=0)))
 
 
 def distorted(points: Array, weights: Array, imperfections: Imperfections) -> Array:

@@ -21,6 +21,7 @@ from service.model.sensors.registry import kind_of
 from sim_rtc.telescope.atmosphere import PhaseResponse
 from sim_rtc.telescope.imperfections import (
     Imperfections,
+    ShapeErrors,
     SlopeErrors,
     distorted,
     non_common_path,
@@ -141,7 +142,7 @@ class SimulatedPlant(Plant):
         """Take the pupil as it is drawn."""
         imperfections = made.get("imperfections") or Imperfections()
         scene = made.get("scene") or Scene()
-        uneven_rng, position_rng, pixel_rng, path_rng = made["rng"].spawn(4)
+        uneven_rng, position_rng, pixel_rng, path_rng, shape_rng = made["rng"].spawn(5)
         self._instrument = instrument
         self._passes = np.float32(scene.passes)
         width_m = instrument.subaperture_m
@@ -157,6 +158,9 @@ class SimulatedPlant(Plant):
             self._surface = influence.surface(drawn.positions_m, mirror.positions_m, width_m)
         faults = made.get("faults") or MirrorFaults()
         self._weights = np.column_stack(disobedient(self._surface, strokes, faults))
+        self._shape_errors = ShapeErrors(
+            pupil.lit, strokes.shape[1], imperfections.model_error, shape_rng
+        )
         self._points = distorted(pupil.points, pupil.weights, imperfections)
         self.points_m = self._points * width_m
         self.pitch_m = width_m / pupil.sampling
@@ -178,7 +182,8 @@ class SimulatedPlant(Plant):
             for start in range(0, len(on_mirror), _RENDER_ROWS)
         ]
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
-        return shapes[:, :-1], np.ascontiguousarray(shapes[:, -1])
+        modes = self._shape_errors.applied(shapes[:, :-1], on_mirror)
+        return modes, np.ascontiguousarray(shapes[:, -1])
 
 
 def between(first: Array32, last: Array32, share: float) -> Array32:

@@ -3,7 +3,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.model.kinds import SignalKind
+from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import instrument_pupil
 from service.model.sensors.pyramid.signals import pixel_places
@@ -43,14 +43,14 @@ def matrix(instrument, basis, **changes):
     return plant(instrument, basis, **changes).optics(ALIGNED).slopes_per_command
 
 
-def test_the_realistic_mix_has_every_imperfection():
+def test_the_realistic_mix_has_every_imperfection_but_a_wrong_model():
     ideal, realistic = SETS["ideal"], SETS["realistic"]
     same = [
         f.name
         for f in fields(Imperfections)
         if getattr(ideal, f.name) == getattr(realistic, f.name)
     ]
-    assert same == []
+    assert same == ["model_error"]
     assert SETS["usual"] == Imperfections()
 
 
@@ -212,3 +212,41 @@ def test_the_non_common_path_has_its_rms_and_no_tilt(pupil):
     moments = [pupil.weights @ (opd * shape) for shape in (1.0, *pupil.points.T)]
     assert np.sqrt(pupil.weights @ opd**2) == pytest.approx(30e-9, rel=1e-5)
     assert np.abs(moments).max() < 1e-13
+
+
+@pytest.mark.parametrize("error", [0.1, 0.3])
+def test_a_model_error_is_that_share_of_every_modes_slopes(small_instrument, small_basis, error):
+    """The gradient decides; what a modulated pyramid makes of it differs by a third at most."""
+    found = {}
+    for size in (0.0, error):
+        changes = replace(SETS["ideal"], model_error=size)
+        plant = LinearPlant(
+            small_instrument, small_basis, rng=np.random.default_rng(1), imperfections=changes
+        )
+        found[size] = plant.optics(Misregistration()).slopes_per_command
+    wrong = found[error] - found[0.0]
+    share = np.linalg.norm(wrong, axis=0) / np.linalg.norm(found[0.0], axis=0)
+    assert np.median(share) == pytest.approx(error, rel=0.1)
+    assert 0.6 * error < share.min()
+    assert share.max() < 1.6 * error
+    alike = wrong / np.linalg.norm(wrong, axis=0)
+    others = (alike.T @ alike)[~np.eye(small_basis.n_modes, dtype=np.bool_)]
+    assert np.sqrt(np.mean(others**2)) < 0.3  # each mode has an error of its own
+
+
+def test_model_errors_move_with_the_mirror(small_instrument, small_basis):
+    """The stop is the telescope: the mirror's image alone moves by one point of the pupil."""
+    instrument = replace(small_instrument, stop=Stop.TELESCOPE)
+    changes = replace(SETS["ideal"], model_error=0.2)
+    plant = LinearPlant(
+        instrument, small_basis, rng=np.random.default_rng(1), imperfections=changes
+    )
+    step = plant.pitch_m / instrument.subaperture_m
+    here = plant.optics(Misregistration()).opd_per_command
+    there = plant.optics(Misregistration(shift_x_subap=step)).opd_per_command
+    points = np.round(plant.points_m / plant.pitch_m * 2).astype(int)
+    place = {tuple(point): k for k, point in enumerate(points)}
+    pairs = [(k, place[x - 2, y]) for (x, y), k in place.items() if (x - 2, y) in place]
+    now, before = np.array(pairs).T
+    error = there[now] - here[before]
+    assert np.sqrt(np.mean(error**2)) < 0.02 * np.sqrt(np.mean(here**2))

@@ -80,7 +80,11 @@ def run(telescope: Telescope, options: Options, stopped: threading.Event) -> Non
         truth = None
         if options.truth is not None:
             truth_recorder = TruthRecorder(
-                options.truth, weights=telescope.weights, clock=clock, options=options
+                options.truth,
+                weights=telescope.weights,
+                clock=clock,
+                options=options,
+                image_offsets_px=telescope.plant.image_offsets_px,
             )
             truth = stack.enter_context(truth_recorder)
         computer_faults = ComputerFaults(

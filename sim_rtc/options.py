@@ -235,6 +235,20 @@ class Options:
     ncpa_nm: float | None = option(
         "--ncpa NM", "static wavefront only the sensor sees, RMS", within(0.0, 300.0)
     )
+    image_offsets_px: tuple[float, ...] | None = several(
+        "--image-offsets X1,Y1,X2,Y2,X3,Y3,X4,Y4",
+        "displacement of each pupil image of a pyramid from its place on the pixel grid, detector "
+        "pixels, of the images at -x -y, +x -y, -x +y, +x +y, less their mean; diffractive plant "
+        "only",
+        as_they_are,
+        lambda *offsets: max(map(abs, offsets)) <= 4.0,
+        ", at most 4 pixels either way",
+    )
+    image_offset_rms_px: float | None = option(
+        "--image-offset-rms PX",
+        "the same, at random: RMS of the eight numbers; diffractive plant only",
+        within(0.0, 2.0),
+    )
     model_error: float | None = option(
         "--model-error RATIO",
         "error of every mode, a smooth pattern of its own, about this share of its slopes; no "
@@ -506,6 +520,19 @@ class Options:
             raise ConfigurationError(
                 f"--plant measured: found imperfections ({found}); expected none but "
                 "--optical-gain: the measured matrix has those of the bench"
+            )
+        if self.plant == "linear":
+            expected = "the linear plant has no pixels; expected --plant diffractive"
+            _refuse_given(
+                {
+                    "--image-offsets": self.image_offsets_px,
+                    "--image-offset-rms": self.image_offset_rms_px,
+                },
+                expected,
+            )
+        if self.image_offsets_px is not None and self.image_offset_rms_px is not None:
+            raise ConfigurationError(
+                "--image-offset-rms: found beside --image-offsets; expected one of them"
             )
         if self.optical_gain is not None:
             if self.plant == "diffractive":

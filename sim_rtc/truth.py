@@ -75,11 +75,16 @@ class TruthRecorder(Background):
         weights: NDArray[np.float64],
         clock: FrameClock,
         options: Options | None = None,
+        image_offsets_px: NDArray[np.float64] | None = None,
     ) -> None:
-        """Take the pupil's ``weights`` ``(n_points,)``, and the options to be recorded."""
+        """Take the pupil's ``weights`` ``(n_points,)``, and the options to be recorded.
+
+        ``image_offsets_px`` ``(4, 2)`` are the displacements of the pupil images, if there are any.
+        """
         super().__init__("truth")
         self._path = path
         self._options = options
+        self._image_offsets_px = None if image_offsets_px is None else image_offsets_px.tolist()
         self._error = WavefrontError(weights)
         self._clock = clock
         self._line_frames = round(_LINE_S * 1e9 / clock.dt_ns)
@@ -93,7 +98,8 @@ class TruthRecorder(Background):
     def __enter__(self) -> Self:
         self._file: TextIO = self._path.open("w", encoding="utf-8")
         if self._options is not None:
-            self._write({"kind": "setup", **setup_of(self._options)})
+            found = {"image_offsets_px": self._image_offsets_px}
+            self._write({"kind": "setup", **setup_of(self._options), **found})
         return super().__enter__()
 
     @override

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.errors import ModelError
+from service.errors import ConfigurationError, ModelError
 from service.model.instrument import Instrument, Mirror, PupilMap
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
@@ -168,11 +168,20 @@ class DiffractivePlant(SimulatedPlant):
         super().__init__(instrument, basis, centred_pupil(instrument, sampling), made)
         self._sensor: DiffractiveSensor
         if isinstance(self._wfs, ShackHartmann):
+            if self.image_offsets_px is not None:
+                raise ConfigurationError(
+                    f"--image-offsets: {instrument.name} has a Shack-Hartmann sensor; expected a "
+                    "pyramid, which has four pupil images"
+                )
             self._sensor = DiffractiveLenslets(self._wfs, self._pupil, instrument.subaperture_m)
             return
         wfs = pyramid_in(replace(instrument, wfs=self._wfs))
+        offsets = self.image_offsets_px
         self._sensor = DiffractivePyramid(
-            wfs, self._pupil, quadrature=quadrature or _quadrature(wfs, binning)
+            wfs,
+            self._pupil,
+            quadrature=quadrature or _quadrature(wfs, binning),
+            offsets_subap=None if offsets is None else offsets.reshape(2, 2, 2) / binning,
         )
 
     @override
@@ -267,6 +276,26 @@ class Quadrature:
             )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _ImageGroup:
+    """Images whose detector points form one regular grid: their propagation is separable."""
+
+    sides_y: slice
+    sides_x: slice
+
+    left: Array
+    """``(n_pairs n_y, N)`` operator along y: pairs of modulation points, detector points."""
+
+    right: Array
+    """``(n_pairs, N, 2 n_x)`` operator along x."""
+
+    by_row: Array
+    """Working memory of the first product."""
+
+    light: Array
+    """Working memory of the second product."""
+
+
 class DiffractivePyramid:
     """The light on the four pupil images for any wavefront, at one shift of the images.
 
@@ -279,24 +308,22 @@ class DiffractivePyramid:
         pupil: PupilGrid,
         shift_subap: tuple[float, float] = (0.0, 0.0),
         quadrature: Quadrature | None = None,
+        offsets_subap: NDArray[np.float64] | None = None,
     ) -> None:
+        """Take where each image lies beside its place on the pixel grid, ``(2, 2, 2)``.
+
+        Side along y, side along x, (x, y), in subapertures; None if all four lie on it.
+        """
         self._wfs, self._pupil = wfs, pupil
         self.shift_subap = shift_subap
         """(x, y) by which the images are moved."""
 
         self._quadrature = quadrature or Quadrature()
+        self._offsets_subap = offsets_subap
         dtype = self._quadrature.dtype
         n_u = len(pupil.coordinates)
-        roof_y, roof_x = self._roof(shift_subap[1]), self._roof(shift_subap[0])
-        tilt_y, tilt_x = self._tilts()
-        # Points of the modulation that share their y component share the first product.
-        left = (tilt_y[:, None] * roof_y).reshape(-1, n_u)
-        right = (tilt_x[:, :, None] * roof_x).reshape(len(tilt_x), -1, n_u).transpose(0, 2, 1)
-        self._left: Array = left.astype(dtype)
-        self._right: Array = np.ascontiguousarray(right, dtype)
+        self._groups = self._image_groups()
         self._field = np.zeros((n_u, n_u), dtype)
-        self._by_row = np.empty((len(self._left), n_u), dtype)
-        self._light = np.empty((len(tilt_y), len(roof_y), 2 * len(roof_x)), dtype)
         real = np.empty(0, dtype).real.dtype
         self._lit = np.flatnonzero(pupil.lit)
         self._amplitude = pupil.amplitude[pupil.lit].astype(real)
@@ -304,7 +331,9 @@ class DiffractivePyramid:
 
     def at(self, shift_subap: tuple[float, float]) -> DiffractivePyramid:
         """Return the same sensor with its images elsewhere."""
-        return DiffractivePyramid(self._wfs, self._pupil, shift_subap, self._quadrature)
+        return DiffractivePyramid(
+            self._wfs, self._pupil, shift_subap, self._quadrature, self._offsets_subap
+        )
 
     def images(self, opd_m: Array) -> Array:
         """Return the light ``(2, n, 2, n)``: side, row along y, side, column along x.
@@ -316,22 +345,60 @@ class DiffractivePyramid:
         field = self._field.reshape(-1)
         field.real[self._lit] = self._amplitude * np.cos(phase)
         field.imag[self._lit] = self._amplitude * np.sin(phase)
-        np.matmul(self._left, self._field, out=self._by_row)
-        n_pairs, n_y, _ = self._light.shape
-        np.matmul(self._by_row.reshape(n_pairs, n_y, -1), self._right, out=self._light)
-        parts = self._light.view(self._amplitude.dtype)
+        if len(self._groups) == 1:
+            return self._light_of(self._groups[0])
+        n = self._wfs.n_subapertures
+        images = np.empty((2, n, 2, n), self._amplitude.dtype)
+        for group in self._groups:
+            images[group.sides_y, :, group.sides_x] = self._light_of(group)
+        return images
+
+    def _light_of(self, group: _ImageGroup) -> Array:
+        """Return the light ``(n_sides_y, n, n_sides_x, n)`` on a group's images, of the field."""
+        np.matmul(group.left, self._field, out=group.by_row)
+        n_pairs, n_y, _ = group.light.shape
+        np.matmul(group.by_row.reshape(n_pairs, n_y, -1), group.right, out=group.light)
+        parts = group.light.view(self._amplitude.dtype)
         power = np.einsum("mij,mij->ij", parts, parts)
         n, nodes = self._wfs.n_subapertures, self._quadrature.n_nodes
         # Rows: side, subaperture, node; columns: point of the pair, side, subaperture, node, part.
-        by_node = power.reshape(2, n, nodes, 2, 2, n, nodes * 2)
+        n_sides = n_y // (n * nodes)
+        by_node = power.reshape(n_sides, n, nodes, 2, -1, n, nodes * 2)
         return np.asarray(by_node.sum(axis=(2, 3, 6)))
+
+    def _image_groups(self) -> tuple[_ImageGroup, ...]:
+        """Return the images in groups that share one grid of detector points: all four, or each."""
+        both = slice(0, 2)
+        if self._offsets_subap is None:
+            return (self._group(both, both, np.zeros(2)),)
+        return tuple(
+            self._group(slice(y, y + 1), slice(x, x + 1), self._offsets_subap[y, x])
+            for y, x in np.ndindex(2, 2)
+        )
+
+    def _group(self, sides_y: slice, sides_x: slice, offset_subap: Array) -> _ImageGroup:
+        dtype, n_u = self._quadrature.dtype, len(self._pupil.coordinates)
+        roof_y = self._roof(self.shift_subap[1] + offset_subap[1], sides_y)
+        roof_x = self._roof(self.shift_subap[0] + offset_subap[0], sides_x)
+        tilt_y, tilt_x = self._tilts()
+        # Points of the modulation that share their y component share the first product.
+        left = (tilt_y[:, None] * roof_y).reshape(-1, n_u)
+        right = (tilt_x[:, :, None] * roof_x).reshape(len(tilt_x), -1, n_u).transpose(0, 2, 1)
+        return _ImageGroup(
+            sides_y=sides_y,
+            sides_x=sides_x,
+            left=left.astype(dtype),
+            right=np.ascontiguousarray(right, dtype),
+            by_row=np.empty((len(left), n_u), dtype),
+            light=np.empty((len(tilt_y), len(roof_y), 2 * len(roof_x)), dtype),
+        )
 
     def signals(self, light: Array, valid: NDArray[np.bool_], recipe: SlopeRecipe) -> Array:
         """Return the signals of its images ``(n_slopes,)``, of a flat wavefront too."""
         return reference_slopes(light, valid, recipe)[0]
 
-    def _roof(self, shift_subap: float) -> Array:
-        """Return the roof operator along one axis, ``(2 n n_nodes, N)``, its weights included.
+    def _roof(self, shift_subap: float, sides: slice) -> Array:
+        """Return the roof operator along one axis, ``(n_sides n n_nodes, N)``, weights included.
 
         The kernel of one edge is that of a half-plane's transform, cut at the band limit of the
         pupil grid; the light of a subaperture is a Gauss-Legendre sum over its nodes.
@@ -339,7 +406,7 @@ class DiffractivePyramid:
         n, half = self._wfs.n_subapertures, self._wfs.image_separation_subap / 2
         offsets, weights = np.polynomial.legendre.leggauss(self._quadrature.n_nodes)
         centres = np.arange(n) - (n - 1) / 2
-        x = _SIDES[:, None, None] * half + centres[:, None] + offsets / 2 - shift_subap
+        x = _SIDES[sides, None, None] * half + centres[:, None] + offsets / 2 - shift_subap
         distance = x[..., None] - self._pupil.coordinates
         near, far = ((distance + sign * half) * self._pupil.sampling for sign in (1.0, -1.0))
         kernel = np.sinc(far) + np.sinc(near) + 1j * (_half_plane(near) - _half_plane(far))

@@ -1,8 +1,8 @@
 """How the telescope departs from its drawing.
 
 One record for every plant. A calibration must survive all of it, so each is an option with a
-default. ``realistic`` is a mix of them all, except for errors of the modes' shapes: those rehearse
-a bench whose model is poor.
+default. ``realistic`` is a mix of them all, except for errors of the modes' shapes, which rehearse
+a bench whose model is poor, and for pupil images beside the pixel grid.
 """
 
 from __future__ import annotations
@@ -63,6 +63,14 @@ class Imperfections:
 
     model_error: float = 0.0
     """Error of every mode's shape, a smooth pattern of its own: RMS gradient over the mode's."""
+
+    image_offsets_px: tuple[float, ...] = ()
+    """Displacement x, y of each pupil image of a pyramid from its place on the pixel grid, detector
+    pixels, of the images at -x -y, +x -y, -x +y, +x +y. Their mean would be a shift of the
+    registration and is taken out. Empty if the images lie on the grid."""
+
+    image_offset_rms_px: float = 0.0
+    """RMS of the eight displacements, detector pixels, if they are drawn at random."""
 
 
 SETS = {
@@ -160,6 +168,23 @@ class SlopeErrors:
             read = slopes + signals_of_slopes(turned - before, self.recipe.kind)
         read[np.tile(self.silent, self.recipe.kind.n_planes)] = 0.0
         return np.asarray(read)
+
+
+def image_offsets(imperfections: Imperfections, rng: np.random.Generator) -> Array | None:
+    """Return the displacements (x, y) of the four pupil images ``(4, 2)``, detector pixels.
+
+    Of the images at -x -y, +x -y, -x +y, +x +y; their mean is 0. None if they lie on the pixel
+    grid.
+    """
+    given, rms_px = imperfections.image_offsets_px, imperfections.image_offset_rms_px
+    drawn = rng.standard_normal((4, 2))
+    if given:
+        offsets = np.array(given).reshape(4, 2)
+        return np.asarray(offsets - offsets.mean(axis=0))
+    if rms_px == 0.0:
+        return None
+    drawn -= drawn.mean(axis=0)
+    return np.asarray(drawn * (rms_px / np.sqrt(np.mean(drawn**2))))
 
 
 _PATTERN_ORDER = 3

@@ -24,6 +24,7 @@ from sim_rtc.telescope.imperfections import (
     ShapeErrors,
     SlopeErrors,
     distorted,
+    image_offsets,
     non_common_path,
     true_sensor,
 )
@@ -107,6 +108,9 @@ class Plant(ABC):
     sensor_opd_m: Array32
     """``(n_points,)`` static OPD that the sensor sees and the science does not."""
 
+    image_offsets_px: Array | None = None
+    """``(4, 2)`` displacement (x, y) of each pupil image; None if they lie on the pixel grid."""
+
     @abstractmethod
     def optics(self, alpha: Misregistration) -> Optics:
         """Return the optics at ``alpha``; takes seconds."""
@@ -142,7 +146,7 @@ class SimulatedPlant(Plant):
         """Take the pupil as it is drawn."""
         imperfections = made.get("imperfections") or Imperfections()
         scene = made.get("scene") or Scene()
-        uneven_rng, position_rng, pixel_rng, path_rng, shape_rng = made["rng"].spawn(5)
+        uneven_rng, position_rng, pixel_rng, path_rng, *later_rngs = made["rng"].spawn(6)
         self._instrument = instrument
         self._passes = np.float32(scene.passes)
         width_m = instrument.subaperture_m
@@ -159,8 +163,9 @@ class SimulatedPlant(Plant):
         faults = made.get("faults") or MirrorFaults()
         self._weights = np.column_stack(disobedient(self._surface, strokes, faults))
         self._shape_errors = ShapeErrors(
-            pupil.lit, strokes.shape[1], imperfections.model_error, shape_rng
+            pupil.lit, strokes.shape[1], imperfections.model_error, later_rngs[0]
         )
+        self.image_offsets_px = image_offsets(imperfections, later_rngs[1])
         self._points = distorted(pupil.points, pupil.weights, imperfections)
         self.points_m = self._points * width_m
         self.pitch_m = width_m / pupil.sampling

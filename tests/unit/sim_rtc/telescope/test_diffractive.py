@@ -361,3 +361,53 @@ def test_the_loop_closes_on_it(plant, small_instrument, small_basis):
             kept.append(np.sqrt(weights @ (residual - weights @ residual) ** 2))
     assert np.mean(left[10:]) < 1.35 * np.mean(fitting[10:])
     assert left[0] > 3 * np.mean(fitting)
+
+
+def test_images_displaced_alike_are_images_shifted(pupil, small_instrument):
+    wfs, (opd_m,) = small_instrument.wfs, phases(pupil, 100e-9)
+    offset = (0.12, -0.07)
+    apart = DiffractivePyramid(wfs, pupil, offsets_subap=np.tile(offset, (2, 2, 1)))
+    together = DiffractivePyramid(wfs, pupil, offset)
+    light = together.images(opd_m)
+    np.testing.assert_allclose(apart.images(opd_m), light, rtol=0, atol=2e-5 * light.max())
+
+
+def test_one_image_alone_is_displaced_along_its_own_axes(pupil, small_instrument):
+    """Side along y 0, side along x 1: the image at +x -y moves by its (x, y), the others stay."""
+    wfs, (opd_m,) = small_instrument.wfs, phases(pupil, 100e-9)
+    offsets = np.zeros((2, 2, 2))
+    offsets[0, 1] = (0.3, 0.1)
+    light = DiffractivePyramid(wfs, pupil, offsets_subap=offsets).images(opd_m)
+    at_rest = DiffractivePyramid(wfs, pupil).images(opd_m)
+    moved = DiffractivePyramid(wfs, pupil, (0.3, 0.1)).images(opd_m)
+    expected = at_rest.copy()
+    expected[0, :, 1] = moved[0, :, 1]
+    np.testing.assert_allclose(light, expected, rtol=0, atol=2e-5 * light.max())
+
+
+def test_displacements_of_the_images_reach_the_light(small_instrument, small_basis):
+    given = (0.1, 0.0, -0.1, 0.2, 0.0, -0.1, 0.0, -0.1)  # their mean is 0
+    changes = replace(PERFECT, image_offsets_px=given)
+    made = DiffractivePlant(
+        small_instrument, small_basis, rng=np.random.default_rng(1), imperfections=changes
+    )
+    ideal = DiffractivePlant(
+        small_instrument, small_basis, rng=np.random.default_rng(1), imperfections=PERFECT
+    )
+    np.testing.assert_allclose(made.image_offsets_px, np.reshape(given, (4, 2)))
+    assert ideal.image_offsets_px is None
+    images, places = made.optics(TURNED).images, ideal.optics(TURNED).images
+    wider = binned(small_instrument, 2)
+    coarse = DiffractivePlant(
+        wider, small_basis, binning=2, rng=np.random.default_rng(1), imperfections=changes
+    )
+    n = np.arange(images.shape[1])
+    for (y, x), (to_x, to_y) in zip(np.ndindex(2, 2), made.image_offsets_px, strict=True):
+        for axis, offset in ((0, to_x), (1, to_y)):
+            after, before = (light[y, :, x].sum(axis=axis) for light in (images, places))
+            moved = after @ n / after.sum() - before @ n / before.sum()
+            # the pupil fills the grid: the light that leaves it counts no more
+            low, high = sorted((0.7 * offset, offset))
+            assert low - 0.005 < moved < high + 0.005
+    # a pixel of the finest sensor is half a subaperture of the binned one
+    np.testing.assert_allclose(coarse._sensor._offsets_subap, np.reshape(given, (2, 2, 2)) / 2)

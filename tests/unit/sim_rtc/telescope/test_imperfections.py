@@ -15,6 +15,7 @@ from sim_rtc.telescope.imperfections import (
     Imperfections,
     SlopeErrors,
     distorted,
+    image_offsets,
     non_common_path,
 )
 from sim_rtc.telescope.linear import LinearPlant
@@ -43,14 +44,14 @@ def matrix(instrument, basis, **changes):
     return plant(instrument, basis, **changes).optics(ALIGNED).slopes_per_command
 
 
-def test_the_realistic_mix_has_every_imperfection_but_a_wrong_model():
+def test_the_realistic_mix_has_every_imperfection_but_these():
     ideal, realistic = SETS["ideal"], SETS["realistic"]
     same = [
         f.name
         for f in fields(Imperfections)
         if getattr(ideal, f.name) == getattr(realistic, f.name)
     ]
-    assert same == ["model_error"]
+    assert same == ["model_error", "image_offsets_px", "image_offset_rms_px"]
     assert SETS["usual"] == Imperfections()
 
 
@@ -232,6 +233,19 @@ def test_a_model_error_is_that_share_of_every_modes_slopes(small_instrument, sma
     alike = wrong / np.linalg.norm(wrong, axis=0)
     others = (alike.T @ alike)[~np.eye(small_basis.n_modes, dtype=np.bool_)]
     assert np.sqrt(np.mean(others**2)) < 0.3  # each mode has an error of its own
+
+
+def test_displacements_of_images_have_their_rms_and_no_mean():
+    rng = np.random.default_rng(1)
+    assert image_offsets(IDEAL, rng) is None
+    for rms_px in (0.05, 0.3):
+        drawn = image_offsets(replace(IDEAL, image_offset_rms_px=rms_px), rng)
+        assert drawn.shape == (4, 2)
+        np.testing.assert_allclose(drawn.mean(axis=0), 0.0, atol=1e-15)
+        assert np.sqrt(np.mean(drawn**2)) == pytest.approx(rms_px)
+    given = replace(IDEAL, image_offsets_px=(0.1, 0.2, 0.3, 0.2, 0.1, 0.2, 0.1, 0.2))
+    found = image_offsets(given, rng)
+    np.testing.assert_allclose(found, [[-0.05, 0], [0.15, 0], [-0.05, 0], [-0.05, 0]], atol=1e-15)
 
 
 def test_model_errors_move_with_the_mirror(small_instrument, small_basis):

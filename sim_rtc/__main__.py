@@ -23,6 +23,7 @@ from sim_rtc.faults import ComputerFaults, FaultPlan
 from sim_rtc.link.link import Link
 from sim_rtc.link.replay import Replay
 from sim_rtc.options import Options, parse_options
+from sim_rtc.rehearsal import write_live_instrument
 from sim_rtc.telescope.measured import MeasuredPlant
 from sim_rtc.truth import TruthRecorder, write_snapshot
 
@@ -42,6 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _build_and_run(options: Options, stopped: threading.Event) -> int:
     if options.replay is not None:
         return _replay(options.replay, options, stopped)
+    if options.write_instrument is not None:
+        write_live_instrument(options.instrument, options.write_instrument, options.given_modes)
+        return 0
     instrument = load_instrument(options.instrument)
     _check_writable(options.truth)
     if options.held_rate and options.plant != "diffractive":

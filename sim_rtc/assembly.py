@@ -34,6 +34,7 @@ from sim_rtc.computer.reconstructors import (
 from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
 from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_motion
 from sim_rtc.options import Options
+from sim_rtc.rehearsal import with_modes
 from sim_rtc.telescope.atmosphere import fried_parameter_m, frozen_layers
 from sim_rtc.telescope.detector import Detector, PixelDetector, binned
 from sim_rtc.telescope.diffractive import DiffractivePlant
@@ -147,7 +148,7 @@ def at_held_rate(options: Options, instrument: Instrument) -> Options:
 
     Where that is too low for a dither, the loop keeps the rate asked for, in slow motion.
     """
-    instrument = in_sensor_mode(options, instrument)
+    instrument = _supported(options, instrument)
     n_modes = instrument.modes.n_modes
     n_valid = int(rtc_valid_subapertures(instrument).sum())
     one_frame_s = frame_s(
@@ -260,11 +261,13 @@ def build_telescope(
 def _supported(options: Options, instrument: Instrument) -> Instrument:
     """Return the instrument in the mode of its sensor that is simulated.
 
-    A measured plant sends what was measured, whatever its order, axes and modes.
+    A measured plant sends what was measured, whatever its order and axes.
     """
-    if options.plant != "measured":
-        check_supported(instrument)
-    return in_sensor_mode(options, instrument)
+    instrument = in_sensor_mode(options, instrument)
+    if options.plant == "measured":
+        return with_modes(instrument, options.given_modes)
+    check_supported(instrument)
+    return instrument
 
 
 def build_detector(

@@ -71,6 +71,18 @@ class Options:
         "(default: that of the instrument file, or 8 m if that is a bench of less than 0.5 m)",
         within(0.01, 100.0),
     )
+    given_modes: int | None = option(
+        "--modes N",
+        "with --plant measured and the actuators of an instrument file as its basis: number of "
+        "Karhunen-Loeve modes that take their place (default: half of the actuators)",
+        count(2),
+    )
+    write_instrument: Path | None = option(
+        "--write-instrument FILE",
+        "with --plant measured: write the instrument file with which the service is run, without "
+        "detector frames and unknown strokes, and end",
+        Path,
+    )
     alpha: Misregistration | None = several(
         "--alpha X,Y,ROT_DEG,MAG",
         "true registration (default: at random, |shift| <= 0.2, 0.3 deg, 0.5 %%); its anamorphosis "
@@ -605,6 +617,8 @@ class Options:
                 "--dataset": self.dataset,
                 "--own-matrix": self.own_matrix,
                 "--sky-diameter": self.sky_diameter_m,
+                "--modes": self.given_modes,
+                "--write-instrument": self.write_instrument,
             }
             _refuse_given(options, "expected --plant measured beside it")
             return

@@ -70,6 +70,9 @@ class Circumstances:
     across_subap: float = TOLERANCE_ACROSS_SUBAP
     """Subapertures across the pupil."""
 
+    measured_plant: bool = False
+    """The plant is a measured matrix, whose true registration nobody knows."""
+
     refusal: str | None = None
     """Why the last refused window was; None: not known."""
 
@@ -156,7 +159,7 @@ def make_report(
         report.alarms = [f"{alarm['name']}: {alarm['text']}" for alarm in state["alarms"]]
         report.swaps = truth.swaps
         _count(report, reconstructors)
-        _stages(report, reconstructors, truth)
+        _stages(report, reconstructors, truth, measured_plant=circumstances.measured_plant)
         _compare(report, state, truth)
         if circumstances.unanswered_s > LONG_S:
             report.failures.append(
@@ -222,7 +225,14 @@ def _count(report: Report, reconstructors: list[View]) -> None:
     report.reconstructors_rejected_by_rtc = sum(r["state"] == "rejected" for r in own)
 
 
-def _stages(report: Report, reconstructors: list[View], truth: TruthFile) -> None:
+def _stages(
+    report: Report, reconstructors: list[View], truth: TruthFile, *, measured_plant: bool
+) -> None:
+    """Fill in the stages of the loop, and how the wavefront error compares with the start.
+
+    A measured plant begins with its own reconstructor: the service's first one is compared with it,
+    too, where no modes were added.
+    """
     foreign = [r for r in reconstructors if r["parent"] is None]
     applied = [r for r in reconstructors if r["applied_frame_seq"] is not None]
     if foreign:
@@ -238,11 +248,10 @@ def _stages(report: Report, reconstructors: list[View], truth: TruthFile) -> Non
         # one applied just before the end has no wavefront error yet
         seen = [stage for stage in larger if stage.wavefront_error_nm is not None]
         report.target_modes = (seen or larger)[-1]
-        before_nm, after_nm = (
-            stage.wavefront_error_nm for stage in (report.start, report.target_modes)
-        )
-        if before_nm and after_nm:
-            report.wavefront_ratio = before_nm / after_nm
+    last = report.target_modes if larger or not measured_plant else report.first_update
+    before_nm, after_nm = (stage.wavefront_error_nm for stage in (report.start, last))
+    if before_nm and after_nm:
+        report.wavefront_ratio = before_nm / after_nm
 
 
 def _stage(record: View, truth: TruthFile) -> Stage:
@@ -257,35 +266,61 @@ def _stage(record: View, truth: TruthFile) -> Stage:
 
 def _compare(report: Report, state: View, truth: TruthFile) -> None:
     known, last = state["registration"], truth.last
-    if last is not None:
+    if last is not None and last[PARAMETERS[0]] is not None:
         report.true_alpha = {name: last[name] for name in PARAMETERS}
-    if known is None or report.true_alpha is None:
+    if known is None:
         return
-    true = report.true_alpha
     report.estimated_alpha, report.sigma = known["alpha"], known["sigma"]
-    report.floor = known["floor"]
+    report.floor, true = known["floor"], report.true_alpha
+    if true is None:
+        return
     report.error = {name: known["alpha"][name] - true[name] for name in PARAMETERS}
     report.error_in_sigma = {name: report.error[name] / known["sigma"][name] for name in PARAMETERS}
 
 
 def _judge(report: Report, circumstances: Circumstances) -> None:
     """Say in words everything that is not as it should be."""
-    fail, wanted = report.failures.append, circumstances.wanted_ratio
-    report.failures += _estimate_failures(report, circumstances.across_subap)
-    start, first, target = report.start, report.first_update, report.target_modes
-    if not _recovered(start.worst_pole_radius, first.worst_pole_radius):
-        fail("the stability margin has not recovered")
-    if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
-        fail("the wavefront error with more modes is not below that of the start")
-    elif report.wavefront_ratio is not None and report.wavefront_ratio < wanted:
-        fail(
-            f"the wavefront error of the start is {report.wavefront_ratio:.2f} times that with "
-            f"more modes, expected {wanted:g} times"
-        )
+    judge = _failures_on_measured_plant if circumstances.measured_plant else _failures
+    report.failures += judge(report, circumstances)
     for swap in report.swaps:
         if swap["frames_skipped"]:
-            fail(f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}")
+            report.failures.append(
+                f"{swap['frames_skipped']} frames skipped at the swap to {swap['cm_id']}"
+            )
     report.failures += [f"alarm {text}" for text in report.alarms if not _is_slowness(text)]
+
+
+def _failures(report: Report, circumstances: Circumstances) -> list[str]:
+    """Return what is not as it should be of estimate and loop, where the truth is known."""
+    failures = _estimate_failures(report, circumstances.across_subap)
+    start, first, target = report.start, report.first_update, report.target_modes
+    if not _recovered(start.worst_pole_radius, first.worst_pole_radius):
+        failures.append("the stability margin has not recovered")
+    if not _less(target.wavefront_error_nm, start.wavefront_error_nm):
+        failures.append("the wavefront error with more modes is not below that of the start")
+        return failures
+    ratio, wanted = report.wavefront_ratio, circumstances.wanted_ratio
+    if ratio is not None and ratio < wanted:
+        failures.append(
+            f"the wavefront error of the start is {ratio:.2f} times that with more modes, expected "
+            f"{wanted:g} times"
+        )
+    return failures
+
+
+def _failures_on_measured_plant(report: Report, circumstances: Circumstances) -> list[str]:
+    """Return what is not as it should be where the RTC began with its measured reconstructor."""
+    failures, ratio = [], report.wavefront_ratio
+    if report.estimated_alpha is None:
+        failures.append("no estimate of the registration")
+    if ratio is None:
+        failures.append("no reconstructor of the service was in use for long enough")
+    elif ratio < circumstances.wanted_ratio:
+        failures.append(
+            f"the wavefront error is {1.0 / ratio:.2f} times that of the measured matrix' own "
+            f"reconstructor, expected at most {1.0 / circumstances.wanted_ratio:.2f} times"
+        )
+    return failures
 
 
 def _tolerances(across_subap: float) -> dict[str, float]:
@@ -387,6 +422,8 @@ def strehl_ratio(error_nm: float, wavelength_nm: float = 1650.0) -> float:
 
 def _row(report: Report, name: str) -> str:
     true = report.true_alpha
+    if true is None and report.estimated_alpha is not None and report.sigma is not None:
+        return f"  not known {report.estimated_alpha[name]:+14.5f} {report.sigma[name]:9.5f}"
     if true is None:
         return "  not known"
     if report.estimated_alpha is None or report.sigma is None or report.error is None:

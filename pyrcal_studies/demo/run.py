@@ -22,8 +22,12 @@ from pyrcal_studies.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, T
 from service.config.instrument_schema import InstrumentFile, SlopesTable, read_instrument_file
 from service.errors import ConfigurationError, shown
 from service.model.kinds import KarhunenLoeve, LoopFacts
+from sim_rtc.rehearsal import write_live_instrument
 
 LOG = "service.log"
+LIVE_INSTRUMENT = "instrument.toml"
+"""Instrument file of the service where the plant is a measured matrix, in the demo's folder."""
+
 OWN = "flao-lbt"
 """The instrument of the demo unless another is asked for."""
 
@@ -34,6 +38,10 @@ other telescope, whose modes leave what they leave."""
 FEW_MODES, FEW_RATIO = 170, 1.05
 """Of a telescope with fewer modes, which begins with seven tenths of them: all of them leave 1.17
 times less than that (variance by N^(-√3/2), Noll 1976), and a third of it in decibels is asked."""
+
+MEASURED_RATIO = 1 / 1.1
+"""Of a measured plant, which begins with the reconstructor of the measurement itself: the service's
+may leave a tenth more."""
 
 PLACE = """\
 The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
@@ -70,6 +78,8 @@ def run_demo(options: argparse.Namespace) -> int:
     service_words, sim_words = _commands(options)
     _check(options, sim_words)
     _emptied(options.dir)
+    if _is_measured(options):
+        write_live_instrument(options.instrument, options.dir / LIVE_INSTRUMENT)
     url = f"http://127.0.0.1:{options.port}"
     _say(f"service    pyrcal {' '.join(service_words)}")
     _say(f"simulator  pyrcal sim {' '.join(sim_words)}")
@@ -103,6 +113,11 @@ def run_demo(options: argparse.Namespace) -> int:
     if options.json is not None:
         options.json.write_text(report.to_json() + "\n", encoding="utf-8")
     return 0 if report.good else 1
+
+
+def _is_measured(options: argparse.Namespace) -> bool:
+    """Return whether the plant is a measured matrix, whose true registration nobody knows."""
+    return bool(options.plant == "measured")
 
 
 def _is_far(options: argparse.Namespace) -> bool:
@@ -159,6 +174,7 @@ def _promise(options: argparse.Namespace) -> Promise:
         real_time=options.plant != "diffractive" and large is None,
         wanted_ratio=_wanted_ratio(options),
         across_subap=_across_subap(read_instrument_file(options.instrument)),
+        measured_plant=_is_measured(options),
         held_rate=options.instrument != OWN,
         large=large is not None,
         asked_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
@@ -166,6 +182,8 @@ def _promise(options: argparse.Namespace) -> Promise:
 
 
 def _wanted_ratio(options: argparse.Namespace) -> float:
+    if _is_measured(options):
+        return MEASURED_RATIO
     if not _is_far(options) or _too_large(options) is not None:
         return 1.0
     if options.instrument == OWN:
@@ -230,7 +248,8 @@ def _emptied(directory: Path) -> None:
 def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     endpoint = f"tcp/127.0.0.1:{options.zenoh_port}"
     service = ["run", "--mode", "auto", "--listen", endpoint, "--port", str(options.port)]
-    service += ["--data-dir", str(options.dir / "data"), "--instrument", options.instrument]
+    live = str(options.dir / LIVE_INSTRUMENT) if _is_measured(options) else options.instrument
+    service += ["--data-dir", str(options.dir / "data"), "--instrument", live]
     simulator = ["--connect", endpoint, "--seed", str(options.seed)]
     simulator += ["--instrument", options.instrument]
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]

@@ -134,6 +134,9 @@ class Promise:
     across_subap: float = TOLERANCE_ACROSS_SUBAP
     """Subapertures across the pupil."""
 
+    measured_plant: bool = False
+    """The plant is a measured matrix, whose true registration nobody knows."""
+
     held_rate: bool = False
     """The simulator runs at the highest rate that this machine holds."""
 
@@ -190,6 +193,7 @@ class TelemetryObserver:
             endings=self._endings(),
             wanted_ratio=self._promise.wanted_ratio,
             across_subap=self._promise.across_subap,
+            measured_plant=self._promise.measured_plant,
             refusal=refusal,
         )
         return make_report(self._state, self._reconstructors, self._truth, circumstances)

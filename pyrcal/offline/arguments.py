@@ -342,8 +342,12 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
         ("synim", "the same, of SynIM", (own, *_REPORTED)),
         (
             "cacao",
-            "from modesWFS, modesDM, wfsmask, dmmask",
-            (words("folder CONF", type=Path), *_REPORTED),
+            "from an example folder, or the conf folder of a loop",
+            (
+                words("folder CONF", type=Path),
+                words("--response NAME", "such as loRM; default: of single actuators if there is"),
+                *_REPORTED,
+            ),
         ),
         ("pyrtc", "from calibrations of pyRTC 2, or bare arrays", (named, unit, *_REPORTED)),
         ("aot", "from an AOT file", (words("file FILE.fits", type=Path), unit, *_REPORTED)),
@@ -354,17 +358,18 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
 
 _REPORTED = (
     words("--diameter-m D", "of the pupil", type=float, required=True),
-    words("--sensor KIND", "default %(default)s", choices=tuple(KINDS), default=next(iter(KINDS))),
+    words("--sensor KIND", "default: as the files say, else pyramid", choices=tuple(KINDS)),
     words(
         "--stop STOP",
         "what limits the beam, default %(default)s",
         choices=("telescope", "mirror"),
         default="telescope",
     ),
-    words("--obscuration RATIO", "linear, default none", type=float, default=0.0),
+    words("--obscuration RATIO", "linear; default: read from the mask", type=float),
     words("--wavelength-m W", "default: unknown", type=float),
     words("--modulation RADIUS", "of a pyramid, λ/D; default: unknown", type=float),
     words("--pupil-subap N", "pupil's diameter, subapertures; default the mask's", type=float),
+    words("--pixels-per-subap N", "of camera frames; default: by the actuators", type=_count),
 )
 """What no file says."""
 

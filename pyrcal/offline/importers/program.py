@@ -10,8 +10,9 @@ from pathlib import Path
 from pyrcal.offline.importers import oopao
 from pyrcal.offline.importers.aot import from_aot
 from pyrcal.offline.importers.cacao import from_cacao
-from pyrcal.offline.importers.files import Reported, by_role, from_arrays
+from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
+from pyrcal.offline.importers.layouts import by_role
 from pyrcal.offline.importers.pyrtc import RECORD, calibration_of
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.importers.specula import UNIT, from_specula
@@ -63,7 +64,7 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
 
 
 def _cacao(options: argparse.Namespace) -> Imported:
-    return from_cacao(options.folder, _reported(options))
+    return from_cacao(options.folder, _reported(options), options.response)
 
 
 def _aot(options: argparse.Namespace) -> Imported:
@@ -79,6 +80,7 @@ def _reported(options: argparse.Namespace) -> Reported:
         wavelength_m=options.wavelength_m,
         modulation_lambda_over_d=options.modulation,
         pupil_diameter_subap=options.pupil_subap,
+        pixels_per_subaperture=options.pixels_per_subap,
         centroid="gradient" if options.source == "synim" else None,
         unit=getattr(options, "unit", UNIT if options.source in {"specula", "synim"} else None),
     )
@@ -106,6 +108,8 @@ def main(options: argparse.Namespace) -> int:
     """
     imported = IMPORTERS[options.source](options)
     saved = imported.save(options.output)
+    for line in imported.inventory:
+        print(line)
     print(f"{saved.instrument}: {imported.source}")
     shapes = ", ".join(f"{name} {values.shape}" for name, values in imported.arrays.items())
     print(f"{saved.matrix}: {shapes}")

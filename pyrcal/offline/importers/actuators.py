@@ -65,7 +65,7 @@ def read_mirror(
             "list of actuators does not say where they are: give positions=FILE, (n_actuators, 2)"
         )
     if strokes is not None:
-        _combine(mirror, strokes, notes)
+        combine(mirror, strokes, notes)
     return mirror
 
 
@@ -123,7 +123,7 @@ def _tabulated(given: Array, diameter_m: float, *, is_basis: bool, notes: list[s
     )
 
 
-def _combine(mirror: Mirror, strokes: Array, notes: list[str]) -> None:
+def combine(mirror: Mirror, strokes: Array, notes: list[str]) -> None:
     """Make the mirror's modes combinations of its actuators; unusable ones are left out."""
     n_actuators = mirror.n_actuators
     found = np.asarray(strokes)

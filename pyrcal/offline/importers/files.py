@@ -26,7 +26,7 @@ from pyrcal.offline.importers.imported import (
 )
 from pyrcal.offline.importers.layouts import ROLES, maps_of, mask_of
 from pyrcal.offline.pupil_width import answers_of, seen_pupil
-from service.errors import MatrixError
+from service.errors import ConfigurationError, MatrixError
 
 UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of the commands."""
@@ -75,6 +75,9 @@ class Reported:
     unit: str | None = None
     """Of the commands, OPD; None if unknown, so that only shapes are compared."""
 
+    columns: Array | None = None
+    """``(n_columns,)`` basis index of each column; None: the first ones."""
+
     @property
     def kind(self) -> str:
         """Kind of the sensor."""
@@ -82,7 +85,7 @@ class Reported:
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class _Signals:
+class Signals:
     """The sensor's part of an import."""
 
     table: dict[str, Any]
@@ -99,6 +102,7 @@ class _Signals:
 
     @property
     def n_columns(self) -> int:
+        """Number of columns of the matrix."""
         return int(self.arrays["interaction_matrix"].shape[self.columns])
 
     @property
@@ -135,20 +139,15 @@ def from_arrays(
             "or a file of its own"
         )
     mirror = read_mirror(source, arrays, reported.diameter_m, notes)
-    frames = _frames(source, arrays, reported)
+    frames = read_frames(source, arrays, reported.kind)
     if frames is None:
-        signals = _slopes(source, arrays, reported, mirror.n_modes, notes)
+        signals = read_slopes(source, arrays, mirror.n_modes, notes)
     else:
         table, kept, ratio = describe_frames(
             frames, mirror.n_actuators, reported.pixels_per_subaperture, source, notes
         )
-        signals = _Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
-        if signals.n_columns > mirror.n_modes:
-            raise MatrixError(
-                f"matrix: found {signals.n_columns} frames, expected at most one for each of "
-                f"{mirror.n_modes} modes"
-            )
-    modes = _usable_modes(signals, mirror, notes, column_numbers)
+        signals = Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
+    modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
     if reported.unit is None:
         mirror.table["stroke"] = UNKNOWN
         notes.append("the unit of the commands is unknown: only shapes are compared")
@@ -185,7 +184,7 @@ def from_arrays(
     )
 
 
-def _frames(source: str, arrays: Mapping[str, Array], reported: Reported) -> Frames | None:
+def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames | None:
     """Return the response as camera frames; None if it is one of slopes."""
     matrix = np.asarray(arrays["matrix"])
     light, valid = arrays.get("light"), arrays.get("valid")
@@ -201,9 +200,9 @@ def _frames(source: str, arrays: Mapping[str, Array], reported: Reported) -> Fra
         None if light is None else _plane(light),
         None if valid is None else _plane(valid),
     )
-    if frames is not None and reported.kind != "pyramid":
+    if frames is not None and kind != "pyramid":
         raise MatrixError(
-            f"{source}: matrix: found shape {matrix.shape}, camera frames; of a {reported.kind} "
+            f"{source}: matrix: found shape {matrix.shape}, camera frames; of a {kind} "
             "only slopes are read"
         )
     return frames
@@ -215,9 +214,16 @@ def _plane(values: Array) -> Array:
     return found[0] if found.ndim == 3 and len(found) == 1 else found
 
 
-def _slopes(
-    source: str, arrays: Mapping[str, Array], reported: Reported, n_modes: int, notes: list[str]
-) -> _Signals:
+def read_slopes(
+    source: str, arrays: Mapping[str, Array], n_modes: int, notes: list[str]
+) -> Signals:
+    """Return a matrix of slopes and its mask.
+
+    Raises
+    ------
+    MatrixError
+        If there is no mask and the matrix is no cube of maps, or a shape fits no layout.
+    """
     given, found = arrays.get("valid"), np.asarray(arrays["matrix"])
     if given is None and found.ndim == 2:
         side = round(found.shape[0] ** 0.5)
@@ -254,7 +260,7 @@ def _slopes(
     width: dict[str, Any] = {}
     if len(grid) - aperture.diameter_subap > NARROWER_SUBAP:
         width = {"pupil_diameter_subap": round(aperture.diameter_subap, 2)}
-    return _Signals(
+    return Signals(
         table={
             "n_subapertures": len(grid),
             "valid_subapertures": Dataset("valid_subapertures"),
@@ -315,38 +321,85 @@ def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
     return others[0] if len(others) == 1 and others[0] < n_modes else n_modes
 
 
-def _usable_modes(
-    signals: _Signals, mirror: Mirror, notes: list[str], numbers: Array | None
+def usable_modes(
+    signals: Signals,
+    mirror: Mirror,
+    columns: Array | None,
+    notes: list[str],
+    numbers: Array | None = None,
 ) -> dict[str, Array]:
-    """Leave out columns and modes that cannot be used, and return ``modes`` if any are missing."""
-    n_columns = signals.n_columns
-    if mirror.n_modes > n_columns:
-        notes.append(f"the matrix is of the first {n_columns} of {mirror.n_modes} modes")
-    columns, shapes = find_defects(signals.by_column), mirror.defects
-    notes += explain_defects(columns, "column", numbers)
+    """Leave out columns and modes that cannot be used; return the basis index of each column left.
+
+    Parameters
+    ----------
+    signals, mirror
+        Changed in place.
+    columns
+        ``(n_columns,)`` basis index of each column; None: the first ones.
+    notes
+        What is left out is added.
+    numbers
+        Numbers of the columns in their file; None: they count from 0.
+
+    Raises
+    ------
+    ConfigurationError
+        If ``columns`` are not of the matrix and the basis.
+    MatrixError
+        If no column is left.
+    """
+    n_columns, n_modes = signals.n_columns, mirror.n_modes
+    indices = _indices(columns, n_columns, n_modes, notes)
+    dead, shapes = find_defects(signals.by_column), mirror.defects
+    notes += explain_defects(dead, "column", numbers)
     notes += explain_defects(shapes, "actuator" if mirror.is_zonal else "mode")
-    unusable = {n for n in columns if mirror.is_zonal} | set(shapes)
-    kept = np.array([n for n in range(mirror.n_modes) if n not in unusable], dtype=np.intp)
+    unusable = set(shapes)
+    if mirror.is_zonal and mirror.per_mode:
+        unusable |= {int(indices[k]) for k in dead}
+    kept = np.array([n for n in range(n_modes) if n not in unusable], dtype=np.intp)
     measured = np.array(
-        [n for n in range(n_columns) if n not in columns and n not in shapes], dtype=np.intp
+        [k for k in range(n_columns) if k not in dead and int(indices[k]) not in shapes],
+        dtype=np.intp,
     )
     if not len(measured):
         raise MatrixError("matrix: found no column that can be used, expected some")
     if len(measured) < n_columns:
         signals.keep(measured)
     arrays: dict[str, Array] = {}
-    if len(kept) < mirror.n_modes or numbers is not None:
+    if len(kept) < n_modes or numbers is not None:
         name = "kept_actuators" if mirror.is_zonal else "kept_modes"
         arrays[name] = kept if numbers is None else np.asarray(numbers)[kept]
         mirror.keep(kept)
     position = {int(n): k for k, n in enumerate(kept)}
-    indices = np.array([position[int(n)] for n in measured])
-    if not np.array_equal(indices, np.arange(len(kept))):
-        arrays["modes"] = indices
+    left = np.array([position[int(indices[k])] for k in measured])
+    if not np.array_equal(left, np.arange(len(kept))):
+        arrays["modes"] = left
     return arrays
 
 
-def _sensor(reported: Reported, signals: _Signals, notes: list[str]) -> dict[str, Any]:
+def _indices(columns: Array | None, n_columns: int, n_modes: int, notes: list[str]) -> Array:
+    """Return the basis index of each column."""
+    if columns is None:
+        if n_columns > n_modes:
+            raise MatrixError(f"matrix: found {n_columns} columns, expected at most {n_modes}")
+        if n_modes > n_columns:
+            notes.append(
+                f"the matrix is of the first {n_columns} of {n_modes} modes; --modes if of others"
+            )
+        return np.arange(n_columns)
+    if len(columns) != n_columns:
+        raise ConfigurationError(
+            f"--modes: found {len(columns)} numbers, expected one for each of the {n_columns} "
+            "columns of the matrix"
+        )
+    if max(columns) >= n_modes:
+        raise ConfigurationError(
+            f"--modes: found {max(columns)}, expected numbers below {n_modes}, the number of modes"
+        )
+    return columns
+
+
+def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str, Any]:
     """Return ``[wfs]``."""
     table: dict[str, Any] = {
         "kind": reported.kind,

@@ -146,3 +146,9 @@ def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
         if there:
             found[role] = arrays[there[0]]
     return found
+
+
+def role_of_name(name: str) -> str | None:
+    """Return the role that an array of this name has; None if the name says nothing."""
+    known = (role for role, names in ROLES.items() if name.lower() in {n.lower() for n in names})
+    return next(known, None)

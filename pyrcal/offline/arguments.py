@@ -330,10 +330,14 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
     folder = words("--output DIR", "folder of both files, made", type=Path, required=True)
     saved = words("file FILE.npz", "np.savez of what docs/integrate/oopao.md lists", type=Path)
     known = "files, known by what is in them"
-    roles = "a file with arrays of known names, or ROLE=FILE: matrix, valid, modes, positions, "
-    roles += "mode_to_actuator"
+    roles = "a file or folder with arrays of known names, or ROLE=FILE: matrix, valid, light, "
+    roles += "modes, positions, mode_to_actuator"
     own = words("files FILE", known, type=_role_and_path, nargs="+")
     named = words("files [ROLE=]FILE", roles, type=_role_and_path, nargs="+")
+    described = words(
+        "--instrument NAME|FILE",
+        "telescope, sensor and mirror as a packaged instrument or a file describes them",
+    )
     unit = words("--unit UNIT", "of the commands, OPD; default: unknown", choices=("m", "um", "nm"))
     sources = bring.add_subparsers(dest="source", required=True)
     for source, purpose, more in (
@@ -342,29 +346,56 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
         ("synim", "the same, of SynIM", (own, *_REPORTED)),
         (
             "cacao",
-            "from modesWFS, modesDM, wfsmask, dmmask",
-            (words("folder CONF", type=Path), *_REPORTED),
+            "from an example folder, or the conf folder of a loop",
+            (
+                words("folder CONF", type=Path),
+                words("--response NAME", "such as loRM; default: of single actuators if there is"),
+                *_REPORTED,
+            ),
         ),
-        ("pyrtc", "from calibrations of pyRTC 2, or bare arrays", (named, unit, *_REPORTED)),
+        (
+            "pyrtc",
+            "from calibrations of pyRTC 2, or bare arrays",
+            (named, unit, described, *_REPORTED),
+        ),
         ("aot", "from an AOT file", (words("file FILE.fits", type=Path), unit, *_REPORTED)),
-        ("npz", "from NumPy, FITS or HDF5 files", (named, unit, *_REPORTED)),
+        ("files", "from NumPy, FITS or HDF5 files", (named, unit, described, *_REPORTED)),
+        ("npz", "the same as files", (named, unit, described, *_REPORTED)),
     ):
         add(sources.add_parser(source, help=purpose), *more, folder)
 
 
+def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
+    """Return a reader whose refusals argparse prints as they are."""
+
+    def read(text: str) -> object:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read
+
+
 _REPORTED = (
-    words("--diameter-m D", "of the pupil", type=float, required=True),
-    words("--sensor KIND", "default %(default)s", choices=tuple(KINDS), default=next(iter(KINDS))),
+    words("--diameter-m D", "of the pupil; needed without --instrument", type=float),
+    words(
+        "--modes FIRST:END",
+        "basis index of each column, like 0:400 or 3,5,9; default the first ones",
+        type=_read_by(parse_modes),
+    ),
+    words("--sensor KIND", "default: as the files say, else pyramid", choices=tuple(KINDS)),
     words(
         "--stop STOP",
         "what limits the beam, default %(default)s",
         choices=("telescope", "mirror"),
         default="telescope",
     ),
-    words("--obscuration RATIO", "linear, default none", type=float, default=0.0),
+    words("--obscuration RATIO", "linear; default: read from the mask", type=float),
     words("--wavelength-m W", "default: unknown", type=float),
     words("--modulation RADIUS", "of a pyramid, λ/D; default: unknown", type=float),
     words("--pupil-subap N", "pupil's diameter, subapertures; default the mask's", type=float),
+    words("--pixels-per-subap N", "of camera frames; default: by the actuators", type=_count),
 )
 """What no file says."""
 
@@ -391,18 +422,6 @@ def parse_arms(text: str) -> Arms:
     from pyrcal.offline.light_rotation import Arms
 
     return Arms(angles_rad=tuple(math.radians(a) for a in angles), width_subap=width[0])
-
-
-def _read_by(parse: Callable[[str], object]) -> Callable[[str], object]:
-    """Return a reader whose refusals argparse prints as they are."""
-
-    def read(text: str) -> object:
-        try:
-            return parse(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from error
-
-    return read
 
 
 def check_files(options: argparse.Namespace) -> None:

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 _EXPECTED = "Input should be "
 
 _HDF5 = re.compile(r"(?P<path>.+):/(?P<name>.+)")
-_FITS = re.compile(r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.gz)?)(?::/?(?P<name>.+))?", re.IGNORECASE)
+_FITS = re.compile(
+    r"(?P<path>.+?\.(?:fits|fit|fts)(?:\.(?:gz|fz))?)(?::/?(?P<name>.+))?", re.IGNORECASE
+)
 _NUMPY = re.compile(r"(?P<path>.+\.npy)(?P<name>)", re.IGNORECASE)
 _FORMS = (_NUMPY, _FITS, _HDF5)
 

@@ -1,7 +1,7 @@
 """From arrays in files to an instrument and its matrix: layouts are told by shape, and checked.
 
-What the arrays are is told by role: the matrix, the valid subapertures, the modes. What no file
-says is told by whoever imports, or is unknown, and then said as unknown.
+Each array has a role: the matrix, the valid subapertures, the modes. Parameters missing from the
+files can be given as options. Otherwise they are read from the mask or marked unknown.
 """
 
 from __future__ import annotations
@@ -13,67 +13,119 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.importers.actuators import Mirror, read_mirror
+from pyrcal.offline.importers.apertures import centre_grid, find_lit, measure_aperture
+from pyrcal.offline.importers.defects import explain_defects, find_defects
+from pyrcal.offline.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.offline.importers.imported import (
     UNKNOWN,
     Array,
     Dataset,
     Imported,
     matrix_of,
-    oriented,
 )
+from pyrcal.offline.importers.layouts import ROLES, maps_of, mask_of
 from pyrcal.offline.pupil_width import answers_of, seen_pupil
-from service.errors import MatrixError
+from service.errors import ConfigurationError, MatrixError
 
 UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of the commands."""
 
-ROLES = {
-    "matrix": ("interaction_matrix", "im", "imat", "intmat", "D", "matrix"),
-    "valid": ("valid_subapertures", "valid", "mask", "valid_sub_aps", "subap_mask"),
-    "modes": ("modes", "influence_functions", "cube", "ifunc", "mode_shapes"),
-    "mode_to_actuator": ("mode_to_actuator", "M2C", "m2c"),
-    "positions": ("positions", "xy_m", "coordinates"),
-}
-"""What arrays are for, and the names by which they are known in a file of several."""
+NARROWER_SUBAP = 0.75
+"""Difference between the width of a grid and that of the pupil on it that is written down."""
+
+OBSCURED = 0.05
+"""Smallest obscuration ratio that is read from a mask."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reported:
-    """What no array says."""
+    """Parameters that no array holds."""
 
     diameter_m: float
     """Of the pupil; cubes of modes are as wide, edge to edge."""
 
-    sensor: str
-    """``pyramid`` or ``shack-hartmann``."""
+    sensor: str | None = None
+    """``pyramid`` or ``shack-hartmann``; None: as the files say, else a pyramid."""
 
     stop: str
     """``telescope`` or ``mirror``."""
 
-    obscuration_ratio: float = 0.0
-    """Linear, of the pupil."""
+    obscuration_ratio: float | None = None
+    """Linear, of the pupil; None: read from the mask."""
 
     wavelength_m: float | None = None
-    """None: unknown."""
+    """None if unknown."""
 
     modulation_lambda_over_d: float | None = None
-    """None: unknown; of a pyramid only."""
+    """None if unknown; of a pyramid only."""
 
     pupil_diameter_subap: float | None = None
     """Of the pupil's image; None: as wide as the mask."""
 
+    pixels_per_subaperture: int | None = None
+    """Of camera frames; None: as many as keep two subapertures for each actuator."""
+
     centroid: str | None = None
-    """Of a Shack-Hartmann; None: not told, as the instrument file takes it."""
+    """Of a Shack-Hartmann; None: the default of the instrument file."""
 
     order: str = "xy"
     """Of the slopes, as its user would list them; the fit finds another."""
 
     unit: str | None = None
-    """Of the commands, OPD; None: unknown, so that only shapes are compared."""
+    """Of the commands, OPD; None if unknown, so that only shapes are compared."""
+
+    columns: Array | None = None
+    """``(n_columns,)`` basis index of each column; None: the first ones."""
+
+    @property
+    def kind(self) -> str:
+        """Kind of the sensor."""
+        return self.sensor or "pyramid"
 
 
-def from_arrays(source: str, arrays: Mapping[str, Array], reported: Reported) -> Imported:
+@dataclass(slots=True, kw_only=True, eq=False)
+class Signals:
+    """The sensor's part of an import."""
+
+    table: dict[str, Any]
+    """``[wfs]``, without the numbers of its optics."""
+
+    arrays: dict[str, Array]
+    """The matrix and the mask."""
+
+    obscuration_ratio: float
+    """As the mask or the light shows it."""
+
+    columns: int
+    """Axis of the matrix along which the modes are listed."""
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns of the matrix."""
+        return int(self.arrays["interaction_matrix"].shape[self.columns])
+
+    @property
+    def by_column(self) -> Array:
+        """The matrix with its modes along the first axis."""
+        return np.moveaxis(self.arrays["interaction_matrix"], self.columns, 0)
+
+    def keep(self, columns: Array) -> None:
+        """Leave out all but these columns."""
+        kept = np.moveaxis(self.by_column[columns], 0, self.columns)
+        self.arrays["interaction_matrix"] = kept
+
+
+def from_arrays(
+    source: str,
+    arrays: Mapping[str, Array],
+    reported: Reported,
+    column_numbers: Array | None = None,
+) -> Imported:
     """Return an instrument and its matrix from arrays by role.
+
+    ``column_numbers`` are the numbers of the columns in the file they come from, for messages and
+    for the record of what was kept; None: they are all there.
 
     Raises
     ------
@@ -81,52 +133,186 @@ def from_arrays(source: str, arrays: Mapping[str, Array], reported: Reported) ->
         If a role is missing, or a shape fits no layout, or several.
     """
     notes: list[str] = []
-    for role in ("matrix", "valid"):
-        if role not in arrays and not (role == "valid" and arrays["matrix"].ndim > 2):
-            raise MatrixError(
-                f"{source}: found no {role}; expected an array named {' or '.join(ROLES[role])}, "
-                "or a file of its own"
-            )
-    given, found = arrays.get("valid"), np.asarray(arrays["matrix"])
-    valid = None if given is None else mask_of(given, notes)
-    if found.ndim > 2:
-        maps = maps_of(found, None if valid is None else len(valid), notes)
-        valid = _lit(maps, notes) if valid is None else valid
-        found = maps[:, valid].reshape(-1, maps.shape[-1])
-    if valid is None:
-        raise MatrixError(f"{source}: found no valid subapertures, expected a mask (n, n)")
-    mirror, kept, n_modes = _mirror(source, arrays, reported, notes)
-    matrix, turned = matrix_of(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
-    notes += turned
-    if n_modes > matrix.shape[1]:
-        notes.append(f"the matrix is of the first {matrix.shape[1]} of {n_modes} modes")
-        kept["modes"] = np.arange(matrix.shape[1])
+    if "matrix" not in arrays:
+        raise MatrixError(
+            f"{source}: found no matrix; expected an array named {' or '.join(ROLES['matrix'])}, "
+            "or a file of its own"
+        )
+    mirror = read_mirror(source, arrays, reported.diameter_m, notes)
+    frames = read_frames(source, arrays, reported.kind)
+    if frames is None:
+        signals = read_slopes(source, arrays, mirror.n_modes, notes)
+    else:
+        table, kept, ratio = describe_frames(
+            frames, mirror.n_actuators, reported.pixels_per_subaperture, source, notes
+        )
+        signals = Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
+    modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
     if reported.unit is None:
-        mirror["stroke"] = UNKNOWN
+        mirror.table["stroke"] = UNKNOWN
         notes.append("the unit of the commands is unknown: only shapes are compared")
     else:
-        matrix = matrix / UNITS_M[reported.unit]
-    sensor = _sensor(reported, valid, matrix, notes)
+        signals.arrays["interaction_matrix"] = (
+            signals.arrays["interaction_matrix"] / UNITS_M[reported.unit]
+        )
+    sensor = _sensor(reported, signals, notes)
+    obscuration = reported.obscuration_ratio
+    if obscuration is None:
+        seen = signals.obscuration_ratio
+        obscuration = round(seen, 3) if seen > OBSCURED else 0.0
+        if obscuration:
+            notes.append(f"obscuration_ratio = {obscuration}: read from the hole in the mask")
     return Imported(
         source=source,
         tables={
             "instrument": {
                 "name": "bench",
                 "diameter_m": reported.diameter_m,
-                "obscuration_ratio": reported.obscuration_ratio,
+                "obscuration_ratio": obscuration,
                 "stop": reported.stop,
             },
             "wfs": sensor,
-            "mirror": mirror,
-            "slopes": {"order": reported.order, "orientation": "auto"},
+            "mirror": mirror.table,
+            "slopes": {
+                # slopes made of frames have the order of the program itself
+                **({} if frames else {"order": reported.order}),
+                "orientation": "auto",
+            },
         },
-        arrays={
-            "interaction_matrix": matrix,
-            "valid_subapertures": valid.astype(np.uint8),
-            **kept,
-        },
+        arrays={**signals.arrays, **modes, **mirror.arrays},
         notes=(*notes, *(f"{key} is unknown" for key, v in sensor.items() if v == UNKNOWN)),
     )
+
+
+def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames | None:
+    """Return the response as camera frames; None if it is one of slopes."""
+    matrix = np.asarray(arrays["matrix"])
+    light, valid = arrays.get("light"), arrays.get("valid")
+    if matrix.ndim == 3:
+        try:
+            maps_of(matrix, None if valid is None else min(np.shape(valid)), [])
+        except MatrixError:
+            pass
+        else:
+            return None
+    frames = frames_of(
+        matrix,
+        None if light is None else _plane(light),
+        None if valid is None else _plane(valid),
+    )
+    if frames is not None and kind != "pyramid":
+        raise MatrixError(
+            f"{source}: matrix: found shape {matrix.shape}, camera frames; of a {kind} "
+            "only slopes are read"
+        )
+    return frames
+
+
+def _plane(values: Array) -> Array:
+    """Return a picture, of which a FITS file may have a single plane."""
+    found = np.asarray(values)
+    return found[0] if found.ndim == 3 and len(found) == 1 else found
+
+
+def read_slopes(
+    source: str, arrays: Mapping[str, Array], n_modes: int, notes: list[str]
+) -> Signals:
+    """Return a matrix of slopes and its mask.
+
+    Raises
+    ------
+    MatrixError
+        If there is no mask and the matrix is no cube of maps, or a shape fits no layout.
+    """
+    given, found = arrays.get("valid"), np.asarray(arrays["matrix"])
+    if given is None and found.ndim == 2:
+        side = round(found.shape[0] ** 0.5)
+        frames = (
+            f"; {found.shape[0]} = {side} x {side} values look like camera frames: give the mean "
+            "frame (light=FILE) or the mask of lit pixels (valid=FILE)"
+            if side**2 == found.shape[0]
+            else ""
+        )
+        raise MatrixError(
+            f"{source}: found no valid; expected an array named {' or '.join(ROLES['valid'])}, or "
+            f"a file of its own{frames}"
+        )
+    valid = None if given is None else mask_of(given, notes)
+    if found.ndim > 2:
+        maps = maps_of(found, None if valid is None else len(valid), notes)
+        if valid is None:
+            valid = find_lit(maps, notes)
+        found = maps[:, valid].reshape(-1, maps.shape[-1])
+    if valid is None:
+        raise MatrixError(f"{source}: found no valid subapertures, expected a mask (n, n)")
+    n_rows = 2 * int(valid.sum())
+    found, valid = _without_dead_rows(found, valid, n_rows, notes)
+    matrix, turned = _oriented(found, 2 * int(valid.sum()), _columns(found, valid, n_modes))
+    notes += turned
+    grid = centre_grid(valid)
+    if grid.shape != valid.shape or np.any(grid != valid):
+        notes.append(
+            f"valid: the lit subapertures are put into the middle of a grid of {len(grid)} x "
+            f"{len(grid)} instead of {len(valid)} x {len(valid)}: their order is the same"
+        )
+    aperture = measure_aperture(grid)
+    notes.append(f"valid: {int(grid.sum())} subapertures, {aperture.words}")
+    width: dict[str, Any] = {}
+    if len(grid) - aperture.diameter_subap > NARROWER_SUBAP:
+        width = {"pupil_diameter_subap": round(aperture.diameter_subap, 2)}
+    return Signals(
+        table={
+            "n_subapertures": len(grid),
+            "valid_subapertures": Dataset("valid_subapertures"),
+            **width,
+        },
+        arrays={"interaction_matrix": matrix, "valid_subapertures": grid.astype(np.uint8)},
+        obscuration_ratio=aperture.obscuration_ratio,
+        columns=1,
+    )
+
+
+def _oriented(found: Array, n_rows: int, n_columns: int) -> tuple[Array, tuple[str, ...]]:
+    """Return a matrix ``(n_slopes, n_modes)``; columns that hold NaN keep it."""
+    if found.dtype.kind != "f" or found.ndim != 2:
+        return matrix_of(found, n_rows, n_columns)
+    unknown = ~np.isfinite(found)
+    matrix, turned = matrix_of(np.where(unknown, 0.0, found), n_rows, n_columns)
+    if unknown.any():
+        matrix = np.array(matrix)
+        matrix[
+            unknown if matrix.shape == unknown.shape and found.shape[0] == n_rows else unknown.T
+        ] = np.nan
+    return matrix, turned
+
+
+def _without_dead_rows(
+    found: Array, valid: NDArray[np.bool_], n_rows: int, notes: list[str]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return matrix and mask without subapertures that give NaN or 0 whatever is poked."""
+    if found.ndim != 2 or found.dtype.kind not in "iuf" or n_rows not in found.shape:
+        return found, valid
+    turned = found.shape[0] != n_rows
+    slopes = found.T if turned else found
+    planes = slopes.reshape(2, -1, slopes.shape[1])
+    with np.errstate(invalid="ignore"):
+        silent = ~np.isfinite(planes) | (planes == 0.0)
+    dead = silent.all(axis=2).any(axis=0)
+    usable = np.isfinite(planes).any(axis=2).any(axis=0)
+    dead |= ~usable
+    if not dead.any() or dead.all():
+        return found, valid
+    places = np.argwhere(valid)[dead]
+    listed = ", ".join(f"({row}, {column})" for row, column in places[:12])
+    more = f" and {len(places) - 12} more" if len(places) > 12 else ""
+    notes.append(
+        f"valid: the subapertures at (row, column) {listed}{more} give NaN or 0 in all columns: "
+        "left out"
+    )
+    kept = valid.copy()
+    kept[tuple(places.T)] = False
+    remaining = planes[:, ~dead].reshape(-1, slopes.shape[1])
+    return (remaining.T if turned else remaining), kept
 
 
 def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
@@ -135,24 +321,101 @@ def _columns(matrix: Array, valid: NDArray[np.bool_], n_modes: int) -> int:
     return others[0] if len(others) == 1 and others[0] < n_modes else n_modes
 
 
-def _sensor(
-    reported: Reported, valid: NDArray[np.bool_], matrix: Array, notes: list[str]
-) -> dict[str, Any]:
+def usable_modes(
+    signals: Signals,
+    mirror: Mirror,
+    columns: Array | None,
+    notes: list[str],
+    numbers: Array | None = None,
+) -> dict[str, Array]:
+    """Leave out columns and modes that cannot be used; return the basis index of each column left.
+
+    Parameters
+    ----------
+    signals, mirror
+        Changed in place.
+    columns
+        ``(n_columns,)`` basis index of each column; None: the first ones.
+    notes
+        What is left out is added.
+    numbers
+        Numbers of the columns in their file; None: they count from 0.
+
+    Raises
+    ------
+    ConfigurationError
+        If ``columns`` are not of the matrix and the basis.
+    MatrixError
+        If no column is left.
+    """
+    n_columns, n_modes = signals.n_columns, mirror.n_modes
+    indices = _indices(columns, n_columns, n_modes, notes)
+    dead, shapes = find_defects(signals.by_column), mirror.defects
+    notes += explain_defects(dead, "column", numbers)
+    notes += explain_defects(shapes, "actuator" if mirror.is_zonal else "mode")
+    unusable = set(shapes)
+    if mirror.is_zonal and mirror.per_mode:
+        unusable |= {int(indices[k]) for k in dead}
+    kept = np.array([n for n in range(n_modes) if n not in unusable], dtype=np.intp)
+    measured = np.array(
+        [k for k in range(n_columns) if k not in dead and int(indices[k]) not in shapes],
+        dtype=np.intp,
+    )
+    if not len(measured):
+        raise MatrixError("matrix: found no column that can be used, expected some")
+    if len(measured) < n_columns:
+        signals.keep(measured)
+    arrays: dict[str, Array] = {}
+    if len(kept) < n_modes or numbers is not None:
+        name = "kept_actuators" if mirror.is_zonal else "kept_modes"
+        arrays[name] = kept if numbers is None else np.asarray(numbers)[kept]
+        mirror.keep(kept)
+    position = {int(n): k for k, n in enumerate(kept)}
+    left = np.array([position[int(indices[k])] for k in measured])
+    if not np.array_equal(left, np.arange(len(kept))):
+        arrays["modes"] = left
+    return arrays
+
+
+def _indices(columns: Array | None, n_columns: int, n_modes: int, notes: list[str]) -> Array:
+    """Return the basis index of each column."""
+    if columns is None:
+        if n_columns > n_modes:
+            raise MatrixError(f"matrix: found {n_columns} columns, expected at most {n_modes}")
+        if n_modes > n_columns:
+            notes.append(
+                f"the matrix is of the first {n_columns} of {n_modes} modes; --modes if of others"
+            )
+        return np.arange(n_columns)
+    if len(columns) != n_columns:
+        raise ConfigurationError(
+            f"--modes: found {len(columns)} numbers, expected one for each of the {n_columns} "
+            "columns of the matrix"
+        )
+    if max(columns) >= n_modes:
+        raise ConfigurationError(
+            f"--modes: found {max(columns)}, expected numbers below {n_modes}, the number of modes"
+        )
+    return columns
+
+
+def _sensor(reported: Reported, signals: Signals, notes: list[str]) -> dict[str, Any]:
     """Return ``[wfs]``."""
     table: dict[str, Any] = {
-        "kind": reported.sensor,
-        "n_subapertures": len(valid),
+        "kind": reported.kind,
+        **signals.table,
         "wavelength_m": reported.wavelength_m or UNKNOWN,
-        "valid_subapertures": Dataset("valid_subapertures"),
     }
-    if reported.sensor == "pyramid":
+    if reported.kind == "pyramid":
         modulation = reported.modulation_lambda_over_d
         table["modulation_lambda_over_d"] = UNKNOWN if modulation is None else modulation
     elif reported.centroid is not None:
         table["centroid"] = reported.centroid
     if reported.pupil_diameter_subap is not None:
         return {**table, "pupil_diameter_subap": reported.pupil_diameter_subap}
-    notes += _narrow(matrix, valid)
+    if table.get("input") != "frames":
+        valid = signals.arrays["valid_subapertures"].astype(bool)
+        notes += _narrow(signals.arrays["interaction_matrix"], valid)
     return table
 
 
@@ -166,170 +429,3 @@ def _narrow(matrix: Array, valid: NDArray[np.bool_]) -> list[str]:
         f"{seen.words}, the mask has {len(valid)}: say --pupil-subap, unless the mirror does not "
         "reach these"
     ]
-
-
-# --- the mirror
-
-
-def _mirror(
-    source: str, arrays: Mapping[str, Array], reported: Reported, notes: list[str]
-) -> tuple[dict[str, Any], dict[str, Array], int]:
-    """Return ``[mirror]``, its arrays, and how many modes it has."""
-    strokes = arrays.get("mode_to_actuator")
-    if "positions" in arrays:
-        places, turned = oriented(
-            arrays["positions"], _longer(arrays["positions"]), 2, "positions", "(n_actuators, 2)"
-        )
-        notes += turned
-        n_modes, table, kept = _of_actuators(len(places), strokes, notes)
-        table |= {"layout": "positions", "positions": Dataset("positions")}
-        return (
-            {**table, "influence": "gaussian", "coupling": UNKNOWN},
-            {
-                "positions": places,
-                **kept,
-            },
-            n_modes,
-        )
-    if "modes" not in arrays:
-        raise MatrixError(
-            f"{source}: found neither modes nor positions of actuators, expected one of the two"
-        )
-    cube = cube_of(arrays["modes"], notes)
-    pitch = {"modes_pitch_m": reported.diameter_m / cube.shape[1]}
-    if strokes is None:
-        return {"modes": Dataset("mode_shapes"), **pitch}, {"mode_shapes": cube}, len(cube)
-    n_modes, table, kept = _of_actuators(len(cube), strokes, notes)
-    table |= {"influence_functions": Dataset("influence_functions"), **pitch}
-    return table, {"influence_functions": cube, **kept}, n_modes
-
-
-def _of_actuators(
-    n_actuators: int, strokes: Array | None, notes: list[str]
-) -> tuple[int, dict[str, Any], dict[str, Array]]:
-    if strokes is None:
-        return n_actuators, {"basis": "zonal"}, {}
-    commands, turned = oriented(
-        strokes, n_actuators, None, "mode_to_actuator", "(n_actuators, n_modes)"
-    )
-    notes += turned
-    if commands.shape[1] > n_actuators:
-        raise MatrixError(
-            f"mode_to_actuator: found {commands.shape[1]} modes of {n_actuators} actuators, "
-            "expected no more modes than actuators"
-        )
-    key = "mode_to_actuator"
-    return commands.shape[1], {key: Dataset(key)}, {key: commands}
-
-
-def _longer(values: Array) -> int:
-    return max(np.shape(values), default=0)
-
-
-# --- layouts
-
-
-def mask_of(values: Array, notes: list[str]) -> NDArray[np.bool_]:
-    """Return a mask ``(n, n)`` of subapertures.
-
-    Raises
-    ------
-    MatrixError
-        If it is none: of another shape, with other values than 0 and 1, or empty. One that lists
-        the same mask for x and for y, ``(2n, n)`` or ``(n, 2n)``, is taken once.
-    """
-    mask = np.asarray(values)
-    if mask.ndim == 2 and max(mask.shape) == 2 * min(mask.shape):
-        of_x, of_y = np.split(mask, 2, axis=int(np.argmax(mask.shape)))
-        if np.array_equal(of_x, of_y):
-            notes.append("valid: listed twice, for x and y: taken once")
-            mask = of_x
-    if mask.ndim != 2 or mask.shape[0] != mask.shape[1] or not np.isin(mask, (0, 1)).all():
-        raise MatrixError(
-            f"valid: found shape {mask.shape} of {mask.dtype}, expected a mask (n, n) of 0 and 1"
-        )
-    if not mask.any():
-        raise MatrixError("valid: found no valid subaperture, expected some")
-    return mask.astype(bool)
-
-
-def maps_of(values: Array, n: int | None, notes: list[str]) -> Array:
-    """Return slopes that are listed as maps as ``(2, n, n, n_modes)``, Sx then Sy.
-
-    They may come as ``(2, n, n)`` maps or as one map of both, side by side ``(n, 2n)`` or one above
-    the other ``(2n, n)``; modes first or last.
-
-    Raises
-    ------
-    MatrixError
-        If they fit no layout, or several.
-    """
-    ways: dict[str, Array] = {}
-    for first in (True, False):
-        modes_last = np.moveaxis(values, 0, -1) if first else values
-        shape, where = modes_last.shape[:-1], "first" if first else "last"
-        if len(shape) == 3 and shape[0] == 2 and shape[1] == shape[2]:
-            ways[f"(2, n, n), modes {where}"] = modes_last
-        elif len(shape) == 2 and shape[1] == 2 * shape[0]:
-            ways[f"(n, 2n), modes {where}"] = np.stack(np.split(modes_last, 2, axis=1))
-        elif len(shape) == 2 and shape[0] == 2 * shape[1]:
-            ways[f"(2n, n), modes {where}"] = np.stack(np.split(modes_last, 2, axis=0))
-    ways = {way: maps for way, maps in ways.items() if n in {None, maps.shape[1]}}
-    if len(ways) != 1:
-        raise MatrixError(
-            f"matrix: found shape {values.shape}, expected maps of slopes: (2, n, n), (n, 2n) or "
-            f"(2n, n), modes first or last; it fits {' and '.join(ways) or 'none of them'}"
-        )
-    ((way, maps),) = ways.items()
-    notes.append(f"matrix: maps of slopes, {way}: the first half taken as Sx")
-    return maps
-
-
-def _lit(maps: Array, notes: list[str]) -> NDArray[np.bool_]:
-    """Return the subapertures that answer to any mode: in maps the others are 0 or not finite."""
-    lit = np.nan_to_num(maps).any(axis=(0, -1))
-    notes.append(f"valid: no mask: the {int(lit.sum())} subapertures that answer to any mode")
-    return np.asarray(lit)
-
-
-def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
-    """Return shapes as ``(n_modes, ny, nx)``: the two axes of equal length are the map's.
-
-    Raises
-    ------
-    MatrixError
-        If no two axes are, or it cannot be told which two.
-    """
-    cube = np.asarray(values)
-    if cube.ndim != 3 or cube.dtype.kind not in "iuf":
-        raise MatrixError(
-            f"modes: found shape {cube.shape} of {cube.dtype}, expected numbers (n_modes, n, n)"
-        )
-    first, _, last = cube.shape
-    if first == last or (first != cube.shape[1] and cube.shape[1] != last):
-        raise MatrixError(
-            f"modes: found shape {cube.shape}, expected (n_modes, n, n) or (n, n, n_modes) with "
-            "n_modes other than n"
-        )
-    if first == cube.shape[1]:
-        notes.append("modes: listed last, (n, n, n_modes): turned to (n_modes, n, n)")
-        cube = np.moveaxis(cube, -1, 0)
-    return np.ascontiguousarray(cube, dtype=np.float32)
-
-
-def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
-    """Return the arrays of a file by what they are for, as their names say.
-
-    Raises
-    ------
-    MatrixError
-        If two have names of the same role.
-    """
-    found: dict[str, Array] = {}
-    for role, names in ROLES.items():
-        there = [name for name in names if name in arrays]
-        if len(there) > 1:
-            raise MatrixError(f"{where}: found {' and '.join(there)}, expected one {role}")
-        if there:
-            found[role] = arrays[there[0]]
-    return found

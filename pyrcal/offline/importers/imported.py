@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -62,8 +63,13 @@ class Imported:
     notes: tuple[str, ...] = ()
     """What was converted, assumed or is unknown, one sentence each."""
 
+    inventory: tuple[str, ...] = ()
+    """Files that were taken, and for what; files that were ignored, and why."""
+
     def save(self, folder: str | Path) -> Saved:
         """Write both files into a folder, and read the instrument file once as a check.
+
+        If anything fails, the folder is left as it was.
 
         Raises
         ------
@@ -81,21 +87,49 @@ class Imported:
         place = Path(folder)
         saved = Saved(place / INSTRUMENT_FILE, place / ARRAYS_FILE)
         try:
+            made = [one for one in (place, *place.parents) if not one.exists()]
             place.mkdir(parents=True, exist_ok=True)
-            write_whole(saved.matrix, self._fill)
-            saved.instrument.write_text(self.instrument_text(), encoding="utf-8")
         except OSError as error:
             raise StorageError(f"{place}: cannot be written: {error}") from error
-        self._check(load_instrument(saved.instrument))
+        try:
+            self._write(place)
+        except BaseException:
+            for one in made:
+                one.rmdir()
+            raise
         return saved
+
+    def _write(self, place: Path) -> None:
+        """Write both files beside their place, read them as a check, then put them there."""
+        try:
+            with tempfile.TemporaryDirectory(dir=place, prefix=".import-") as name:
+                draft = Saved(Path(name) / INSTRUMENT_FILE, Path(name) / ARRAYS_FILE)
+                write_whole(draft.matrix, self._fill)
+                draft.instrument.write_text(self.instrument_text(), encoding="utf-8")
+                try:
+                    self._check(load_instrument(draft.instrument))
+                except ConfigurationError as error:
+                    # the draft's folder is gone when this is read
+                    raise ConfigurationError(str(error).replace(name, str(place))) from error
+                draft.matrix.replace(place / ARRAYS_FILE)
+                draft.instrument.replace(place / INSTRUMENT_FILE)
+        except OSError as error:
+            raise StorageError(f"{place}: cannot be written: {error}") from error
 
     def _check(self, instrument: Instrument) -> None:
         """Refuse a matrix that is not of the instrument."""
         matrix = self.arrays.get(DATASET)
         if matrix is None:
             return
-        n_slopes = instrument.slopes.order.kind.n_planes * rtc_valid_subapertures(instrument).sum()
         n_modes = len(self.arrays.get("modes", range(instrument.modes.n_modes)))
+        if instrument.frames is not None:
+            if matrix.ndim != 3 or len(matrix) != n_modes:
+                raise MatrixError(
+                    f"{DATASET}: found shape {matrix.shape}, expected (n_modes, ny, nx) of "
+                    f"{n_modes} modes"
+                )
+            return
+        n_slopes = instrument.slopes.order.kind.n_planes * rtc_valid_subapertures(instrument).sum()
         if matrix.shape != (n_slopes, n_modes):
             raise MatrixError(
                 f"{DATASET}: found shape {matrix.shape}, expected (n_slopes, n_modes) = "
@@ -125,6 +159,8 @@ def _toml(value: object) -> str:
         return json.dumps(f"{ARRAYS_FILE}:/{value}")
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(each)}" for key, each in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml(each) for each in value) + "]"
     if isinstance(value, bool | str):
         return json.dumps(value, ensure_ascii=False)
     return repr(float(value)) if isinstance(value, float | np.floating) else str(value)

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import argparse
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from pyrcal.offline.importers import oopao
 from pyrcal.offline.importers.aot import from_aot
 from pyrcal.offline.importers.cacao import from_cacao
-from pyrcal.offline.importers.files import Reported, by_role, from_arrays
+from pyrcal.offline.importers.described import from_described
+from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
+from pyrcal.offline.importers.layouts import by_role, role_of_name
 from pyrcal.offline.importers.pyrtc import RECORD, calibration_of
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.importers.specula import UNIT, from_specula
-from service.errors import MatrixError
+from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
 
 
@@ -29,21 +34,57 @@ def _specula(options: argparse.Namespace) -> Imported:
 
 
 def _arrays(options: argparse.Namespace) -> Imported:
-    """Import arrays by their names, or by the roles that are reported."""
+    """Import arrays by their names, or by the roles that are given."""
     found: dict[str, Array] = {}
-    for role, path in options.files:
-        arrays = _read(path)
-        if role is not None:
-            arrays = {role: _only(arrays, str(path))}
-        elif options.source == "pyrtc":
-            arrays = dict([calibration_of(arrays, str(path))])
-        else:
-            arrays = by_role(arrays, str(path))
+    inventory: list[str] = []
+    for role, path in _files(options.files):
+        arrays = _by_role(role, path, options.source)
+        if not arrays:
+            inventory.append(f"ignored {path}: no name of a role, see docs/integrate/importing.md")
         twice = found.keys() & arrays.keys()
         if twice:
             raise MatrixError(f"{path}: found a second {min(twice)}, expected one")
+        inventory += [f"took {path} {np.shape(a)}: {name}" for name, a in arrays.items()]
         found |= arrays
-    return from_arrays(" ".join(str(path) for _, path in options.files), found, _reported(options))
+    source = " ".join(str(path) for _, path in options.files)
+    if options.instrument is not None:
+        imported = from_described(source, found, options.instrument, options.unit, options.modes)
+    else:
+        imported = from_arrays(source, found, _reported(options))
+    return replace(imported, inventory=tuple(inventory))
+
+
+def _files(given: Sequence[tuple[str | None, Path]]) -> Iterator[tuple[str | None, Path]]:
+    """Yield the files that were given, of a folder those in it."""
+    for role, path in given:
+        if role is None and path.is_dir():
+            for one in sorted(path.iterdir()):
+                name = one.name.lower()
+                if one.is_file() and name.endswith(_ARRAY_FILES) and _role_of(one) is not None:
+                    yield None, one
+        else:
+            yield role, path
+
+
+def _by_role(role: str | None, path: Path, source: str) -> dict[str, Array]:
+    """Return the arrays of a file by what they are for, as their names or the file's say."""
+    arrays = _read(path)
+    if role is not None:
+        return {role: _only(arrays, str(path))}
+    if source == "pyrtc":
+        return dict([calibration_of(arrays, str(path))])
+    found = by_role(arrays, str(path))
+    if len(arrays) == 1:
+        # the array of a NumPy file has no name, so the file's own is taken
+        named = _role_of(path)
+        if named is not None:
+            return {named: next(iter(arrays.values()))}
+    return found
+
+
+def _role_of(path: Path) -> str | None:
+    """Return the role that a file's name says; None if it says nothing."""
+    return role_of_name(path.name.partition(".")[0])
 
 
 def _read(path: Path) -> dict[str, Array]:
@@ -63,7 +104,7 @@ def _only(arrays: Mapping[str, Array], where: str) -> Array:
 
 
 def _cacao(options: argparse.Namespace) -> Imported:
-    return from_cacao(options.folder, _reported(options))
+    return from_cacao(options.folder, _reported(options), options.response)
 
 
 def _aot(options: argparse.Namespace) -> Imported:
@@ -71,6 +112,13 @@ def _aot(options: argparse.Namespace) -> Imported:
 
 
 def _reported(options: argparse.Namespace) -> Reported:
+    if options.diameter_m is None:
+        other = (
+            ", or --instrument with a packaged name or a file" if "instrument" in options else ""
+        )
+        raise ConfigurationError(
+            f"--diameter-m: found none, expected the diameter of the pupil in metres{other}"
+        )
     return Reported(
         diameter_m=options.diameter_m,
         sensor=options.sensor,
@@ -79,10 +127,15 @@ def _reported(options: argparse.Namespace) -> Reported:
         wavelength_m=options.wavelength_m,
         modulation_lambda_over_d=options.modulation,
         pupil_diameter_subap=options.pupil_subap,
+        pixels_per_subaperture=options.pixels_per_subap,
+        columns=options.modes,
         centroid="gradient" if options.source == "synim" else None,
         unit=getattr(options, "unit", UNIT if options.source in {"specula", "synim"} else None),
     )
 
+
+_ARRAY_FILES = (".npy", ".fits", ".fits.gz", ".fits.fz", ".npz", ".h5")
+"""Ends of the names of files that are read from a folder."""
 
 IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
     "oopao": _oopao,
@@ -91,6 +144,7 @@ IMPORTERS: Mapping[str, Callable[[argparse.Namespace], Imported]] = {
     "cacao": _cacao,
     "pyrtc": _arrays,
     "aot": _aot,
+    "files": _arrays,
     "npz": _arrays,
 }
 """By the word that names them."""
@@ -106,6 +160,8 @@ def main(options: argparse.Namespace) -> int:
     """
     imported = IMPORTERS[options.source](options)
     saved = imported.save(options.output)
+    for line in imported.inventory:
+        print(line)
     print(f"{saved.instrument}: {imported.source}")
     shapes = ", ".join(f"{name} {values.shape}" for name, values in imported.arrays.items())
     print(f"{saved.matrix}: {shapes}")

@@ -66,11 +66,13 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     """
     found: dict[str, Array] = {}
     places: Subapertures | None = None
+    kind = reported.kind
     interleaved, notes = False, list[str]()
     for path in paths:
         with opened(path) as container:
             if "fsizex" in container.facts or "np_sub" in container.facts:
                 places = _subapertures(container)
+                kind = "shack-hartmann" if "np_sub" in container.facts else "pyramid"
                 continue
             role, values, turned = _role_of(container)
             if role in found:
@@ -91,12 +93,17 @@ def from_specula(paths: Sequence[Path], reported: Reported, source: str = "SPECU
     )
     found["matrix"] = both[:, places.by_rows].reshape(matrix.shape)
     found["valid"] = places.mask
+    if reported.sensor not in {None, kind}:
+        raise MatrixError(
+            f"{source}: found the subapertures of a {kind}, expected those of a {reported.sensor}, "
+            "as --sensor says"
+        )
     # what its pyramid calls x runs along the rows of its mask
-    order = "yx" if reported.sensor == "pyramid" else "xy"
-    if reported.sensor != "pyramid" and reported.unit is not None:
+    order = "yx" if kind == "pyramid" else "xy"
+    if kind != "pyramid" and reported.unit is not None:
         notes.append(LENSLETS)
         reported = replace(reported, unit=None)
-    imported = from_arrays(source, found, replace(reported, order=order))
+    imported = from_arrays(source, found, replace(reported, order=order, sensor=kind))
     if not np.array_equal(places.by_rows, np.arange(len(places.rows))):
         notes.append("subapertures were not listed row by row: sorted")
     return imported.noted(*notes)

@@ -1,0 +1,73 @@
+"""Find columns, rows, modes and functions that cannot be used, and name them by number.
+
+A broken actuator or a pixel that failed leaves NaN, zeros or a copy of its neighbour. One of them
+must not make the rest unusable, nor be left out silently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pyrcal.offline.importers.imported import Array
+
+COPY = "equal to "
+"""Begins the reason of an entry that repeats an earlier one, whose number follows."""
+
+_LISTED = 12
+"""Numbers that a message lists."""
+
+
+def find_defects(values: Array) -> dict[int, str]:
+    """Return the entries along the first axis that cannot be used, with the reason.
+
+    An entry is unusable if it holds a NaN that not all others have at the same place (outside a
+    pupil all may be unknown), if it is zero, or if it equals an earlier one.
+    """
+    flat = np.asarray(values).reshape(len(values), -1)
+    unknown = ~np.isfinite(flat)
+    n_unknown = unknown.sum(axis=1)
+    usual = unknown[int(np.argmin(n_unknown))]
+    found: dict[int, str] = {}
+    seen: dict[bytes, int] = {}
+    for number, (entry, missing) in enumerate(zip(flat, unknown, strict=True)):
+        if n_unknown[number] == flat.shape[1] or np.any(missing & ~usual):
+            found[number] = "NaN"
+            continue
+        if not np.nan_to_num(entry).any():
+            found[number] = "zero"
+            continue
+        first = seen.setdefault(entry.tobytes(), number)
+        if first != number:
+            found[number] = f"{COPY}{first}"
+    return found
+
+
+def explain_defects(
+    defects: Mapping[int, str], what: str, numbers: Array | None = None
+) -> list[str]:
+    """Return one note for each kind of defect: ``columns 3, 7 are zero: left out``.
+
+    ``numbers`` are those by which a person knows the entries; None if they count from 0.
+    """
+
+    def known(entry: int) -> int:
+        return entry if numbers is None else int(numbers[entry])
+
+    listed: dict[str, list[str]] = {"not finite": [], "zero": [], "copies": []}
+    for entry, reason in sorted(defects.items()):
+        if reason.startswith(COPY):
+            of = known(int(reason.removeprefix(COPY)))
+            listed["copies"].append(f"{known(entry)} (of {of})")
+        else:
+            listed["not finite" if reason == "NaN" else "zero"].append(str(known(entry)))
+    notes = []
+    for kind, entries in listed.items():
+        more = f" and {len(entries) - _LISTED} more" if len(entries) > _LISTED else ""
+        text = ", ".join(entries[:_LISTED]) + more
+        if len(entries) == 1:
+            notes.append(f"{what} {text} is {'a copy' if kind == 'copies' else kind}: left out")
+        elif entries:
+            notes.append(f"{what}s {text} are {kind}: left out")
+    return notes

@@ -1,0 +1,178 @@
+"""From arrays of an instrument that a file describes: one of your own, or a packaged one.
+
+The arrays are a response, the modes it was measured with, the light. Everything else is taken from
+the instrument file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pyrcal.offline.importers.actuators import Mirror, combine
+from pyrcal.offline.importers.files import (
+    UNITS_M,
+    Signals,
+    read_frames,
+    read_slopes,
+    usable_modes,
+)
+from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, Imported
+from pyrcal.offline.importers.pupil_images import find_pupil_images
+from service.config import instrument_path, load_instrument
+from service.config.sources import read_toml
+from service.errors import MatrixError
+from service.model.instrument import Instrument
+from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
+
+OFF_CENTRE_SUBAP = 0.25
+"""Distance between the centres of the file and those of the light that is mentioned."""
+
+_REFERENCES = ("modes", "positions", "mode_to_actuator", "influence_functions", "influence_origin")
+
+
+def from_described(
+    source: str,
+    arrays: Mapping[str, Array],
+    instrument_file: str,
+    unit: str | None,
+    columns: Array | None,
+) -> Imported:
+    """Return an instrument of a file with the response and the modes of arrays.
+
+    Parameters
+    ----------
+    source
+        What the arrays were read from, for messages.
+    arrays
+        By role: ``matrix``, perhaps ``mode_to_actuator``, ``valid``, ``light``.
+    instrument_file
+        A packaged name, or the path of a file.
+    unit
+        Of the commands, OPD; None if unknown.
+    columns
+        ``(n_columns,)`` basis index of each column; None: the first ones.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such instrument.
+    MatrixError
+        If the arrays do not belong to it.
+    """
+    path = instrument_path(instrument_file)
+    instrument, tables = load_instrument(path), read_toml(path)
+    if "matrix" not in arrays:
+        raise MatrixError(f"{source}: found no matrix, expected one beside the instrument file")
+    notes = [f"telescope, sensor and mirror as {path.name} describes them"]
+    mirror = _mirror(instrument, tables["mirror"], path.parent, arrays, notes)
+    signals = _signals(source, instrument, arrays, mirror, notes)
+    modes = usable_modes(signals, mirror, columns, notes)
+    table = {**mirror.table}
+    if unit is None:
+        table["stroke"] = UNKNOWN
+        notes.append("the unit of the commands is unknown: only shapes are compared")
+    else:
+        signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
+    wfs = {**tables["wfs"], **signals.table}
+    slopes = {**tables.get("slopes", {})}
+    slopes.setdefault("orientation", "auto")
+    kept = {key: table for key, table in tables.items() if key not in {"wfs", "mirror", "slopes"}}
+    if "modes" in kept:
+        kept["modes"] = {k: v for k, v in kept["modes"].items() if k != "n_modes"}
+    if kept.get("loop", {}).get("n_controlled", 0) > mirror.n_modes:
+        kept["loop"] = {k: v for k, v in kept["loop"].items() if k != "n_controlled"}
+    return Imported(
+        source=source,
+        tables={**kept, "wfs": wfs, "mirror": table, "slopes": slopes},
+        arrays={**signals.arrays, **modes, **mirror.arrays},
+        notes=tuple(notes),
+    )
+
+
+def _mirror(
+    instrument: Instrument,
+    table: Mapping[str, Any],
+    folder: Path,
+    arrays: Mapping[str, Array],
+    notes: list[str],
+) -> Mirror:
+    """Return the mirror of the file, with the modes of the arrays where there are some."""
+    absolute = {
+        key: str(folder.resolve() / value)
+        for key, value in table.items()
+        if key in _REFERENCES and isinstance(value, str)
+    }
+    places = getattr(instrument.mirror, "positions_m", None)
+    mirror = Mirror(
+        n_modes=instrument.modes.n_modes,
+        n_actuators=instrument.modes.n_modes if places is None else len(places),
+        table={**table, **absolute},
+        arrays={},
+    )
+    if "mode_to_actuator" in arrays:
+        if "modes" in table:
+            raise MatrixError(
+                "mode_to_actuator: found beside an instrument file with modes of its own, expected "
+                "one with actuators"
+            )
+        mirror.table.pop("basis", None)
+        combine(mirror, arrays["mode_to_actuator"], notes)
+    return mirror
+
+
+def _signals(
+    source: str,
+    instrument: Instrument,
+    arrays: Mapping[str, Array],
+    mirror: Mirror,
+    notes: list[str],
+) -> Signals:
+    told = instrument.frames
+    if not isinstance(told, FrameWindows):
+        signals = read_slopes(source, arrays, mirror.n_modes, notes)
+        n = instrument.wfs.n_subapertures
+        found = signals.table["n_subapertures"]
+        if found != n:
+            raise MatrixError(
+                f"{source}: valid: found a mask that spans {found} subapertures, expected {n} as "
+                "wfs.n_subapertures says"
+            )
+        signals.table = {"valid_subapertures": Dataset("valid_subapertures")}
+        return signals
+    frames = read_frames(source, arrays, "pyramid")
+    if frames is None:
+        raise MatrixError(
+            f"{source}: matrix: found shape {np.shape(arrays['matrix'])}, expected camera frames: "
+            'wfs.input = "frames"; give the mask of lit pixels or the mean frame beside them'
+        )
+    notes += _beside_the_light(told, frames.light, frames.light_name)
+    return Signals(
+        table={},
+        arrays={"interaction_matrix": frames.cube, "flux_frame": frames.light},
+        obscuration_ratio=0.0,
+        columns=0,
+    )
+
+
+def _beside_the_light(told: FrameWindows, light: Array, name: str) -> list[str]:
+    """Return a note if the centres of the file do not lie where the light is."""
+    if told.centres_px is None:
+        return []
+    try:
+        images = find_pupil_images(light, name)
+        found = by_quadrant(images.centres_px).reshape(4, 2)
+    except MatrixError:
+        return []
+    expected = by_quadrant(told.centres_px).reshape(4, 2)
+    away = np.hypot(*(found - expected).T) / told.pixels_per_subaperture
+    if away.max() <= OFF_CENTRE_SUBAP:
+        return []
+    words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in found)
+    return [
+        f"wfs.pupil_centres_px lie up to {away.max():.2f} subapertures beside the pupil images in "
+        f"{name}, which are centred at {words}: change the key if the light is right"
+    ]

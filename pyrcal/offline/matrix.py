@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ from pyrcal.offline.pupil_checks import LEAST_EXPLAINED, Few, left_by_light, tri
 from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
-from pyrcal.offline.solver import nuisances_of
+from pyrcal.offline.solver import IMAGE_SIGMA_PX, image_patterns, nuisances_of
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
@@ -262,6 +263,7 @@ def _found(
         nominal=models.instrument.with_anamorphosis(models.instrument.start),
         optics=models.optics,
         unknown=models.unknown,
+        **_unknown_images(models),
     )
     match options.method:
         case Method.JOINT:
@@ -273,6 +275,15 @@ def _found(
         case Method.PAPER:
             alpha, table = scan(models, target, start)
             return _Found(settled=settle_at(models, target, alpha, nuisances), table=table)
+
+
+def _unknown_images(models: FitModels) -> dict[str, Any]:
+    """Return what is unknown of the places of the sensor's pupil images, where anything is."""
+    pixel = kind_of(models.instrument).pixel_subap(models.instrument)
+    if pixel is None:
+        return {}
+    patterns = image_patterns(models.instrument.stop)
+    return {"images": patterns, "image_sigma": IMAGE_SIGMA_PX * pixel}
 
 
 def _answer(

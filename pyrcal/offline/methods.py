@@ -60,6 +60,13 @@ MAX_REPEATS = 6
 LINEAR = 0.01
 """A logarithm of the instrument's that differs by less is as good as linear."""
 
+LINEAR_IMAGES = 0.02
+"""A pupil image displaced by less, in subapertures, is as good as linear."""
+
+IMAGE_REPEATS = 2
+"""Times that the images of the model are moved: four of the six displacements hardly change a
+matrix, and would wander."""
+
 REACH = 20.0
 """Derivatives within so many settling lengths of where they were taken are as good as new."""
 
@@ -190,9 +197,9 @@ def settle(
     solution = refine(models, seen, start, nuisances)
     settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
     models, nuisances = _with_nearest_sensor(settled)
-    for _ in range(MAX_REPEATS):
+    for repeat in range(MAX_REPEATS):
         if models is settled.models:
-            models, nuisances = _adjusted(settled)
+            models, nuisances = _adjusted(settled, move_images=repeat < IMAGE_REPEATS)
         there = _known(models, target, settled.solution.alpha)
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             break
@@ -244,7 +251,7 @@ def spread(n_modes: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
 
 
-def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
+def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisances]:
     """Return the models of the instrument that was found, and the unknowns about it."""
     models, nuisances = settled.models, settled.nuisances
     optics = []
@@ -254,7 +261,12 @@ def _adjusted(settled: Settled) -> tuple[FitModels, Nuisances]:
             change = float(np.clip(change, -LONGEST_OPTIC_STEP, LONGEST_OPTIC_STEP))
             models, offset = models.adjusted(optic, change), offset + change
         optics.append((optic, offset))
-    return models, replace(nuisances, optics=tuple(optics))
+    nuisances = replace(nuisances, optics=tuple(optics))
+    displaced = nuisances.image_offsets(settled.solution.nuisances)
+    far = np.any(np.abs(displaced - nuisances.displaced) > LINEAR_IMAGES)
+    if move_images and far:
+        return models.displaced(displaced), replace(nuisances, displaced=displaced)
+    return models, nuisances
 
 
 def settle_at(

@@ -193,6 +193,15 @@ class FitModels:
         coupling = float(surface.coupling ** np.exp(-2.0 * change))
         return replace(self, basis=self.basis.of_surface(replace(surface, coupling=coupling)))
 
+    def displaced(self, offsets: Array) -> FitModels:
+        """Return the models of a sensor whose pupil images lie beside their places ``(8,)``.
+
+        Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y,
+        then along y.
+        """
+        wfs = kind_of(self.instrument).displaced(self.instrument, offsets)
+        return replace(self, instrument=replace(self.instrument, wfs=wfs))
+
     def optics_derivatives(
         self, alpha: Misregistration, optics: Sequence[Optic]
     ) -> list[NDArray[Any]]:

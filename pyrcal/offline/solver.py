@@ -23,7 +23,7 @@ from service.estimation.solver import (
     Projection,
     within_limits,
 )
-from service.model.kinds import SignalKind
+from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import signals_of_slopes, slopes_of
 
@@ -68,6 +68,28 @@ LONGEST_OPTIC_STEP = 0.4
 """A step of such a logarithm beyond this trusts the derivatives too far."""
 
 
+IMAGE_SIGMA_PX = 0.15
+"""1 σ of a coordinate of a pupil image beside its place on the pixel grid, detector pixels. Real
+pyramids have 0.05 to 0.3 px: the faces are polished to some 0.1 % of their angle, and the windows
+that cut the images begin at whole pixels."""
+
+LONGEST_IMAGE_STEP = 0.3
+"""A longer step of an image, in subapertures, trusts the derivatives too far."""
+
+
+def image_patterns(stop: Stop) -> Array:
+    """Return orthonormal displacements of the four images ``(n_patterns, 8)``.
+
+    Along x of the images at -x -y, +x -y, -x +y, +x +y, then along y. With the mirror as stop
+    there are six of mean zero, for a common displacement is the shift of α. With the telescope as
+    stop two more displace all images together: there α is where the mirror is seen on the grid,
+    and the pupil may lie elsewhere.
+    """
+    along = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1], [1, -1, -1, 1], [1, 1, 1, 1]]) / 2.0
+    both = np.kron(np.eye(2), along)  # those of x, then those of y
+    return both if stop is Stop.TELESCOPE else both[[0, 1, 2, 4, 5, 6]]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Nuisances:
     """The unknowns beside the registration, in their order."""
@@ -88,6 +110,15 @@ class Nuisances:
     unknown: frozenset[Optic] = frozenset()
     """What of it the file says to be unknown."""
 
+    images: Array = field(default_factory=lambda: np.zeros((0, 8)))
+    """``(n_patterns, 8)`` unknown displacements of the pupil images, see ``image_patterns``."""
+
+    image_sigma: float = 0.0
+    """How large each of these may be, 1 σ, subapertures."""
+
+    displaced: Array = field(default_factory=lambda: np.zeros(8))
+    """``(8,)`` how far the images of the models are already displaced, subapertures."""
+
     @property
     def sigma(self) -> Array:
         """``(n_nuisances,)`` how large each may be, 1 σ."""
@@ -97,12 +128,19 @@ class Nuisances:
             for optic, _ in self.optics
         ]
         maps = [GAIN_MAP_SIGMA] * len(self.maps)
-        return np.array([SLOPE_TURN_SIGMA_RAD, *stretches, *optics, *maps])
+        images = [self.image_sigma] * len(self.images)
+        return np.array([SLOPE_TURN_SIGMA_RAD, *stretches, *optics, *images, *maps])
 
     @property
     def first_optic(self) -> int:
         """Index of the first unknown of the instrument among the nuisances."""
         return 3 if self.anamorphosis else 1
+
+    @property
+    def image_places(self) -> slice:
+        """Places of the images' displacements among the nuisances."""
+        first = self.first_optic + len(self.optics)
+        return slice(first, first + len(self.images))
 
     def from_prior(self, values: Array) -> Array:
         """Return values ``(n_nuisances,)`` as distances from what is expected of them."""
@@ -111,7 +149,12 @@ class Nuisances:
             distance[STRETCHES] -= self.nominal
         for k, (_, offset) in enumerate(self.optics, self.first_optic):
             distance[k] += offset
+        distance[self.image_places] += self.images @ self.displaced
         return distance
+
+    def image_offsets(self, values: Array) -> Array:
+        """Return where the pupil images lie beside their places ``(8,)``, subapertures."""
+        return self.displaced + values[self.image_places] @ self.images
 
     def changes(self, values: Array) -> dict[Optic, float]:
         """Return by how much each of the instrument's unknowns differs from the file, as ln."""
@@ -125,10 +168,13 @@ class Nuisances:
         """``(4 + n_nuisances,)`` reciprocal variances: the registration itself has no prior."""
         return np.concatenate([np.zeros(4), 1.0 / self.sigma**2])
 
-    def derivatives(self, models: FitModels, alpha: Misregistration, matrix: NDArray[Any]) -> Array:
+    def derivatives(
+        self, models: FitModels, alpha: Misregistration, matrix: NDArray[Any], of_alpha: Array
+    ) -> Array:
         """Return the change of D with each unknown but the gain map.
 
-        ``(n_nuisances - n_maps, n_slopes, n_modes)``
+        ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_alpha`` ``(4, n_slopes, n_modes)`` are
+        the derivatives with respect to α.
         """
         model = models.cheap
         kind = model.instrument.slopes.kind
@@ -138,7 +184,18 @@ class Nuisances:
             models.counter.n += 2
             found += list(model.stretch_derivatives(alpha))
         found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
+        if len(self.images):
+            models.counter.n += 2
+            found += list(self._of_images(model.image_derivatives(alpha), of_alpha))
         return np.array(found)
+
+    def _of_images(self, apart: Array, of_alpha: Array) -> Array:
+        """Return the change with each pattern, of the changes ``(8, ...)`` with each image."""
+        rates = np.tensordot(self.images.astype(apart.dtype), apart, axes=1)
+        common = self.images.reshape(-1, 2, 4).mean(axis=2)
+        # where all images move the pupil does, and α, the mirror on the grid, stays
+        rates -= np.tensordot(common.astype(apart.dtype), of_alpha[:2], axes=1)
+        return np.asarray(rates)
 
     def slope_gain(self, values: Array) -> Array:
         """Return the gain ``(n_slopes,)`` that the gain map gives every slope, mean 1."""
@@ -185,6 +242,8 @@ def nuisances_of(
     nominal: Misregistration = NOMINAL,
     optics: Sequence[Optic] = (),
     unknown: frozenset[Optic] = frozenset(),
+    images: Array | None = None,
+    image_sigma: float = 0.0,
 ) -> Nuisances:
     """Return the unknowns beside the registration: the turn of the axes, and those asked for."""
     unknowns = Nuisances(
@@ -193,6 +252,8 @@ def nuisances_of(
         nominal=nominal.stretches,
         optics=tuple((optic, 0.0) for optic in optics),
         unknown=unknown,
+        images=np.zeros((0, 8)) if images is None else images,
+        image_sigma=image_sigma,
     )
     if not gain_map:
         return unknowns
@@ -250,7 +311,7 @@ def refine(
     models.counter.n += 4
     frozen = models.cheap.derivatives(start)
     matrix = models.matrix(models.fine, start)
-    near = np.concatenate([frozen, nuisances.derivatives(models, start, matrix)])
+    near = np.concatenate([frozen, nuisances.derivatives(models, start, matrix, frozen)])
     seen, every = _seen(columns, matrix, near, values, nuisances)
     converged = False
     for _ in range(max_steps):
@@ -322,5 +383,6 @@ def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Arra
     stretches = step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
     first = 4 + nuisances.first_optic
     optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP
-    longest = [*excess, *optics, *(np.abs(stretches) / LONGEST_STRETCH)]
+    images = np.abs(step[4:][nuisances.image_places]) / LONGEST_IMAGE_STEP
+    longest = [*excess, *images, *optics, *(np.abs(stretches) / LONGEST_STRETCH)]
     return np.asarray(step / max(1.0, *longest))

@@ -334,6 +334,7 @@ _LATER = frozenset(
         "nominal_anamorphosis",
         "laser",
         "local",
+        "image_offsets_subap",
     }
 )
 """Fields without which an instrument has the digest that it has always had."""

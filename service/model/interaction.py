@@ -27,7 +27,15 @@ from service.model.modes import Basis, local_of
 from service.model.pupil import Illumination, instrument_pupil
 from service.model.sensors.kind import WorkingPoint
 from service.model.sensors.registry import kind_of
-from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Response, Sensor, by_rows
+from service.model.sensors.sensor import (
+    KEPT_BYTES,
+    Fineness,
+    Mapper,
+    Response,
+    Sensor,
+    SeveralImages,
+    by_rows,
+)
 from service.model.slopes import rtc_mask, to_rtc
 
 Array = NDArray[Any]
@@ -227,6 +235,18 @@ class InteractionModel:
         rates = self._seen_together(alpha, moved)
         return np.stack([self._as_listed(rate) for rate in rates])
 
+    def image_derivatives(self, alpha: Misregistration) -> Array:
+        """Return how D changes when one of the sensor's pupil images alone moves on its pixels.
+
+        ``(8, n_slopes, n_modes)`` per subaperture: the images at -x -y, +x -y, -x +y, +x +y along
+        x, then along y. The mirror moves with its image. Empty for a sensor with one image.
+        """
+        response = self._at(self._image_shift(alpha))
+        if not isinstance(response, SeveralImages):
+            return np.empty((0, self.n_slopes, self.basis.n_modes))
+        rates = response.image_rates(self._rendered(alpha))
+        return np.stack([self._as_listed(rate) for rate in rates])
+
     def width_derivative(self, alpha: Misregistration) -> Array:
         """Return how D changes with the logarithm of the influence functions' width.
 
@@ -290,7 +310,8 @@ class InteractionModel:
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
         """Shift of the pupil images: with the telescope as stop they stay where they are."""
         if self.instrument.stop is Stop.TELESCOPE:
-            return self.instrument.pupil_shift_subap or (0.0, 0.0)
+            told = kind_of(self.instrument).pupil_offset(self.instrument)
+            return self.instrument.pupil_shift_subap or told or (0.0, 0.0)
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _mirror_points(self, alpha: Misregistration) -> NDArray[np.float64]:

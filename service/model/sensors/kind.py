@@ -273,6 +273,32 @@ class SensorKind(ABC):
     def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
         """Return its class in AOT files, and the fields that only this class is given."""
 
+    def pixel_subap(self, instrument: Instrument) -> float | None:
+        """Return a detector pixel's width in subapertures, where images may lie off the pixel grid.
+
+        None if the sensor has one image of the pupil, or the file says where each of several lies.
+        """
+        return None
+
+    def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> SensorDescription:
+        """Return the sensor with its pupil images beside their places ``(2 n_images,)``.
+
+        Subapertures, axes of conventions.md: of each image along x, then of each along y.
+
+        Raises
+        ------
+        ModelError
+            If it has only one image.
+        """
+        raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
+
+    def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
+        """Return where the instrument file places the pupil's image on the grid, (x, y).
+
+        Subapertures, axes of conventions.md; None if the file does not say.
+        """
+        return None
+
     def light(self, instrument: Instrument) -> Light | CannotTell:
         """Return how an instrument's light tells of the pupil, or that it does not."""
         from service.model.sensors.sensor import CannotTell

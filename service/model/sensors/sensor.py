@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,17 @@ class Response(Protocol):
 
     def with_shift_rates(self, shapes: Shapes) -> tuple[Array, Array, Array]:
         """Return what ``apply`` does, and its change per subaperture along x, and along y."""
+
+
+@runtime_checkable
+class SeveralImages(Protocol):
+    """The response of a sensor with several images of the pupil, each at its own place."""
+
+    def image_rates(self, shapes: Shapes) -> Array:
+        """Return the change of the signals when one image alone moves on its pixels.
+
+        ``(2 n_images, n_signals, n_shapes)`` per subaperture: each along x, then each along y.
+        """
 
 
 class Sensor(Protocol):

@@ -12,6 +12,7 @@ from service.errors import ModelError
 from service.model.instrument import Instrument, SensorMode, sensor_of_kind
 from service.model.kinds import LoopFacts
 from service.model.sensors.pyramid.table import PyramidMode, PyramidNumbers, PyramidTable
+from service.model.slopes import Orientation
 
 _SEPARATION_TOLERANCE = 0.1
 
@@ -27,6 +28,10 @@ class Pyramid(PyramidNumbers):
     valid_subapertures: NDArray[np.bool_] | None = None
     """Mask ``(n_subapertures, n_subapertures)``, [y, x] in the RTC's own axes, as its slopes are
     listed; None: by ``flux_threshold`` at α = 0."""
+
+    image_offsets_subap: tuple[tuple[float, float], ...] | None = None
+    """Displacement (x, y) of the images at -x -y, +x -y, -x +y and +x +y from their places on the
+    pixel grid, subapertures, in the RTC's own axes; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +61,14 @@ def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
             f"diameter, {diameter:g} subapertures: the images would overlap"
         )
     optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
-    return Pyramid(**optics | {"pupil_separation_subap": separation})
+    pixels = table.pixels_per_subaperture
+    offsets = table.image_offsets_px
+    if offsets is not None:
+        offsets = tuple((x / pixels, y / pixels) for x, y in offsets)
+    return Pyramid(
+        **optics | {"pupil_separation_subap": separation},
+        image_offsets_subap=offsets,
+    )
 
 
 def modes_of(table: PyramidTable, sensor: Pyramid) -> tuple[tuple[SensorMode, str], ...]:
@@ -88,6 +100,9 @@ def binned(sensor: Pyramid, binning: int) -> Pyramid:
         n_subapertures=sensor.n_subapertures // binning,
         pupil_separation_subap=sensor.image_separation_subap / binning,
         pupil_diameter_subap=sensor.pupil_diameter / binning,
+        image_offsets_subap=None
+        if sensor.image_offsets_subap is None
+        else tuple((x / binning, y / binning) for x, y in sensor.image_offsets_subap),
     )
 
 
@@ -115,6 +130,65 @@ def _in_mode(sensor: Pyramid, mode: PyramidMode, where: str) -> SensorMode:
     )
     loop = LoopFacts(frame_rate_hz=mode.frame_rate_hz, n_controlled=mode.n_controlled)
     return SensorMode(config_id=mode.config_id, binning=binning, wfs=wfs, loop=loop)
+
+
+def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
+    """Return where the images lie beside their places ``(2, 2, 2)``: side y, side x, (x, y).
+
+    In subapertures and the axes of conventions.md. With the mirror as stop less their mean, which
+    is the shift of α; with the telescope as stop ``pupil_offset`` is the mean. None if they are
+    unknown.
+    """
+    told = pyramid_in(instrument).image_offsets_subap
+    if told is None:
+        return None
+    turned = turned_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
+    return turned - turned.mean(axis=(0, 1))
+
+
+def pupil_offset(instrument: Instrument) -> tuple[float, float] | None:
+    """Return the mean displacement (x, y) of the images, subapertures; None if unknown."""
+    told = pyramid_in(instrument).image_offsets_subap
+    if told is None:
+        return None
+    turned = turned_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
+    x, y = turned.mean(axis=(0, 1))
+    return float(x), float(y)
+
+
+def displaced(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
+    """Return the pyramid with its images beside their places ``(8,)``.
+
+    Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y, then
+    along y.
+    """
+    turned = turned_offsets(
+        offsets.reshape(2, 2, 2).transpose(1, 2, 0),
+        instrument.slopes.assumed_orientation,
+        back=True,
+    )
+    places = tuple((float(x), float(y)) for x, y in turned.reshape(4, 2))
+    return replace(pyramid_in(instrument), image_offsets_subap=places)
+
+
+def turned_offsets(
+    offsets: NDArray[np.float64], orientation: Orientation, *, back: bool = False
+) -> NDArray[np.float64]:
+    """Return displacements ``(2, 2, 2)`` of the RTC's axes in those of conventions.md.
+
+    Side along y, side along x, (x, y). A sign of -1 exchanges the images' roles and leaves each at
+    its place, as with pixels. ``back``: from conventions.md to the RTC's axes.
+    """
+    flips = np.array([orientation.flip_x, orientation.flip_y])
+    signs = np.array([orientation.sign_x, orientation.sign_y]) * (-1) ** flips
+
+    def flipped(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values[:: signs[1], :: signs[0]] * (-1.0) ** flips
+
+    def swapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values.swapaxes(0, 1)[..., ::-1] if orientation.swap_xy else values
+
+    return flipped(swapped(offsets)) if back else swapped(flipped(offsets))
 
 
 def pyramid_in(instrument: Instrument) -> Pyramid:

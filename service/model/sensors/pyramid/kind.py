@@ -173,6 +173,27 @@ class PyramidKind(SensorKind):
         return "Pyramid", {"n_sides": 4, "dimensions": recipe.kind.n_planes}
 
     @override
+    def pixel_subap(self, instrument: Instrument) -> float | None:
+        from service.model.sensors.pyramid.description import FrameWindows, pyramid_in
+
+        if pyramid_in(instrument).image_offsets_subap is not None:
+            return None
+        frames = instrument.frames
+        return 1.0 / frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1.0
+
+    @override
+    def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
+        from service.model.sensors.pyramid.description import displaced
+
+        return displaced(instrument, offsets)
+
+    @override
+    def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
+        from service.model.sensors.pyramid.description import pupil_offset
+
+        return pupil_offset(instrument)
+
+    @override
     def light(self, instrument: Instrument) -> PyramidLight:
         from service.model.sensors.pyramid.light import PyramidLight
 

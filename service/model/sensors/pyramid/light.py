@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from service.errors import ModelError
 from service.model.instrument import Instrument
 from service.model.pupil import Illumination, instrument_pupil
-from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.description import image_offsets, pyramid_in
 from service.model.sensors.pyramid.optics import PyramidOptics, enough_modulation_points
 from service.model.sensors.sensor import CannotTell, PupilPosition
 from service.model.slopes import turned_mask
@@ -155,6 +155,7 @@ def even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:
         pupil=instrument_pupil(instrument, sampling),
         n_nodes=sampling,
         n_modulation=enough_modulation_points(pyramid_in(instrument)),
+        offsets=image_offsets(instrument),
     )
 
 

@@ -116,6 +116,10 @@ class PyramidOptics:
     arrays: Arrays = NUMPY
     """What computes a row of subapertures; all that rows share is made by NumPy."""
 
+    offsets: NDArray[np.float64] | None = None
+    """``(2, 2, 2)`` displacement of each image from its place on the pixel grid, subapertures: side
+    along y, side along x, (x, y); None: all four lie where they should."""
+
     def __post_init__(self) -> None:
         """Refuse a modulation that the formulas cannot fold.
 
@@ -174,22 +178,38 @@ class PyramidOptics:
 
     def prepare(self, of_row: RowResponse) -> PreparedRows:
         """Return what all rows of subapertures share."""
-        roof_y = self._roof(of_row.shift[1], of_row.nodes_y)
-        roof_x = self._roof(of_row.shift[0], of_row.nodes_x)
-        modulated_y, modulated_x = self._modulated(roof_y, roof_x)
-        fields_at_rest = self._fields(modulated_y, modulated_x)
+        images = np.empty((2, self.wfs.n_subapertures, 2, self.wfs.n_subapertures))
+        parts = []
+        for grid in self._grids:
+            roof_y = self._roof(of_row.shift[1] + grid.y, of_row.nodes_y, grid.sides_y)
+            roof_x = self._roof(of_row.shift[0] + grid.x, of_row.nodes_x, grid.sides_x)
+            modulated_y, modulated_x = self._modulated(roof_y, roof_x)
+            fields_at_rest = self._fields(modulated_y, modulated_x)
+            images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
+            parts.append(
+                PreparedGrid(
+                    grid=grid,
+                    fields=fields_at_rest,
+                    factors_y=_weighted_parts(modulated_y, roof_y, axis=1),
+                    factors_x=self.arrays.there(_weighted_parts(modulated_x, roof_x, axis=-2)),
+                    signs=self._signs(len(roof_y.weights), len(roof_x.weights), grid),
+                )
+            )
         return PreparedRows(
-            images=self._images(fields_at_rest, roof_y, roof_x),
-            fields=fields_at_rest,
-            factors_y=_weighted_parts(modulated_y, roof_y, axis=1),
-            factors_x=self.arrays.there(_weighted_parts(modulated_x, roof_x, axis=-2)),
-            signs=self._signs(len(roof_y.weights), len(roof_x.weights)),
-            finish=self._finish(of_row.shapes),
+            images=images, parts=tuple(parts), finish=self._finish(of_row.shapes)
         )
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""
-        return self.arrays.here(rows.finish(*self._row_factors(row, columns, rows)))
+        factors = [self._row_factors(row, columns, part) for part in rows.parts]
+        if len(factors) == 1:
+            return self.arrays.here(rows.finish(*factors[0]))
+        # each image is one more set of terms in the sum over products of factors
+        xp = self.arrays.xp
+        along_y = xp.concat([along_y for along_y, _ in factors], axis=1)
+        every_x = zip(*(along_x for _, along_x in factors), strict=True)
+        along_x = [xp.concat(list(same), axis=1) for same in every_x]
+        return self.arrays.here(rows.finish(along_y, along_x))
 
     @property
     def n_pairs(self) -> int:
@@ -198,9 +218,30 @@ class PyramidOptics:
 
     def images(self, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
         """Return the light at rest ``(2, n, 2, n)``: side, row along y, side, column along x."""
-        roof_y = self._roof(shift[1], Nodes.area(self.n_nodes))
-        roof_x = self._roof(shift[0], Nodes.area(self.n_nodes))
-        return self._images(self._fields(*self._modulated(roof_y, roof_x)), roof_y, roof_x)
+        n, nodes = self.wfs.n_subapertures, Nodes.area(self.n_nodes)
+        images = np.empty((2, n, 2, n))
+        for grid in self._grids:
+            roof_y = self._roof(shift[1] + grid.y, nodes, grid.sides_y)
+            roof_x = self._roof(shift[0] + grid.x, nodes, grid.sides_x)
+            fields_at_rest = self._fields(*self._modulated(roof_y, roof_x))
+            images[grid.sides_y, :, grid.sides_x] = self._images(fields_at_rest, roof_y, roof_x)
+        return images
+
+    @property
+    def n_grids(self) -> int:
+        """Regular grids that the detector points of the four images form."""
+        return len(self._grids)
+
+    @property
+    def _grids(self) -> tuple[_Grid, ...]:
+        """The four images together or, where each lies elsewhere, one by one."""
+        if self.offsets is None:
+            return (_Grid(sides_y=slice(0, 2), sides_x=slice(0, 2)),)
+        return tuple(
+            _Grid(sides_y=slice(y, y + 1), sides_x=slice(x, x + 1), x=float(at[0]), y=float(at[1]))
+            for y, row in enumerate(self.offsets)
+            for x, at in enumerate(row)
+        )
 
     def _flux_gradient(self, by_row: list[Array], n_valid: int) -> Array:
         match self.recipe.normalisation:
@@ -213,11 +254,11 @@ class PyramidOptics:
     def _complex(self) -> type[np.complex64] | type[np.complex128]:
         return np.complex64 if self.dtype is np.float32 else np.complex128
 
-    def _roof(self, shift: float, nodes: Nodes) -> _Roof:
+    def _roof(self, shift: float, nodes: Nodes, sides: slice) -> _Roof:
         """Return the roof operator along one axis, at the nodes of every subaperture."""
         n, half = self.wfs.n_subapertures, self.wfs.image_separation_subap / 2
         centres = np.arange(n) - (n - 1) / 2
-        x = _SIDES[:, None, None] * half + centres[:, None] + nodes.offsets - shift
+        x = _SIDES[sides, None, None] * half + centres[:, None] + nodes.offsets - shift
         distance = x[..., None] - self.pupil.coordinates
         kernel = _roof_kernel(distance, half, self.pupil.sampling)
         return _Roof(
@@ -291,11 +332,11 @@ class PyramidOptics:
         # what the halo loses beyond the grid still falls on the detector, only without signal
         return np.asarray(images / (2.0 * self._source()[2].sum()))
 
-    def _signs(self, n_y: int, n_x: int) -> Array:
+    def _signs(self, n_y: int, n_x: int, grid: _Grid) -> Array:
         """Return with which sign each field at rest has a part in every plane of signals.
 
-        ``(n_planes, 1, 1, 2, 2, n_y, 2, 2, n_x)``: with local normalisation the flux is one more
-        plane. Of the two parts of a field, times i and as it is, see ``_row_factors``.
+        ``(n_planes, 1, 1, 2, n_sides, n_y, n_sides, 2, n_x)``: with local normalisation the flux
+        is one more plane. Of the two parts of a field, times i and as it is, see ``_row_factors``.
         """
         if self.recipe.kind is SignalKind.INTENSITY:
             signs = np.eye(4).reshape(4, 2, 2)
@@ -303,13 +344,15 @@ class PyramidOptics:
             signs = np.stack([np.tile(_SIGNS, (2, 1)), np.tile(_SIGNS, (2, 1)).T])
         if self.recipe.normalisation is Normalisation.LOCAL:
             signs = np.concatenate([signs, np.ones((1, 2, 2))])
+        signs = signs[:, grid.sides_y, grid.sides_x]
         parts = np.array([1j, 1.0])[:, None, None, None, None, None]
         every = signs[:, None, None, None, :, None, :, None, None] * parts
-        shape = (len(signs), 1, 1, 2, 2, n_y, 2, 2, n_x)
+        n_planes, on_y, on_x = signs.shape
+        shape = (n_planes, 1, 1, 2, on_y, n_y, on_x, 2, n_x)
         return np.broadcast_to(every, shape).astype(self._complex)
 
     def _row_factors(
-        self, row: int, columns: Array, rows: PreparedRows
+        self, row: int, columns: Array, rows: PreparedGrid
     ) -> tuple[Foreign, list[Foreign]]:
         """Return factors ``(N, n_terms)`` along y, ``(n_lines, n_terms, N)`` along x of one row.
 
@@ -334,16 +377,16 @@ class PyramidOptics:
         lines = xp.matmul(there(left), right)
         along_x = [xp.reshape(lines, (n_planes * n_columns, -1, n_u))]
         if self.recipe.normalisation is Normalisation.GLOBAL:
-            along_x.append(self._flux_factor(lines, along_y))
+            along_x.append(self._flux_factor(lines, along_y, rows.grid))
         return there(along_y.reshape(-1, n_u).T), along_x
 
-    def _flux_factor(self, lines: Foreign, along_y: Array) -> Foreign:
+    def _flux_factor(self, lines: Foreign, along_y: Array, grid: _Grid) -> Foreign:
         """Return the factor along x of a row's whole flux, ``(1, n_terms, N)``."""
         xp = self.arrays.xp
         if self.recipe.kind is SignalKind.INTENSITY:
             flux = xp.sum(lines, axis=(0, 1))
         else:  # the plane along y, less its signs
-            signs = np.broadcast_to(_SIGNS[:, None, None], (*along_y.shape[:-1], 1))
+            signs = np.broadcast_to(_SIGNS[grid.sides_y, None, None], (*along_y.shape[:-1], 1))
             signs = signs.reshape(len(along_y), -1, 1).astype(self.dtype)
             flux = xp.sum(lines[1, ...], axis=0) * self.arrays.there(signs)
         return xp.reshape(flux, (1, -1, flux.shape[-1]))
@@ -380,11 +423,23 @@ class PyramidOptics:
         return gradient if shapes is None else xp.matmul(gradient, shapes)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PreparedRows:
-    """What all rows of subapertures share."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Grid:
+    """Images whose detector points form one regular grid, so that their optics are separable."""
 
-    images: NDArray[np.float64]
+    sides_y: slice
+    sides_x: slice
+    x: float = 0.0
+    """Displacement along x, subapertures."""
+
+    y: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PreparedGrid:
+    """What all rows of subapertures share, of the images on one grid."""
+
+    grid: _Grid
     fields: Array
     factors_y: Array
     """``(M/2, Re | Im, n, 2, n_nodes, N)``."""
@@ -394,6 +449,15 @@ class PreparedRows:
 
     signs: Array
     """What a field is multiplied by in every plane of signals."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PreparedRows:
+    """What all rows of subapertures share."""
+
+    images: NDArray[np.float64]
+    parts: tuple[PreparedGrid, ...]
+    """One for the four images together, or one for each."""
 
     finish: Callable[[Foreign, list[Foreign]], Foreign]
     """What makes of a row's factors its gradient, or its response to shapes."""

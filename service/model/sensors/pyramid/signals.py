@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
-from service.model.kinds import Normalisation, SignalKind
+from service.model.kinds import Normalisation, SignalKind, SlopeOrder
 from service.model.local import Shapes
 from service.model.pupil import PupilGrid, valid_subapertures
 from service.model.sensors.kind import WorkingPoint
-from service.model.sensors.pyramid.description import pyramid_in
+from service.model.sensors.pyramid.description import image_offsets, pyramid_in
 from service.model.sensors.pyramid.optics import (
     LightGradient,
     Nodes,
@@ -24,7 +24,7 @@ from service.model.sensors.pyramid.optics import (
 )
 from service.model.sensors.pyramid.working_point import Halo
 from service.model.sensors.sensor import KEPT_BYTES, Fineness, Mapper, Work, by_rows
-from service.model.slopes import PLAIN, SlopeRecipe
+from service.model.slopes import PLAIN, TO_SLOPES, SlopeRecipe
 
 Array = NDArray[Any]
 
@@ -57,6 +57,7 @@ def pyramid_sensor(
         halo=working_point,
         recipe=instrument.slopes,
         arrays=fineness.arrays,
+        offsets=image_offsets(instrument),
     )
     return PyramidSensor(
         optics=optics,
@@ -101,7 +102,8 @@ class PyramidSensor:
         n, side = optics.wfs.n_subapertures, len(optics.pupil.coordinates)
         n_points = int(optics.pupil.lit.sum())
         local = optics.recipe.normalisation is Normalisation.LOCAL
-        n_terms = 4 * optics.n_pairs * optics.n_nodes
+        each = 4 if optics.n_grids == 1 else 8  # one image at a time has half the terms of four
+        n_terms = each * optics.n_pairs * optics.n_nodes
         in_a_row = optics.recipe.kind.n_planes * n + (n if local else 1)
         gradients = rows + (n_valid if local else int(self.valid.any(axis=1).sum()))
         n_lines = 2 * n * optics.n_nodes
@@ -160,6 +162,26 @@ class PyramidResponse:
         signals = normalised_jacobian(at_rest, valid, out=at_rest.gradient)
         return self._per_metre(signals), along_x, along_y
 
+    def image_rates(self, shapes: Shapes) -> Array:
+        """Return how the signals change when one image alone moves, ``(8, n_signals, n_shapes)``.
+
+        The images at -x -y, +x -y, -x +y, +x +y along x, then all four along y.
+        """
+        sensor, valid, recipe = self.sensor, self.sensor.valid, self.sensor.optics.recipe
+        apart = replace(sensor.optics, recipe=SlopeRecipe(order=SlopeOrder.IMAGES))
+        images = replace(sensor, optics=apart)
+        at_rest, rates = self._to(shapes), []
+        for edges in ({"nodes_x": Nodes.edges()}, {"nodes_y": Nodes.edges()}):
+            moving = replace(self, sensor=images)._to(shapes, **edges)  # noqa: SLF001 - its own kind
+            by_image = moving.gradient.reshape(2, 2, -1, moving.gradient.shape[1])
+            for side_y, side_x in np.ndindex(2, 2):
+                light = np.zeros_like(moving.images)
+                light[side_y, :, side_x] = moving.images[side_y, :, side_x]
+                one = _of_image(by_image[side_y, side_x], (side_y, side_x), recipe)
+                rate = normalised_derivative(at_rest, replace(one, images=light), valid)
+                rates.append(self._per_metre(rate))
+        return np.array(rates)
+
     @cached_property
     def _gradient(self) -> LightGradient:
         """The gradient at every point."""
@@ -197,6 +219,23 @@ class PyramidResponse:
         if gradient.ndim == 1:
             return np.asarray((gradient[None] @ shapes)[0])
         return by_rows(self.sensor.mapper, lambda rows: rows @ shapes, gradient)
+
+
+def _of_image(gradient: Array, image: tuple[int, int], recipe: SlopeRecipe) -> LightGradient:
+    """Return the gradient of all signals where only one image ``(n_valid, n_shapes)`` changes."""
+    n_valid, n_shapes = gradient.shape
+    if recipe.kind is SignalKind.INTENSITY:
+        weights = np.eye(4)[2 * image[0] + image[1]]
+    else:
+        weights = TO_SLOPES[SignalKind.INTENSITY][:, 2 * image[0] + image[1]]
+    planes = weights.astype(gradient.dtype)[:, None, None] * gradient
+    local = recipe.normalisation is Normalisation.LOCAL
+    return LightGradient(
+        images=np.empty(0),
+        gradient=planes.reshape(-1, n_shapes),
+        flux_gradient=gradient if local else gradient.sum(axis=0) / n_valid,
+        recipe=recipe,
+    )
 
 
 def pixel_places(valid: NDArray[np.bool_]) -> NDArray[np.intp]:

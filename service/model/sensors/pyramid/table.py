@@ -12,11 +12,20 @@ from service.model.kinds import Count, Positive, Read
 USUAL_SEPARATION = 1.2
 """Distance of neighbouring pupil images over their diameter, where nobody tells."""
 
+MAX_OFFSET_PX = 4.0
+"""Largest displacement of a pupil image from its place on the pixel grid, detector pixels. Whole
+pixels belong into the windows that cut the images."""
+
 Across = Annotated[int, Ge(4), Le(1000)]
 Modulation = Annotated[float, Ge(0.0), Le(100.0)]
 Pixel = Annotated[float, Ge(0.0)]
 Centre = tuple[Pixel, Pixel]
 Centres = tuple[Centre, Centre, Centre, Centre]
+Offset = tuple[
+    Annotated[float, Ge(-MAX_OFFSET_PX), Le(MAX_OFFSET_PX)],
+    Annotated[float, Ge(-MAX_OFFSET_PX), Le(MAX_OFFSET_PX)],
+]
+Offsets = tuple[Offset, Offset, Offset, Offset]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,6 +106,13 @@ class PyramidTable(PyramidNumbers):
 
     pixels_per_subaperture: Count = 1
     """Frames only."""
+
+    image_offsets_px: Offsets | None = None
+    """Displacement [x, y] of each pupil image from its place on the pixel grid, detector pixels,
+    in the RTC's axes, in the order of the images' places: -x -y, +x -y, -x +y, +x +y. With
+    ``stop = "mirror"`` only differences from their mean count: the mean is the shift itself. Not
+    given: fitted to a measured matrix. "unknown": so, and the uncertainty of live estimates allows
+    for 0.15 pixel."""
 
     mode: tuple[PyramidMode, ...] = ()
     """A table ``[[wfs.mode]]`` for each; the service begins with the first."""

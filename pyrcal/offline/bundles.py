@@ -17,6 +17,7 @@ from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.config import Settings, load_instrument, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
+from service.files.container import NUMPY_DAMAGE
 from service.files.documents import json_text
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
@@ -141,7 +142,7 @@ def _interaction_matrix(
 def _reference(path: Path, n_slopes: int) -> NDArray[np.float32]:
     try:
         found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except NUMPY_DAMAGE as error:
         raise ConfigurationError(f"--reference {path}: {error}") from error
     if found.shape != (n_slopes,):
         raise ConfigurationError(

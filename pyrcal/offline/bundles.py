@@ -18,10 +18,11 @@ from service.config import Settings, load_instrument, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
 from service.files.container import NUMPY_DAMAGE
+from service.files.disk_cache import cached_basis
 from service.files.documents import json_text
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
-from service.model.modes import ModalBasis, modal_basis
+from service.model.modes import ModalBasis
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.wire import checksum
 
@@ -78,7 +79,7 @@ def _whole(
             f"{record.id}: was made for {made_for}; found the instrument {instrument.name}: give "
             "its own with --instrument"
         )
-    basis = modal_basis(instrument)
+    basis = cached_basis(instrument)
     if isinstance(basis, ModalBasis):
         arrays["mode_to_actuator"] = np.asarray(basis.mode_to_actuator)
     if options.interaction_matrix:

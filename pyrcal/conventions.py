@@ -22,9 +22,9 @@ from pyrcal.terminal import print_lines
 from service.config import load_instrument
 from service.errors import MatrixError, ModelError
 from service.estimation.reference import Reference
+from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument
 from service.model.misregistration import wrapped
-from service.model.modes import modal_basis
 from service.model.pupil import instrument_pupil, rtc_valid_subapertures
 from service.model.slopes import FLIPS
 
@@ -163,7 +163,7 @@ def _basis(instrument: Instrument) -> Iterator[RuleCheck]:
     """Yield what the shapes of the modes are like over the pupil, the lowest ones alone."""
     if not instrument.mirror.stroke_known:
         return
-    basis = modal_basis(instrument)
+    basis = cached_basis(instrument)
     lowest = basis.subset(np.arange(min(basis.n_modes, 20)))
     pupil = instrument_pupil(instrument, 3)
     shapes = lowest.render(pupil.points)

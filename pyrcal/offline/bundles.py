@@ -17,10 +17,12 @@ from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.config import Settings, load_instrument, load_settings
 from service.errors import ArchiveError, ConfigurationError, UnknownIdError, say, shown
 from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundle
+from service.files.container import NUMPY_DAMAGE
+from service.files.disk_cache import cached_basis
 from service.files.documents import json_text
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
-from service.model.modes import ModalBasis, modal_basis
+from service.model.modes import ModalBasis
 from service.tracking.products import MatrixState, ReconstructorRecord
 from service.wire import checksum
 
@@ -77,7 +79,7 @@ def _whole(
             f"{record.id}: was made for {made_for}; found the instrument {instrument.name}: give "
             "its own with --instrument"
         )
-    basis = modal_basis(instrument)
+    basis = cached_basis(instrument)
     if isinstance(basis, ModalBasis):
         arrays["mode_to_actuator"] = np.asarray(basis.mode_to_actuator)
     if options.interaction_matrix:
@@ -141,7 +143,7 @@ def _interaction_matrix(
 def _reference(path: Path, n_slopes: int) -> NDArray[np.float32]:
     try:
         found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except NUMPY_DAMAGE as error:
         raise ConfigurationError(f"--reference {path}: {error}") from error
     if found.shape != (n_slopes,):
         raise ConfigurationError(

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import ModelError
+from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument
 from service.model.interaction import Linearisation, RtcInteractionModel
 from service.model.misregistration import Misregistration
-from service.model.modes import modal_basis
 
 
 def interaction_matrix(
@@ -19,8 +19,9 @@ def interaction_matrix(
 ) -> NDArray[np.float32]:
     """Return the noise-free D(α) of an instrument, ``(n_slopes, n_modes)`` slope per metre of OPD.
 
-    Rows stand as the RTC lists its slopes. Without ``alpha``: of a perfect registration. Who needs
-    many keeps an ``RtcInteractionModel``, which does not begin anew.
+    Rows are in the order of the RTC's slopes. Without ``alpha`` the registration is perfect. The
+    modes are cached on disk (in ``$PYRCAL_SERVICE__CACHE_DIR``, or ``~/.cache/pyrcal``); many
+    matrices of one instrument are quickest with one ``RtcInteractionModel``.
 
     Raises
     ------
@@ -29,9 +30,9 @@ def interaction_matrix(
 
     References
     ----------
-    Heritier et al. 2018, equation 6: D = M_WFS M_DM.
+    Heritier et al. 2018, equation 1: D = M_WFS M_DM.
     """
-    model = RtcInteractionModel(instrument, modal_basis(instrument))
+    model = RtcInteractionModel(instrument, cached_basis(instrument))
     return np.asarray(model.interaction_matrix(alpha or Misregistration()), np.float32)
 
 

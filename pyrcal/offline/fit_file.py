@@ -18,6 +18,7 @@ from pyrcal.offline.recorded import FLUX_FRAME, Recorded, read_recorded
 from pyrcal.offline.report import FitReport
 from service.errors import MatrixError
 from service.estimation.reference import Reference
+from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.modes import Basis
 from service.model.sensors.registry import kind_of
@@ -36,8 +37,9 @@ def fit_file(
     basis: Basis | None = None,
     progress: Progress | None = None,
 ) -> FitReport:
-    """Return the fit of the measured matrix in a file; ``basis`` as in ``fit_matrix``.
+    """Return the fit of the measured matrix in a file.
 
+    ``basis`` are the instrument's modes; None: from the cache on disk, or made here.
     What would take more than ``memory_gb`` is refused before it is fitted; None: it is not asked.
 
     Raises
@@ -54,11 +56,15 @@ def fit_file(
         n_modes = len(reference.columns if options.modes is None else options.modes)
         check_fit(instrument, n_modes, memory_gb, gain_map=options.gain_map)
     begun = time.perf_counter()
+    tell = progress or (lambda _: None)
     # BLAS keeps to one thread: nested threading made a fit seven times slower
     with threadpool_limits(1), ThreadPoolExecutor(threads) as pool:
         try:
+            if basis is None:
+                tell("modes")
+                basis = cached_basis(instrument)
             fit = fit_matrix(
-                instrument, reference, options, basis=basis, mapper=pool.map, progress=progress
+                instrument, reference, options, basis=basis, mapper=pool.map, progress=tell
             )
         except MatrixError as error:
             text = str(error).removeprefix("reference: ")

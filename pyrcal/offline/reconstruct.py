@@ -31,11 +31,12 @@ from service.control.gains import CalibrationGains
 from service.control.reconstructor import InversionMethod, Prior, Recipe, reconstruct
 from service.errors import ConfigurationError, MatrixError, say
 from service.files import parse_alpha
+from service.files.disk_cache import cached_basis
 from service.files.whole import write_whole
 from service.model.arrays import arrays_of
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
-from service.model.modes import Basis, ModalBasis, modal_basis
+from service.model.modes import Basis, ModalBasis
 from service.model.sensors.registry import kind_of
 from service.model.surface import Gaussian
 
@@ -161,7 +162,7 @@ def _with_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
 
 def _basis(instrument: Instrument, fit: KnownFit) -> Basis:
     """Return the modes of the instrument, its actuators coupled as the fit found."""
-    basis, coupling = modal_basis(instrument), fit.instrument_found.get(COUPLING_KEY)
+    basis, coupling = cached_basis(instrument), fit.instrument_found.get(COUPLING_KEY)
     if coupling is None or not isinstance(basis, ModalBasis):
         return basis
     if not isinstance(basis.surface, Gaussian):

@@ -7,6 +7,7 @@ conventions.md; those of any other file are as its instrument lists them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,8 @@ class _Reader:
                 f"loop {loop.uid}: found a command of frame {alone[0]}, which has no slopes"
             )
         stamps = _stamps(commands)
+        if not np.all(np.isfinite(stamps)):
+            raise self._refusal(f"loop {loop.uid}: found times that are not finite numbers")
         arrays = {
             "slopes": slopes[[places[seq] for seq in seqs]],
             "commands_m": self._modal(loop),
@@ -247,10 +250,15 @@ class _Reader:
 
 
 def _numbers(image: Any) -> list[int]:  # noqa: ANN401
-    """Return the numbers of the frames that an image is of; empty: it has none."""
-    return [] if image.time is None else [int(number) for number in image.time.frame_numbers]
+    """Return the numbers of the frames that an image is of, -1 where one is missing.
+
+    Empty if it has none.
+    """
+    given = [] if image.time is None else image.time.frame_numbers
+    return [-1 if number is None else int(number) for number in given]
 
 
 def _stamps(image: Any) -> list[float]:  # noqa: ANN401
-    """Return their times, seconds; empty: it has none."""
-    return [] if image.time is None else [float(stamp) for stamp in image.time.timestamps]
+    """Return their times in seconds, NaN where one is missing; empty if it has none."""
+    given = [] if image.time is None else image.time.timestamps
+    return [math.nan if stamp is None else float(stamp) for stamp in given]

@@ -13,6 +13,10 @@ An HDF5 file, or an ``.npz`` of NumPy's, with
 
 and the numbers ``frame_rate_hz``, ``delay_frames`` (default 2), ``leak`` (default 1), ``t0_ns_utc``
 (default 0), as attributes of the HDF5 file or arrays of one number. Metres are metres of OPD.
+
+Small arrays are checked before anything is played. Slopes and commands may be larger than the
+memory: they are checked as they are read, and frames that hold a number that is not finite are left
+out, as the service leaves them out.
 """
 
 from __future__ import annotations
@@ -30,7 +34,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from service.errors import ConfigurationError
+from pyrcal.offline.importers.saved import read_npz
+from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of
 from service.files.recording import Message, RecordedKind
 from service.model.instrument import Instrument
@@ -57,6 +62,24 @@ Array = NDArray[np.float64]
 STATUS_S: Final = 0.5
 """Between two statuses."""
 
+MAX_NUMBER: Final = 1e12
+"""Largest slope, command (m) or element of a reconstructor (m per slope), in whatever unit: larger
+ones overflow single precision once they are squared and summed."""
+
+_LOOKED_AT: Final = 2000
+"""Frames of the dither in which each of its modes has to move."""
+
+MAX_RATE_HZ: Final = 1e6
+MAX_DELAY_FRAMES: Final = 100.0
+MAX_SPAN_S: Final = 86_400.0
+"""Longest time from the first frame to the last: the contract's limit for a dither."""
+
+_FINITE: Final = f"finite numbers up to {MAX_NUMBER:g}"
+
+_MOST_EXACT: Final = 2**53
+_MOST_SEQ: Final = 2**62
+"""Largest frame numbers that a double and a message can hold; room is left for what follows."""
+
 SESSION: Final = "file"
 MATRIX_ID: Final = "of-the-file"
 
@@ -73,8 +96,7 @@ def opened_arrays(path: Path) -> Iterator[Arrays]:
     with contextlib.ExitStack() as stack:
         try:
             if zipfile.is_zipfile(path):
-                stored = stack.enter_context(np.load(path, allow_pickle=False))
-                found: dict[str, Any] = {name: stored[name] for name in stored.files}
+                found: dict[str, Any] = dict(read_npz(path, max_bytes=None))
                 facts: Mapping[str, Any] = {}
             elif kind_of(path) is FileKind.HDF5:
                 file = stack.enter_context(h5py.File(path, "r", locking=False))
@@ -82,7 +104,7 @@ def opened_arrays(path: Path) -> Iterator[Arrays]:
                 facts = file.attrs
             else:
                 raise ConfigurationError(f"{path}: expected telemetry in HDF5 or .npz")
-        except (OSError, RuntimeError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (OSError, RuntimeError, ValueError, KeyError) as error:
             raise ConfigurationError(f"{path}: damaged: {error}") from error
         yield Arrays(path=path, found=found, facts=facts)
 
@@ -101,31 +123,68 @@ class Arrays:
         Raises
         ------
         ConfigurationError
-            If something is missing or of the wrong shape: what was found and expected, and where.
+            If something is missing, of the wrong shape or out of its range, or if no frame is
+            finite: what was found and expected, and where.
         """
         n_modes = instrument.modes.n_modes
         n_frames, n_slopes = self._shape("slopes", (None, None))
         _, n_given = self._shape("commands_m", (n_frames, None))
         if n_given > n_modes:
             raise self._refusal("commands_m", f"{n_given} modes", f"at most the basis's {n_modes}")
-        seq = self._sequence(n_frames)
-        matrix = self._reconstructor(n_slopes, n_modes)
-        status = self._status(instrument, n_slopes, n_given if matrix is None else len(matrix))
         if self._has("dither_m"):
             self._shape("dither_m", (n_frames, n_given))
+        seq = self._sequence(n_frames)
+        matrix = self._reconstructor(n_slopes, n_modes)
+        n_controlled = n_given if matrix is None else len(matrix)
+        status = self._status(instrument, n_slopes, n_given, n_controlled)
         if matrix is not None:
             yield _matrix_message(matrix, status)
         every = max(1, round(STATUS_S * status.frame_rate_hz))
-        told = -1
-        for first, last in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
-            since = seq[[first, last - 1]] - seq[0]
-            if since[0] // every != told:
-                told = since[0] // every
-                yield _status_message(status, int(seq[first]), int(since[0]))
-            header = self._header(status, int(seq[first]), last - first, int(since[0]))
-            payload, attachment = encode_frames(header, self._rows(first, last, n_modes))
-            at_s = float(since[1] + 1) / status.frame_rate_hz
-            yield Message(at_s, RecordedKind.FRAMES, payload, attachment)
+        told, unusable = -1, np.zeros(0, np.intp)
+        for start, stop in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
+            rows = self._rows(start, stop, n_modes)
+            usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)  # False for NaN, too
+            unusable = np.concatenate([unusable, start + np.flatnonzero(~usable)])
+            for first, last in _runs(usable):
+                numbers = seq[[start + first, start + last - 1]]
+                since = numbers - seq[0]
+                if since[0] // every != told:
+                    told = since[0] // every
+                    yield _status_message(status, int(numbers[0]), int(since[0]))
+                header = self._header(status, int(numbers[0]), last - first, int(since[0]))
+                payload, attachment = encode_frames(header, rows[first:last])
+                at_s = float(since[1] + 1) / status.frame_rate_hz
+                yield Message(at_s, RecordedKind.FRAMES, payload, attachment)
+        self._report_unusable(unusable, n_frames)
+
+    def _report_unusable(self, frames: NDArray[np.intp], n_frames: int) -> None:
+        """Name frames that were left out.
+
+        Raises
+        ------
+        ConfigurationError
+            If that leaves none.
+        """
+        if not len(frames):
+            return
+        name, column, value = self._unusable_number(int(frames[0]))
+        where = f"{value:g} in row {frames[0]}, column {column}"
+        if len(frames) == n_frames:
+            raise self._refusal(name, f"{where}, and no frame without such a number", _FINITE)
+        say(
+            f"note: {self.path}: {name}: found {where}; {len(frames)} of {n_frames} frames hold "
+            "such numbers and are left out"
+        )
+
+    def _unusable_number(self, row: int) -> tuple[str, int, float]:
+        """Return array, column and value of the first number of a frame that cannot be used."""
+        for name in ("slopes", "commands_m", "dither_m"):
+            if self._has(name):
+                values = np.asarray(self.found[name][row], float)
+                (places,) = np.nonzero(~(np.abs(values) <= MAX_NUMBER))
+                if len(places):
+                    return name, int(places[0]), float(values[places[0]])
+        raise AssertionError(f"row {row} of {self.path} is finite")
 
     def _header(self, status: Status, seq0: int, n: int, since: int) -> FrameHeader:
         return FrameHeader(
@@ -144,31 +203,42 @@ class Arrays:
 
     def _rows(self, first: int, last: int, n_modes: int) -> NDArray[np.float32]:
         """Return some frames as they travel; modes that the file does not tell of stand still."""
-        parts = [np.asarray(self.found["slopes"][first:last], np.float32)]
-        for name in ("commands_m", "dither_m"):
-            if self._has(name):
-                given = np.asarray(self.found[name][first:last], np.float32)
-                parts.append(np.pad(given, ((0, 0), (0, n_modes - given.shape[1]))))
+        with np.errstate(over="ignore"):  # infinite in single precision: left out as such
+            parts = [np.asarray(self.found["slopes"][first:last], np.float32)]
+            for name in ("commands_m", "dither_m"):
+                if self._has(name):
+                    given = np.asarray(self.found[name][first:last], np.float32)
+                    parts.append(np.pad(given, ((0, 0), (0, n_modes - given.shape[1]))))
         return np.hstack(parts)
 
-    def _status(self, instrument: Instrument, n_slopes: int, n_controlled: int) -> Status:
+    def _status(
+        self, instrument: Instrument, n_slopes: int, n_given: int, n_controlled: int
+    ) -> Status:
         n_modes = instrument.modes.n_modes
         gains = np.zeros(n_modes)
         given = self._values("gains", 1) if self._has("gains") else np.array([0.5])
         if len(given) not in {1, n_controlled, n_modes}:
             expected = f"one number, {n_controlled} or {n_modes}"
             raise self._refusal("gains", f"{len(given)} numbers", expected)
+        self._check_each(
+            "gains",
+            given,
+            (given >= 0.0) & (given <= MAX_NUMBER),
+            f"gains from 0 to {MAX_NUMBER:g}",
+        )
         gains[: max(n_controlled, len(given) if len(given) > 1 else 0)] = given
-        rate_hz = self._number("frame_rate_hz", None)
-        if not 0.0 < rate_hz <= 1e6:
-            raise self._refusal("frame_rate_hz", f"{rate_hz:g}", "frames a second, above 0")
+        rate_hz = self._number("frame_rate_hz", None, MAX_RATE_HZ)
+        n_frames, _ = self._shape("slopes", (None, None))
+        if not rate_hz * MAX_SPAN_S >= n_frames:
+            found = f"{rate_hz:g}, at which {n_frames} frames last longer than a day"
+            raise self._refusal("frame_rate_hz", found, "frames a second")
         return Status(
-            delay_frames=self._number("delay_frames", 2.0),
+            delay_frames=self._number("delay_frames", 2.0, MAX_DELAY_FRAMES),
             gains=tuple(gains.tolist()),
-            leak=self._number("leak", 1.0),
+            leak=self._number("leak", 1.0, 1.0),
             session=SESSION,
             seq=None,
-            t_ns=int(self._number("t0_ns_utc", 0.0)),
+            t_ns=int(self._number("t0_ns_utc", 0.0, 2.0**62)),
             loop=Loop.CLOSED if n_controlled and gains.any() else Loop.OPEN,
             frame_rate_hz=rate_hz,
             n_slopes=n_slopes,
@@ -177,13 +247,13 @@ class Arrays:
             cm_id=MATRIX_ID if self._has("reconstructor") else None,
             basis_id=instrument.basis_id or SESSION,
             config_id=instrument.config_id or SESSION,
-            dither=self._dither(rate_hz),
+            dither=self._dither(rate_hz, n_given, n_frames),
             max_dither_m=1.0,
             max_dither_modes=n_modes,
             magnitude=None,
         )
 
-    def _dither(self, rate_hz: float) -> DitherStatus | None:
+    def _dither(self, rate_hz: float, n_given: int, n_frames: int) -> DitherStatus | None:
         """Return the sines that play from the first frame on; None: the file tells of none."""
         names = ("dither_modes", "dither_frequencies_hz", "dither_amplitude_m")
         if not any(map(self._has, names)):
@@ -192,7 +262,21 @@ class Arrays:
         if not len(modes) == len(frequencies) == len(amplitudes):
             sizes = f"{len(modes)} modes, {len(frequencies)} frequencies, {len(amplitudes)} strokes"
             raise self._refusal("dither_modes", sizes, "one of each for every mode")
-        n_frames, _ = self._shape("slopes", (None, None))
+        if len(np.unique(modes)) < len(modes) or not len(modes):
+            raise self._refusal("dither_modes", f"{modes.tolist()}", "each mode once")
+        indices = f"indices of columns of commands_m, counted from 0 to {n_given - 1}"
+        fits = (modes >= 0) & (modes < n_given) & (modes == np.round(modes))
+        self._check_each("dither_modes", modes, fits, indices)
+        if self._has("dither_m"):
+            moving = np.any(self.found["dither_m"][:_LOOKED_AT], axis=0)
+            still = "modes that dither_m moves (indices are counted from 0)"
+            self._check_each("dither_modes", modes, moving[modes.astype(int)], still)
+        most_hz = rate_hz / 2.0
+        fits = (frequencies > 0.0) & (frequencies < most_hz)
+        below = f"above 0 and below half of frame_rate_hz, {most_hz:g} Hz"
+        self._check_each("dither_frequencies_hz", frequencies, fits, below)
+        fits = (amplitudes > 0.0) & (amplitudes <= 1.0)
+        self._check_each("dither_amplitude_m", amplitudes, fits, "above 0 and at most 1 m of OPD")
         request = DitherRequest(
             id="dither-of-the-file",
             modes=tuple(int(mode) for mode in modes),
@@ -209,14 +293,41 @@ class Arrays:
         n_controlled, _ = self._shape("reconstructor", (None, n_slopes))
         if n_controlled > n_modes:
             raise self._refusal("reconstructor", f"{n_controlled} rows", f"at most {n_modes}")
-        return np.ascontiguousarray(self.found["reconstructor"][()], "<f4")
+        values = np.asarray(self.found["reconstructor"][()], float)
+        usable = np.abs(values) <= MAX_NUMBER  # False for NaN, too
+        if not usable.all():
+            row, column = (int(place) for place in np.argwhere(~usable)[0])
+            n_rows = int(np.sum(~usable.all(axis=1)))
+            found = (
+                f"{values[row, column]:g} in row {row}, column {column} ({n_rows} of "
+                f"{n_controlled} rows hold such numbers)"
+            )
+            raise self._refusal("reconstructor", found, _FINITE)
+        return np.ascontiguousarray(values, "<f4")
 
     def _sequence(self, n_frames: int) -> NDArray[np.int64]:
+        """Return the number of every frame, as integers: doubles end at 2^53."""
         if not self._has("seq"):
             return np.arange(n_frames, dtype=np.int64)
-        seq = self._values("seq", 1).astype(np.int64)
-        if len(seq) != n_frames or np.any(np.diff(seq) <= 0):
-            raise self._refusal("seq", f"{len(seq)} numbers", f"{n_frames} that only rise")
+        array = self.found["seq"]
+        if array.shape != (n_frames,) or array.dtype.kind not in "iuf":
+            found = f"{array.dtype} of shape {array.shape}"
+            raise self._refusal("seq", found, f"whole numbers ({n_frames},)")
+        given = np.asarray(array[()])
+        limit = _MOST_EXACT if given.dtype.kind == "f" else _MOST_SEQ
+        expected = f"whole numbers from 0 to {limit}"
+        if given.dtype.kind == "f" and len(given) and np.nanmax(given) > limit:
+            expected += ", or larger ones as integers"
+        fits = (given >= 0) & (given <= limit)
+        if given.dtype.kind == "f":
+            fits &= given == np.round(given)
+        self._check_each("seq", given, fits, expected)
+        seq = given.astype(np.int64)
+        falls = np.flatnonzero(np.diff(seq) <= 0)
+        if len(falls):
+            k = int(falls[0])
+            found = f"{seq[k + 1]} in row {k + 1} after {seq[k]}"
+            raise self._refusal("seq", found, "numbers that only rise")
         return seq
 
     # --- what is in the file
@@ -243,11 +354,27 @@ class Arrays:
         array = self.found[name]
         values = array[()] if array.dtype.kind in "iuf" else None
         values = None if values is None else np.atleast_1d(np.asarray(values, float))
-        if values is None or values.ndim != n_dimensions or not np.all(np.isfinite(values)):
+        if values is None or values.ndim != n_dimensions:
             raise self._refusal(name, f"{array.dtype} of shape {array.shape}", "finite numbers")
+        self._check_each(name, values, np.isfinite(values), "finite numbers")
         return values
 
-    def _number(self, name: str, default: float | None) -> float:
+    def _check_each(
+        self, name: str, values: NDArray[Any], fits: NDArray[np.bool_], expected: str
+    ) -> None:
+        """Refuse values of which one does not fit, with its row.
+
+        Raises
+        ------
+        ConfigurationError
+            Naming the first.
+        """
+        if not fits.all():
+            row = int(np.argmin(fits))
+            shown = f"{values[row]:.17g}" if values.dtype.kind == "f" else str(values[row])
+            raise self._refusal(name, f"{shown} in row {row}", expected)
+
+    def _number(self, name: str, default: float | None, most: float) -> float:
         given = self.facts.get(name, self.found.get(name, default))
         if given is None:
             raise self._refusal(name, "no such number", "it as an attribute or an array of one")
@@ -255,8 +382,8 @@ class Arrays:
             value = float(np.asarray(given[()] if hasattr(given, "shape") else given).item())
         except (TypeError, ValueError) as error:
             raise self._refusal(name, str(given), "one number") from error
-        if not np.isfinite(value) or value < 0.0:
-            raise self._refusal(name, f"{value:g}", "a finite number from 0")
+        if not 0.0 <= value <= most:
+            raise self._refusal(name, f"{value:g}", f"a number from 0 to {most:g}")
         return value
 
     def _refusal(self, name: str, found: str, expected: str) -> ConfigurationError:
@@ -295,6 +422,12 @@ def _status_message(status: Status, seq: int, since: int) -> Message:
 
 def _frames_at_once(n_columns: int) -> int:
     return max(1, min(FRAMES_PER_BATCH, BATCH_LIMIT // (4 * n_columns)))
+
+
+def _runs(usable: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Return first and end of runs of usable rows."""
+    edges = np.flatnonzero(np.diff(usable, prepend=False, append=False)).tolist()
+    return zip(edges[::2], edges[1::2], strict=True)
 
 
 def _batches(seq: NDArray[np.int64], n_at_once: int) -> Iterator[tuple[int, int]]:

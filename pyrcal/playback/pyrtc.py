@@ -16,7 +16,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.importers.saved import read_npz
 from service.errors import ConfigurationError
+from service.files.container import NUMPY_DAMAGE
 from service.model.instrument import Instrument
 
 Array = NDArray[Any]
@@ -47,12 +49,14 @@ def read_session(path: Path, instrument: Instrument) -> dict[str, Array]:
     slopes, answered = _stream(folder, streams, SLOPES)
     strokes, by = _stream(folder, streams, COMMANDS)
     facts = _facts(folder)
-    delay = float(facts.get("delay_frames", DELAY_FRAMES))
-    if not 1.0 <= delay <= 20.0:
+    delay = np.asarray(facts.get("delay_frames", DELAY_FRAMES))
+    if delay.size != 1 or delay.dtype.kind not in "iuf" or not 1.0 <= delay.item() <= 20.0:
         raise ConfigurationError(
-            f"{folder / FACTS}: delay_frames: found {delay:g}, expected 1 to 20"
+            f"{folder / FACTS}: delay_frames: found {delay.tolist()}, expected 1 to 20"
         )
-    sent_m, known = _on_mirror(_in_modes(strokes, instrument, folder), by, answered, delay)
+    sent_m, known = _on_mirror(
+        _in_modes(strokes, instrument, folder), by, answered, float(delay.item())
+    )
     if not known.any():
         raise ConfigurationError(
             f"{folder}: found signals of exposures {answered[0]} to {answered[-1]} and commands "
@@ -117,19 +121,13 @@ def _loaded(folder: Path, record: Mapping[str, Any], key: str) -> Array:
         raise ConfigurationError(f"{folder / MANIFEST}: {key}: found {path}, expected a file in it")
     try:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+    except NUMPY_DAMAGE as error:
         raise ConfigurationError(f"{path}: cannot be read: {error}") from error
 
 
 def _facts(folder: Path) -> dict[str, Array]:
     path = folder / FACTS
-    if not path.exists():
-        return {}
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: np.asarray(stored[name]) for name in stored.files}
-    except (OSError, ValueError, EOFError) as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error}") from error
+    return read_npz(path) if path.exists() else {}
 
 
 def _in_modes(strokes: Array, instrument: Instrument, folder: Path) -> Array:

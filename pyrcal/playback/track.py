@@ -55,7 +55,7 @@ def main(options: argparse.Namespace) -> int:
         write_whole(options.output, partial(fill, track=found, source=options.telemetry))
     if options.plot is not None:
         plot(found, f"{instrument.name}: {options.telemetry.name}", options.plot)
-    return FOUND if found.entries or found.passive else NOTHING_FOUND
+    return NOTHING_FOUND if found.state.alpha.registration is None else FOUND
 
 
 def track(path: Path, instrument: Instrument, settings: Settings | None = None) -> Track:

@@ -222,6 +222,8 @@ class Passive(PassiveSums):
     @override
     def why_unusable(self) -> str | None:
         """Return why this loop's telemetry says nothing, or None."""
+        if self.delay_frames >= N_TAPS:
+            return f"no passive estimate: the delay of {self.delay_frames:g} frames is too long"
         if self.delay_frames < MIN_DELAY_FRAMES:
             return (
                 f"no passive estimate: the loop's delay is {self.delay_frames:g} frames, "

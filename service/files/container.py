@@ -228,7 +228,7 @@ def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
     )
 
 
-_NOT_NUMPY = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)
+NUMPY_DAMAGE = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)
 """What a damaged header of NumPy raises: it is read by Python's own parser."""
 
 
@@ -237,7 +237,7 @@ def _numpy(path: Path) -> Iterator[Container]:
     """Open the one array of a NumPy file; nothing that would have to be unpickled."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except _NOT_NUMPY as error:
+    except NUMPY_DAMAGE as error:
         said = str(error).replace("\n", " ")
         raise MatrixError(f"{path}: damaged NumPy file: {said}") from error
     stored = StoredArray(

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from service.model import instrument as model_code
 from service.model.instrument import Instrument, Mirror, instrument_sha256
-from service.model.kinds import BasisKind
 from service.model.modes import Basis, ModalBasis, in_subapertures, modal_basis
 from service.model.surface import mirror_surface
 
@@ -50,6 +49,11 @@ def usual_folder(environment: Mapping[str, str]) -> Path:
     return Path(home) / "pyrcal"
 
 
+def cached_basis(instrument: Instrument) -> Basis:
+    """Return the modes of an instrument, from this user's cache folder where they are in it."""
+    return DiskCache(usual_folder(os.environ)).basis(instrument)
+
+
 class DiskCache:
     """A folder of results; without one everything is computed."""
 
@@ -60,36 +64,33 @@ class DiskCache:
     def basis(self, instrument: Instrument) -> Basis:
         """Return the modes of this instrument, as ``modal_basis`` does.
 
-        Only Karhunen-Loeve modes are kept: others are a matter of milliseconds. They are found on
-        the finest subapertures of its sensor: on binned ones they could not be told apart.
+        Only modes of analytic mirrors are cached: the statistics of turbulence take seconds even
+        where the strokes are given. A table of shapes is ready within milliseconds. Modes are
+        computed on the finest subapertures of the sensor: binned ones cannot tell them apart.
         """
         return in_subapertures(self._found(instrument.finest), instrument)
 
     def _found(self, instrument: Instrument) -> Basis:
         mirror = instrument.mirror
-        if (
-            not isinstance(mirror, Mirror)
-            or mirror.mode_to_actuator is not None
-            or mirror.basis is not BasisKind.KARHUNEN_LOEVE
-        ):
+        if not isinstance(mirror, Mirror):
             return modal_basis(instrument)
 
         def computed() -> Arrays:
             basis = modal_basis(instrument)
             if not isinstance(basis, ModalBasis):
                 raise TypeError(f"found {type(basis).__name__} for an analytic mirror")
-            return {
-                "mode_to_actuator": basis.mode_to_actuator,
-                "variance_m2": basis.variance_m2,
-            }
+            strokes, coefficients = basis.mode_to_actuator, basis.coefficients
+            found = {"mode_to_actuator": strokes, "variance_m2": basis.variance_m2}
+            # of Gaussians they are the strokes themselves, hundreds of megabytes for an ELT
+            return found if coefficients is strokes else found | {"coefficients": coefficients}
 
-        kept = self.arrays(instrument, ("modes",), computed)
-        surface = mirror_surface(mirror, instrument.subaperture_m)
+        kept = self.arrays(instrument, ("modes", "with coefficients"), computed)
         return ModalBasis(
-            surface=surface,
-            coefficients=surface.coefficients(kept["mode_to_actuator"]),
+            surface=mirror_surface(mirror, instrument.subaperture_m),
+            mode_to_actuator=kept["mode_to_actuator"],
+            coefficients=kept.get("coefficients", kept["mode_to_actuator"]),
+            variance_m2=kept["variance_m2"],
             y_sign=mirror.y_sign,
-            **kept,
         )
 
     def arrays(

@@ -10,30 +10,31 @@ import numpy as np
 
 from pyrcal.offline.importers.imported import Array
 from service.errors import MatrixError
-from service.files.container import MAX_BYTES
+from service.files.container import MAX_BYTES, NUMPY_DAMAGE
 
 
-def read_npz(path: Path) -> dict[str, Array]:
+def read_npz(path: Path, *, max_bytes: int | None = MAX_BYTES) -> dict[str, Array]:
     """Return the arrays of an ``.npz`` by name.
 
     Raises
     ------
     MatrixError
-        If it is none, is damaged, holds Python objects, or unpacks to more than 4 GB.
+        If it is none, is damaged, holds Python objects, or unpacks to more than ``max_bytes``
+        (None: there is no limit).
     """
     try:
         with zipfile.ZipFile(path) as packed:
             n_bytes = sum(member.file_size for member in packed.infolist())
-        if n_bytes > MAX_BYTES:
+        if max_bytes is not None and n_bytes > max_bytes:
             raise MatrixError(
                 f"{path}: found {n_bytes / 1e9:.1f} GB unpacked, expected at most "
-                f"{MAX_BYTES / 1e9:.2g} GB"
+                f"{max_bytes / 1e9:.2g} GB"
             )
         with np.load(path, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except OSError as error:
         raise MatrixError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, RuntimeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+    except (*NUMPY_DAMAGE, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise MatrixError(
             f"{path}: found {error}, expected arrays that np.savez wrote, and no Python objects"
         ) from error

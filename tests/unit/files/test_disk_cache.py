@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pyrcal.offline.design import interaction_matrix
 from service.files import disk_cache
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.modes import modal_basis
@@ -166,8 +167,22 @@ def test_the_folder_is_the_users_unless_the_environment_says_otherwise(tmp_path)
     assert usual_folder({}) == Path.home() / ".cache" / "pyrcal"
 
 
-def test_modes_of_the_users_own_are_not_kept(tmp_path):
+def test_modes_of_the_users_own_are_computed_once_too(tmp_path, counted):
+    """Their strokes are given; the statistics of turbulence still take seconds."""
     instrument = small_instrument()
-    own = replace(instrument.mirror, mode_to_actuator=np.eye(len(instrument.mirror.positions_m)))
-    DiskCache(tmp_path).basis(replace(instrument, mirror=own))
-    assert not list(tmp_path.iterdir())
+    strokes = np.random.default_rng(2).normal(size=(len(instrument.mirror.positions_m), 7))
+    own = replace(instrument, mirror=replace(instrument.mirror, mode_to_actuator=strokes))
+    other = replace(instrument, mirror=replace(instrument.mirror, mode_to_actuator=2.0 * strokes))
+    for _ in range(2):
+        same(DiskCache(tmp_path).basis(own), modal_basis(own))
+    assert len(counted) == 1
+    same(DiskCache(tmp_path).basis(other), modal_basis(other))
+    assert len(counted) == 2
+
+
+def test_what_people_call_uses_the_folder_of_the_environment(tmp_path, counted, monkeypatch):
+    monkeypatch.setenv("PYRCAL_SERVICE__CACHE_DIR", str(tmp_path))
+    matrices = [interaction_matrix(small_instrument()) for _ in range(2)]
+    np.testing.assert_array_equal(*matrices)
+    assert len(counted) == 1
+    assert list(tmp_path.glob("small-modes-*.npz"))

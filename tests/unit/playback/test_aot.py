@@ -2,14 +2,16 @@
 
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pyrcal.playback.aot import read_telemetry
+from pyrcal.playback.arrays import Arrays
 from pyrcal_studies.campaign.small import SMALL
 from service.config import load_instrument
-from service.errors import MatrixError
+from service.errors import ConfigurationError, MatrixError
 from service.model.pupil import rtc_valid_subapertures
 from service.model.slopes import Orientation
 
@@ -124,6 +126,30 @@ def test_times_off_the_rate_or_twice_in_a_frame_are_refused(stamps, small, tmp_p
     hand.time.timestamps = [stamp / RATE_HZ for stamp in stamps]
     with pytest.raises(MatrixError, match="of a frame off the loop's 500 Hz"):
         hand.read(tmp_path, small)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (
+            lambda hand: hand.control.__setitem__((2, 1, 4), np.nan),
+            "reconstructor: found nan in row 2",
+        ),
+        (lambda hand: hand.slopes.__setitem__((slice(None), 0, 3), np.inf), "slopes: found inf"),
+        (lambda hand: hand.modal_m.__setitem__((slice(None), 7), np.nan), "commands_m: found nan"),
+        (lambda hand: hand.time.timestamps.__setitem__(0, np.nan), "times that are not finite"),
+        (lambda hand: setattr(hand.loop, "delay", -1.0), "delay_frames: found -1"),
+    ],
+)
+def test_numbers_that_cannot_be_played_are_refused(spoil, match, small, tmp_path):
+    hand = Hand(small)
+    spoil(hand)
+    with pytest.raises((MatrixError, ConfigurationError), match=match):
+        played(hand.read(tmp_path, small).arrays, small)
+
+
+def played(arrays, about):
+    return list(Arrays(path=Path("hand.fits"), found=arrays, facts={}).messages(about))
 
 
 def test_commands_of_more_frames_than_signals_without_any_number_are_refused(small, tmp_path):

@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from pyrcal.playback.arrays import Arrays
 from pyrcal.playback.pyrtc import is_session, read_session
 from service.config import load_instrument
-from service.errors import ConfigurationError
+from service.errors import ConfigurationError, MatrixError
 from tests.system.night import INSTRUMENT
 
 N_SLOPES, N_MODES = 224, 6
@@ -84,6 +85,7 @@ BAD = {
     "a name that is none": ({"name": "wfs"}, "found the streams wfs, wfs, expected one of signal"),
     "a path out of it": ({"frames_file": "../../x.npy"}, "expected a file in it"),
     "no ids": ({"frame_ids_file": "nowhere.npy"}, "cannot be read"),
+    "two delays": ({"facts": {"delay_frames": [2.0, 3.0]}}, "expected 1 to 20"),
     "a delay": ({"facts": {"delay_frames": 0.2}}, "delay_frames: found 0.2, expected 1 to 20"),
 }
 
@@ -96,6 +98,40 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path, what):
     with pytest.raises(ConfigurationError, match=told) as error:
         read_session(folder, SMALL)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("facts", "match"),
+    [
+        ({"reconstructor": np.full((3, N_SLOPES), np.nan)}, "reconstructor: found nan in row 0"),
+        ({"leak": np.array(np.nan)}, "leak: found nan"),
+        (
+            {
+                "dither_modes": np.array([5, 6]),
+                "dither_frequencies_hz": np.array([50.0, 60.0]),
+                "dither_amplitude_m": np.full(2, 1e-8),
+            },
+            "dither_modes: found 6 in row 1",
+        ),
+    ],
+)
+def test_what_the_loop_says_beside_it_is_checked_as_any_telemetry(tmp_path, facts, match):
+    ids = range(60)
+    folder = session_in(
+        tmp_path / "s", signals=counted(ids, N_SLOPES), commands=counted(ids, N_MODES), facts=facts
+    )
+    arrays = Arrays(path=folder, found=read_session(folder, SMALL), facts={})
+    with pytest.raises(ConfigurationError, match=match):
+        list(arrays.messages(SMALL))
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip", b"PK\x03\x04 cut off"])
+def test_facts_that_cannot_be_read_are_refused(tmp_path, content):
+    given = {"signals": counted(range(9), N_SLOPES), "commands": counted(range(9), N_MODES)}
+    folder = session_in(tmp_path / "s", **given)
+    (folder / "loop.npz").write_bytes(content)
+    with pytest.raises(MatrixError, match=r"loop\.npz"):
+        read_session(folder, SMALL)
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"streams": 3}', '{"streams": [7]}'])

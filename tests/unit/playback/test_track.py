@@ -124,10 +124,10 @@ def test_hdf5_says_the_same_as_npz(telemetry, tmp_path, capsys):
 def test_without_a_dither_it_says_what_ordinary_telemetry_says(telemetry, tmp_path, capsys):
     plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
     status, found, _ = tracked(capsys, saved(tmp_path, plain))
-    assert status == 0
+    assert status == 1
     assert found["alpha"] is None
     assert found["passive"][-1]["sigma"]["shift_x_subap"] > 0.05  # nothing is made from it alone
-    assert main(["track", SMALL, str(tmp_path / "night.npz")]) == 0
+    assert main(["track", SMALL, str(tmp_path / "night.npz")]) == 1
     assert "alpha was not found: no dithered window" in capsys.readouterr().out
 
 
@@ -162,6 +162,18 @@ def without(name):
     return lambda arrays: arrays.pop(name)
 
 
+def counted(numbers):
+    return lambda arrays: arrays.update(seq=numbers(len(arrays["slopes"])))
+
+
+def set_in(name, place, value):
+    def spoil(arrays):
+        arrays[name] = arrays[name].astype(float)
+        arrays[name][place] = value
+
+    return spoil
+
+
 def given(name, change):
     return lambda arrays: arrays.update({name: change(arrays[name])})
 
@@ -181,7 +193,29 @@ def given(name, change):
         (given("gains", lambda v: v[:4]), "gains: found 4 numbers, expected one number, 45 or 90"),
         (given("dither_modes", lambda v: v[:2]), "dither_modes: found 2 modes, 4 frequencies"),
         (given("slopes", lambda v: v.astype("S3")), "slopes: found |S3 of shape"),
-        (lambda arrays: arrays.update(seq=np.zeros(7)), "seq: found 7 numbers, expected"),
+        (lambda arrays: arrays.update(seq=np.zeros(7)), "seq: found float64 of shape (7,)"),
+        (counted(lambda n: np.arange(n) - 5), "seq: found -5 in row 0"),
+        (counted(lambda n: np.arange(n) + 0.5), "seq: found 0.5 in row 0"),
+        (counted(lambda n: 2.0**53 + 2.0 * np.arange(n)), "seq: found 9007199254740994 in row 1"),
+        (counted(lambda n: np.arange(n, dtype=np.uint64) + 2**63), "found 9223372036854775808"),
+        (counted(lambda n: np.r_[np.arange(n - 1), 7]), "seq: found 7 in row 9009 after 9008"),
+        (set_in("reconstructor", (7, 3), np.nan), "reconstructor: found nan in row 7, column 3"),
+        (set_in("reconstructor", 7, np.nan), "(1 of 45 rows hold such numbers)"),
+        (set_in("reconstructor", (7, 3), 1e30), "reconstructor: found 1e+30 in row 7, column 3"),
+        (set_in("slopes", np.s_[:, 3], np.nan), "slopes: found nan in row 0, column 3"),
+        (set_in("commands_m", np.s_[:, 4], -np.inf), "commands_m: found -inf in row 0, column 4"),
+        (set_in("dither_m", np.s_[:, 2], 1e300), "dither_m: found 1e+300 in row 0, column 2"),
+        (set_in("dither_modes", 3, 90), "dither_modes: found 90 in row 3"),
+        (set_in("dither_modes", 0, -1), "dither_modes: found -1 in row 0"),
+        (given("dither_modes", lambda v: v + 1), "dither_modes: found 51 in row 0"),
+        (set_in("dither_modes", 1, 50), "expected each mode once"),
+        (set_in("dither_frequencies_hz", 2, 500.0), "dither_frequencies_hz: found 500 in row 2"),
+        (set_in("dither_amplitude_m", 1, 0.0), "dither_amplitude_m: found 0 in row 1"),
+        (set_in("gains", 8, np.nan), "gains: found nan in row 8"),
+        (given("leak", lambda _: 1.5), "leak: found 1.5, expected a number from 0 to 1"),
+        (given("delay_frames", lambda _: 1e9), "delay_frames: found 1e+09"),
+        (lambda arrays: arrays.update(t0_ns_utc=1e19), "t0_ns_utc: found 1e+19"),
+        (given("frame_rate_hz", lambda _: 1e-3), "frame_rate_hz: found 0.001"),
     ],
 )
 def test_what_does_not_fit_is_named(telemetry, tmp_path, capsys, spoil, text):
@@ -191,6 +225,41 @@ def test_what_does_not_fit_is_named(telemetry, tmp_path, capsys, spoil, text):
     assert (status, found) == (2, None)
     assert text in err
     assert "Traceback" not in err
+
+
+def test_frame_numbers_beyond_what_a_double_holds_are_taken_as_they_are(
+    telemetry, tmp_path, capsys
+):
+    n = 1500
+    cut = {
+        k: v[:n] if k in ("slopes", "commands_m", "dither_m") else v for k, v in telemetry.items()
+    }
+    far = cut | {"seq": 2**53 + 1 + np.arange(n)}
+    _, found, _ = tracked(capsys, saved(tmp_path, far))
+    assert (found["n_frames"], found["n_missing"]) == (n, 0)
+
+
+def test_frames_that_are_not_finite_are_left_out_and_named(telemetry, tmp_path, capsys):
+    spoilt = dict(telemetry)
+    for name, rows in {"slopes": [100, 101, 3000], "commands_m": [2500]}.items():
+        spoilt[name] = telemetry[name].copy()
+        spoilt[name][rows, 5] = np.nan
+    status, found, err = tracked(capsys, saved(tmp_path, spoilt))
+    assert status == 0
+    assert found["n_missing"] == 4
+    assert "slopes: found nan in row 100, column 5; 4 of 9010 frames" in err
+    assert "lock-in" in {entry["source"] for entry in found["entries"]}
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.5, 10.9, 11.0, 25.0, 100.0])
+def test_a_delay_beyond_the_filter_gives_no_estimate(telemetry, tmp_path, capsys, delay):
+    n = 1500
+    cut = {
+        k: v[:n] if k in ("slopes", "commands_m", "dither_m") else v for k, v in telemetry.items()
+    }
+    status, found, _ = tracked(capsys, saved(tmp_path, cut | {"delay_frames": np.array(delay)}))
+    assert status == 1
+    assert not found["passive"] or 2.0 <= delay < 11.0
 
 
 def test_frames_that_are_missing_are_told_by_their_numbers(telemetry, tmp_path, capsys):

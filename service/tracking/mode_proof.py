@@ -313,8 +313,11 @@ def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
         strange=frozenset(event.strange),
         own_response_ratio=event.response,
         own_uneven=event.uneven,
+        own_weights=event.weights,
+        own_misfit=event.misfit,
     )
     context.matrices = replace(context.matrices, mode_proof=proof)
+    context.alpha = replace(context.alpha, own_matrix_alpha=event.alpha)
     context.log("modes.recognised", f"{event.id}: {event.text}")
 
 

@@ -63,6 +63,9 @@ TURBULENCE_M = 336e-9
 MEMORY = 0.998
 """Correlation of the turbulence from one frame to the next."""
 
+MAX_DITHER_MODES = 8
+"""Modes that the RTC dithers at once, as that of examples/rtc.py."""
+
 SLOPE_NOISE = 2e-3
 N_FIRST = 20
 """Modes that the RTC controls at the start."""
@@ -89,6 +92,7 @@ class Plan:
 
     instrument: str = INSTRUMENT
     seed: int = 1
+    n_first: int = N_FIRST
     seconds: float = 90.0
     slope_noise: float = SLOPE_NOISE
     settings: tuple[tuple[str, float | str | bool], ...] = ()
@@ -153,7 +157,8 @@ class ModalDome(Dome):
 
     @override
     def status(self) -> Status:
-        return decode(Status, encode(self._clock.stamped(self.computer.status())))
+        status = self._clock.stamped(self.computer.status())
+        return decode(Status, encode(replace(status, max_dither_modes=MAX_DITHER_MODES)))
 
     @override
     def _blocks(self) -> Iterator[Block]:
@@ -319,6 +324,7 @@ class Night(Observatory):
             alpha=true_alpha(plan),
             seed=plan.seed,
             slope_noise=plan.slope_noise,
+            n_first=plan.n_first,
         )
         super().__init__(
             (),
@@ -382,7 +388,7 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
         "n_stable": stable_modes(plan, response, fit),
         "late_nm": late_nm(night.dome.moments),
         "best_nm": best_nm(plan, response, last.n_controlled),
-        "alone_nm": best_nm(plan, response, N_FIRST),
+        "alone_nm": best_nm(plan, response, plan.n_first),
         "accepted": night.state.windows.accepted,
         "refused": night.state.windows.refused,
         "said": [(at, name, text) for (name, text), at in night.said.items()],

@@ -162,6 +162,9 @@ class OwnMatrix:
         found = f"{int(self.known.sum())} of {len(self.columns)} modes are the instrument file's"
         if size is not None and abs(size - 1.0) > 0.1:
             found += f" and answer {size:.2f} times as drawn"
+        misfit = self.typical_misfit
+        if misfit is not None and misfit >= WELL_EXPLAINED:
+            found += f"; the model leaves {misfit:.0%} of their response unexplained"
         return f"{found}; {self.uneven}" if self.uneven else found
 
     def _signs(self) -> str:

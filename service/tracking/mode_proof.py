@@ -133,7 +133,7 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
 def awaits_proof(context: StepContext, rtc: Status) -> bool:
     """Return whether modes that are wanted are still to be shown by a dither."""
     allowed = context.policy.dither_enabled and not context.dithers.stopped
-    return allowed and not context.policy.dither_modes and bool(_missing_modes(context, rtc))
+    return allowed and bool(_missing_modes(context, rtc))
 
 
 def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[int, ...]:

@@ -204,6 +204,10 @@ class MatrixStates:
     mismatched_id: str | None = None
     """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
 
+    hindrance: str = ""
+    """What keeps a reconstructor that is wanted from being made, and what to change; empty if
+    nothing does, or none is wanted."""
+
     applied_asked_ns_utc: int = 0
     """When the RTC was last asked for the matrix it uses."""
 

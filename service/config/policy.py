@@ -25,6 +25,17 @@ AT_WORK = (0.001, 0.005, 0.0005)
 """The same where it is compared with the response at the working point."""
 
 
+REFERENCE_MODES, REFERENCE_SUBAPERTURES = 500, 30
+"""Modes and subapertures of the telescope for which ``USELESS`` and ``STALE`` were chosen: FLAO."""
+
+USELESS = np.array([0.1, 0.1, 0.3, 0.01])
+"""1 σ of shifts in subapertures, rotation in degrees and magnification beyond which α is not used:
+the misregistration that 594 modes of FLAO tolerate without loss, three times that in rotation."""
+
+STALE = np.array([0.05, 0.1, 0.003])
+"""1 σ of a shift in subapertures, of rotation in degrees and of magnification from which on α is
+stale: half of what 594 modes of FLAO tolerate."""
+
 MEASURED_PITCH = 0.30 / 8.22
 """Distance between actuators over the pupil's diameter where these floors were measured: FLAO."""
 
@@ -92,6 +103,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         ),
         slew_limit_deg=tracking.slew_limit_deg,
         stale_sigma=_stale_sigma(settings, instrument),
+        useless_sigma=USELESS / BOUNDARY_SCALE * tolerance_scale(settings, instrument),
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,
@@ -121,12 +133,37 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
     )
 
 
+def tolerance_scale(
+    settings: Settings, instrument: Instrument | None = None
+) -> NDArray[np.float64]:
+    """Return ``(4,)`` how much more misregistration a loop tolerates than that of the reference.
+
+    A loop tolerates a given share of the width of its finest mode (Heritier et al. 2018, section
+    5). That width is ``N sqrt(pi / (4 n))`` subapertures for n modes on N subapertures. A shift
+    displaces the image as a whole, rotation and magnification displace its rim by N / 2 times the
+    parameter. Never below 1: what is allowed for the reference was safe on every telescope tried.
+    """
+    if instrument is None:
+        return np.ones(4)
+    n_modes = settings.control.n_modes_target
+    if not isinstance(instrument.mirror, TabulatedModes):
+        n_modes = min(n_modes, instrument.modes.n_modes)
+    finer = float(np.sqrt(REFERENCE_MODES / n_modes))
+    shift = finer * instrument.wfs.n_subapertures / REFERENCE_SUBAPERTURES
+    return np.maximum([shift, shift, finer, finer], 1.0)
+
+
 def _stale_sigma(settings: Settings, instrument: Instrument | None) -> NDArray[np.float64]:
     """Return from which σ on α is stale: no window mends what a coarse mirror adds to the floor."""
     tracking = settings.tracking
-    limit = _vector(
-        tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification
+    given = (tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification)
+    shift, rotation, magnification = (
+        usual if limit is None else limit
+        for usual, limit in zip(
+            STALE * tolerance_scale(settings, instrument)[1:], given, strict=True
+        )
     )
+    limit = _vector(float(shift), float(rotation), float(magnification))
     usual, floor = (floor_of(settings, about) / BOUNDARY_SCALE for about in (None, instrument))
     return np.where(floor > usual, np.sqrt(limit**2 + floor**2 - usual**2), limit)
 

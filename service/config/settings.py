@@ -170,14 +170,15 @@ class TrackingTable(Table):
     slew_limit_deg: Positive = 5.0
     """α is invalid when the telescope has moved further since the last window, degrees."""
 
-    stale_shift_subap: Positive = 0.05
-    """α is stale from this 1 σ of a shift on, subapertures."""
+    stale_shift_subap: Positive | None = None
+    """α is stale from this 1 σ of a shift on, subapertures, beyond the model error. None: 0.05 for
+    500 modes on 30 subapertures, more for fewer modes."""
 
-    stale_rotation_deg: Positive = 0.1
-    """Of the rotation, degrees."""
+    stale_rotation_deg: Positive | None = None
+    """Of the rotation, degrees. None: 0.1 for 500 modes, more for fewer."""
 
-    stale_magnification: Positive = 0.003
-    """Of the magnification."""
+    stale_magnification: Positive | None = None
+    """Of the magnification. None: 0.003 for 500 modes, more for fewer."""
 
 
 class AcquisitionTable(Table):

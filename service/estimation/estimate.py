@@ -126,6 +126,10 @@ class DitheredEstimate(Estimate):
     weak: tuple[int, ...] = ()
     """Modes that were dithered far more weakly than the others: nothing of α depends on them."""
 
+    unexplained: NDArray[np.float64] | None = None
+    """``(n,)`` share of the power of each mode's answer that the model does not explain, the noise
+    subtracted; None if not measured."""
+
     answers_as: tuple[int, ...] = ()
     """Mode of the model whose response each mode's answer certainly is, its own where that is not
     certain; empty: not looked at."""

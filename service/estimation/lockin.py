@@ -269,7 +269,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         step = step + change[:n]
         gains = gains + change[n::2] + 1j * change[n + 1 :: 2]
     normal, _ = _normal_equations(slopes, seen, known, gains, step)
-    spread, misfit = _side_bins(spectra, linearisation, seen, known, gains, step)
+    spread, misfit, unexplained = _side_bins(spectra, linearisation, seen, known, gains, step)
     inverse = np.linalg.inv(normal)
     every = inverse @ spread @ inverse.T
     every = (every + every.T) / 2
@@ -282,6 +282,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
         optical_gain=gains,
         lag_frames=-np.angle(gains) / turns,
         misfit=misfit,
+        unexplained=unexplained,
         step=step[:4],
         t_ns_utc=spectra.t_end_ns_utc,
         cm_id=spectra.cm_id,
@@ -453,14 +454,15 @@ def _side_bins(
     known: Array,
     gains: Array,
     step: Array,
-) -> tuple[Array, float]:
+) -> tuple[Array, float, Array]:
     """Return the covariance of the score, from the bins beside the lines, and the misfit.
 
     What remains there after the same model is noise with the very spectrum the lines suffer from.
+    The third is the share ``(n_lines,)`` of each line's power that is neither noise nor model.
     """
     n = len(step) + 2 * len(gains)
     spread = np.zeros((n, n))
-    misfit = []
+    misfit, unexplained = [], []
     matrix = linearisation.matrix_by(step)
     for line, gain in enumerate(gains):
         explained = gain * _apply(matrix, spectra.commands[line, 1:])
@@ -469,5 +471,8 @@ def _side_bins(
         at = _unknowns(line, len(step))
         spread[np.ix_(at, at)] += 0.5 * (score @ score.conj().T).real / score.shape[1]
         left = spectra.slopes[line, 0] - gain * _regressors(seen[line], gain, step)[-2]
-        misfit.append(np.sum(np.abs(left) ** 2) / np.mean(np.sum(np.abs(residual) ** 2, axis=1)))
-    return spread, float(np.mean(misfit))
+        power, noise = np.sum(np.abs(left) ** 2), np.mean(np.sum(np.abs(residual) ** 2, axis=1))
+        misfit.append(power / noise)
+        seen_power = max(float(np.sum(np.abs(spectra.slopes[line, 0]) ** 2) - noise), power)
+        unexplained.append(max(float(power - noise), 0.0) / seen_power)
+    return spread, float(np.mean(misfit)), np.array(unexplained)

@@ -9,7 +9,7 @@ columns is held against every mode of the model, at the registration that explai
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,17 @@ NEIGHBOURS = 10
 ROLLED = 0.8
 """Share of misplaced modes that are so by as many places, when all are said to be rolled."""
 
+WELL_EXPLAINED = 0.08
+"""Median misfit of the RTC's own modes, in norm, below which all modes count alike for α. Matrices
+of simulators that differ from the model in influence functions and light leave 0.01 to 0.05,
+measured ones 0.15 to 0.4."""
+
+N_FITTED = 8
+"""Modes of the RTC's own matrix from which the misfit of others may be extrapolated."""
+
+N_PARAMETERS = 4
+"""Parameters of a registration: so many modes say nothing of their own scatter."""
+
 _NAMED = 8
 """Modes that a sentence names at most."""
 
@@ -80,10 +91,29 @@ class OwnMatrix:
     response: NDArray[np.float64]
     """``(n,)`` slopes per unit of command over the model's, signed; NaN: not recognised."""
 
+    misfit: NDArray[np.float64]
+    """``(n,)`` norm of the residual over that of the model's column; NaN: not recognised."""
+
+    covariance: NDArray[np.float64]
+    """``(4, 4)`` of ``alpha``, numeric units, from the scatter of what single modes say of it."""
+
+    weights: tuple[float, ...] = ()
+    """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
+
     @property
     def known(self) -> NDArray[np.bool_]:
         """``(n,)`` which columns are the mode that their number says, with the model's sign."""
         return np.asarray((self.modes == self.columns) & (np.nan_to_num(self.response) > 0.0))
+
+    @property
+    def typical_misfit(self) -> float | None:
+        """Median misfit of the modes that are known; None: none is."""
+        return float(np.median(self.misfit[self.known])) if self.known.any() else None
+
+    @property
+    def tells_registration(self) -> bool:
+        """Whether enough modes were recognised for ``alpha`` to be a start of fits."""
+        return int(self.known.sum()) > N_PARAMETERS and bool(np.isfinite(self.covariance).all())
 
     @property
     def wrong(self) -> str:
@@ -132,6 +162,9 @@ class OwnMatrix:
         found = f"{int(self.known.sum())} of {len(self.columns)} modes are the instrument file's"
         if size is not None and abs(size - 1.0) > 0.1:
             found += f" and answer {size:.2f} times as drawn"
+        misfit = self.typical_misfit
+        if misfit is not None and misfit >= WELL_EXPLAINED:
+            found += f"; the model leaves {misfit:.0%} of their response unexplained"
         return f"{found}; {self.uneven}" if self.uneven else found
 
     def _signs(self) -> str:
@@ -189,7 +222,7 @@ def recognise_modes(
     columns = np.flatnonzero(np.any(reconstructor != 0.0, axis=1))
     if not len(columns):
         return None
-    inverse = np.linalg.pinv(reconstructor[columns].astype(float), rcond=1.0 / LARGEST_CONDITION)
+    inverse = _inverse_of(reconstructor[columns])
     seen = inverse / np.maximum(np.linalg.norm(inverse, axis=0), np.finfo(float).tiny)
     alpha, near = start, linearise(start)
     n = min(FIRST_COLUMNS, len(columns))
@@ -200,11 +233,101 @@ def recognise_modes(
         n = min(GROWTH * n, len(columns))
     response = near.matrix_at(alpha)
     modes = _recognised(seen, columns, response)
-    gains = np.full(len(columns), np.nan)
+    gains, misfit = np.full((2, len(columns)), np.nan)
     for k in np.flatnonzero(modes >= 0):
-        mode = response[:, modes[k]]
+        mode = response[:, modes[k]].astype(float)
         gains[k] = mode @ inverse[:, k] / (mode @ mode)
-    return OwnMatrix(alpha=alpha, columns=columns, modes=modes, response=gains)
+        residual = inverse[:, k] / gains[k] - mode
+        misfit[k] = np.linalg.norm(residual) / np.linalg.norm(mode)
+    return OwnMatrix(
+        alpha=alpha,
+        columns=columns,
+        modes=modes,
+        response=gains,
+        misfit=misfit,
+        covariance=_scatter(seen, modes, response, near),
+    )
+
+
+def weights_of_modes(found: OwnMatrix, power: NDArray[np.floating]) -> tuple[float, ...]:
+    """Return the weight of each mode for the measurement of α; empty: all count alike.
+
+    A mode of which the model leaves a share s unexplained pulls α by about s over its own
+    sensitivity, whatever the noise. Of modes that the matrix does not control the misfit is
+    extrapolated: it grows with the order of the mode on every bench measured so far.
+
+    Parameters
+    ----------
+    found
+        The modes of the RTC's own matrix.
+    power
+        ``(n_modes,)`` sum of the squares of each column of the model.
+    """
+    columns, misfit = found.columns[found.known], found.misfit[found.known]
+    if len(columns) < N_FITTED or np.median(misfit) < WELL_EXPLAINED:
+        return ()
+    typical, every = float(np.median(misfit)), np.arange(len(power))
+    slope, _ = np.polyfit(columns, misfit, 1)
+    expected = typical + np.maximum(slope * (every - np.median(columns)), 0.0)
+    expected[columns] = misfit
+    weights = 1.0 / (power * (WELL_EXPLAINED**2 + expected**2))
+    return tuple((weights / weights.max()).tolist())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LeftOver:
+    """The part of the measured response of some modes that the model does not explain."""
+
+    columns: NDArray[np.intp]
+    """``(n,)`` modes."""
+
+    slopes: NDArray[np.float32]
+    """``(n_slopes, n)`` slope per metre."""
+
+    def added_to(self, linearisation: Linearisation) -> Linearisation:
+        """Return a linearisation whose matrix has it: the response as it was measured."""
+        matrix = linearisation.matrix.copy()
+        matrix[:, self.columns] += self.slopes
+        return replace(linearisation, matrix=matrix)
+
+
+def left_over(
+    reconstructor: NDArray[np.float32], found: OwnMatrix, response: NDArray[np.floating]
+) -> LeftOver:
+    """Return what the model's ``response`` ``(n_slopes, n_modes)`` leaves of a reconstructor.
+
+    ``response`` is of the registration that was found. One gain common to all modes is left out:
+    it is the sensor's.
+    """
+    columns = found.columns[found.known]
+    inverse = _inverse_of(reconstructor[found.columns])[:, found.known]
+    model = response[:, columns].astype(float)
+    gain = np.median(np.sum(model * inverse, axis=0) / np.sum(model**2, axis=0))
+    return LeftOver(columns=columns, slopes=(inverse / gain - model).astype(np.float32))
+
+
+def _inverse_of(reconstructor: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the interaction matrix ``(n_slopes, n)`` that a reconstructor inverts."""
+    return np.linalg.pinv(reconstructor.astype(float), rcond=1.0 / LARGEST_CONDITION)
+
+
+def _scatter(
+    seen: Array, modes: NDArray[np.intp], response: Array, near: Linearisation
+) -> NDArray[np.float64]:
+    """Return the covariance ``(4, 4)`` of the registration from the scatter between modes.
+
+    The sandwich estimator with a mode as the unit: a model that is wrong pulls each mode another
+    way, and by more than the noise of its slopes would.
+    """
+    usable = np.flatnonzero(modes >= 0)
+    if len(usable) <= N_PARAMETERS:
+        return np.full((4, 4), np.inf)
+    normals, scores = _equations(
+        seen[:, usable], response[:, modes[usable]], near.derivatives[:, :, modes[usable]]
+    )
+    inverse = np.linalg.inv(normals)
+    spread = scores @ scores.T * (len(usable) / (len(usable) - N_PARAMETERS))
+    return np.asarray(inverse @ spread @ inverse.T)
 
 
 def _registered(
@@ -252,14 +375,19 @@ def _recognised(
 
 def _step(seen: Array, response: Array, derivatives: Array) -> Array:
     """Return the step ``(4,)`` of α that explains columns of unit length, each with a free gain."""
+    normal, scores = _equations(seen, response, derivatives)
+    return np.asarray(np.linalg.solve(normal, scores.sum(axis=1)))
+
+
+def _equations(seen: Array, response: Array, derivatives: Array) -> tuple[Array, Array]:
+    """Return the normal matrix ``(4, 4)`` and the scores of the modes ``(4, n)`` of that step."""
     length = np.linalg.norm(response, axis=0)
     unit, moved = response / length, derivatives / length
     gains = np.einsum("sm,sm->m", unit, seen)
     # of every derivative only what is no gain of the mode itself
     moved = moved - unit * np.einsum("sm,ksm->km", unit, moved)[:, None, :]
     left = seen / gains - unit
-    normal = np.einsum("jsm,ksm->jk", moved, moved)
-    return np.asarray(np.linalg.solve(normal, np.einsum("jsm,sm->j", moved, left)))
+    return np.einsum("jsm,ksm->jk", moved, moved), np.einsum("jsm,sm->jm", moved, left)
 
 
 def _listed(things: Sequence[object] | NDArray[np.intp]) -> str:

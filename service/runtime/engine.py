@@ -93,14 +93,15 @@ class Engine:
 
         self._driver = driver
         self._step = step
+        self._mode_information = policy.mode_information
         self._checked_out: tuple[EstimatorBank, TrackerState] | None = None
 
     def set_description(self, description: Description) -> None:
         """Take what the optical model expects of telemetry: estimators begin to listen."""
         self.bank = EstimatorBank.of(description, self.policy.passive)
-        self.policy = replace(
-            self.policy, mode_information=description.mode_information, start=description.start
-        )
+        self._mode_information = description.mode_information
+        self.policy = replace(self.policy, start=description.start)
+        self._weigh_modes()
 
     def begin_anew(self) -> None:
         """Give up what the estimators have gathered; they listen from here on.
@@ -130,6 +131,8 @@ class Engine:
         now_ns = self._driver.now_ns()
         self.state, effects = self._step(before, event, self.policy, now_ns, cause)
         self._driver.stepped(before, event)
+        if self.state.matrices.mode_proof.own_weights != before.matrices.mode_proof.own_weights:
+            self._weigh_modes()
         self._note_sensor_mode(before)
         self._follow()
         for effect in effects:
@@ -137,6 +140,13 @@ class Engine:
         if self.state.matrices.in_use != before.matrices.in_use:
             self._driver.swapped(self.state.matrices.in_use)
         return effects
+
+    def _weigh_modes(self) -> None:
+        """Let modes that the model explains badly count less where those to dither are chosen."""
+        told, weights = self._mode_information, self.state.matrices.mode_proof.own_weights
+        if told is not None and len(weights) == len(told):
+            told = told * np.array(weights)[:, None, None]
+        self.policy = replace(self.policy, mode_information=told)
 
     def _note_sensor_mode(self, before: TrackerState) -> None:
         """Stop listening where the sensor's mode has changed, until its model is there."""

@@ -122,6 +122,8 @@ async def _outcome(
 ) -> lockin.LockInEstimate | RandomEstimate | openloop.WideCaptureEstimate | WindowRefused:
     rtc, registration = state.loop.rtc, state.alpha.registration
     alpha = None if registration is None else registration.alpha
+    if alpha is None and state.alpha.law.nominal is None:
+        alpha = state.alpha.own_matrix_alpha
     start = start_of_fit(state, alpha, window.t_end_ns_utc)
     if rtc is not None and window.session != rtc.session:
         # the model may be of another mode of the sensor by now
@@ -240,6 +242,9 @@ async def read_own_matrix(
                 text=own.text,
                 response=own.typical_response,
                 uneven="" if wrong else own.uneven,
+                alpha=None if wrong or not own.tells_registration else own.alpha,
+                weights=() if wrong else own.weights,
+                misfit=own.typical_misfit,
             )
         )
     return events

@@ -269,6 +269,10 @@ def _for_the_matrix(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
     ):
         text = f"its reconstructor {rtc.cm_id}: offer it on rtc/cm/applied{_describe_rtc(state)}"
         yield Prerequisite(name="matrix-in-use", responsible=Responsible.RTC, text=text)
+    if state.matrices.hindrance:
+        yield Prerequisite(
+            name="new-matrix", responsible=Responsible.OPERATOR, text=state.matrices.hindrance
+        )
     no_return = why_no_return(state)
     for record in state.matrices.reconstructors:
         if record.on_its_way:

@@ -122,6 +122,16 @@ def _not_found(context: StepContext) -> str | None:
         return None
     if not (context.loop.holds and missed_enough(context.state)):
         return context.alarm_text(alarms.NOT_FOUND)
+    proof = context.matrices.mode_proof
+    if proof.own_response_ratio is not None and not proof.strange:
+        left = "" if proof.own_misfit is None else f" ({proof.own_misfit:.0%} left unexplained)"
+        return (
+            f"No window gives a registration: {context.windows.refused_because}. Order and signs "
+            "of modes and slopes are not the cause: the model recognises the modes of the RTC's "
+            f"own matrix{left}. Set mirror.nominal_rotation_deg to the rotation of a fit of a "
+            "measured matrix (pyrcal fit), or run pyrcal acquire, which opens the loop and "
+            "searches from far away."
+        )
     return (
         "window after window finds no registration, though the loop holds well: modes or slopes "
         "are probably in another order, or of another sign, than the instrument file says; "

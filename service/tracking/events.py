@@ -280,6 +280,17 @@ class ModesRecognised:
     uneven: str = ""
     """Which modes answer by far stronger or weaker than their neighbours; empty: none."""
 
+    alpha: Misregistration | None = None
+    """Registration that best explains the RTC's own matrix; None if the matrix does not tell it."""
+
+    weights: tuple[float, ...] = ()
+    """Weight of each mode of the basis for the measurement of α, by how well the model explains
+    it; empty if all modes count alike."""
+
+    misfit: float | None = None
+    """Median share of the RTC's own matrix that the model leaves unexplained, per mode, in norm;
+    None if unknown."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MarginJudged:

@@ -29,6 +29,7 @@ from service.tracking.registration import (
     Purpose,
     Registration,
     Source,
+    TimedEstimate,
     without_previous,
 )
 from service.tracking.state import TrackerState
@@ -54,6 +55,17 @@ Array = NDArray[np.float64]
 
 CAPTURE_RANGE = np.array([0.8, 0.8, np.deg2rad(2.0), 0.02])
 """Beyond this, one linearised fit with high modes cannot be trusted (numeric units)."""
+
+FAR_WINDOWS = 3
+"""Windows beyond ``CAPTURE_RANGE`` that must agree while α is unknown before they are used."""
+
+AGREEING = np.array([0.02, 0.02, np.deg2rad(0.1), 0.002])
+"""Distance of two windows that agree whatever their σ (numeric units): a loop's turbulence moves a
+window by so much."""
+
+MAX_UNEXPLAINED = 0.5
+"""Share of a line's power that the model may leave unexplained in a window far from its start. A
+model that is 40 % wrong per mode leaves 0.15 to 0.3, modes or slopes in another order 0.8."""
 
 GAIN_RANGE = (0.1, 3.0)
 """Gains outside this are no pyramid seeing the dither: about 0.4 to 0.9 on sky, twice that when the
@@ -246,8 +258,9 @@ def n_agreeing(context: StepContext, registration: Registration, prior: Joint) -
     """Return how many windows agree after this one: it stands alone where α had gone stale."""
     policy = context.policy
     sigma = np.sqrt(np.diag(prior.alpha_covariance) + registration.floor**2)
+    limit = validity.beyond_model_error(policy.stale_sigma, registration.floor, policy)
     slewed = validity.slewed_deg(context.state, registration) > policy.slew_limit_deg
-    return 1 if slewed or np.any(sigma > policy.stale_sigma) else registration.n_windows + 1
+    return 1 if slewed or np.any(sigma > limit) else registration.n_windows + 1
 
 
 def accept(
@@ -284,6 +297,7 @@ def accept(
         nominal=context.alpha.law.nominal,
     )
     validity.store_registration(context, registration)
+    context.alpha = replace(context.alpha, far_windows=())
     context.windows = replace(context.windows, accepted=context.windows.accepted + n_accepted)
     if not doubted:
         validity.make_valid(context, Purpose.SETTLE)
@@ -398,19 +412,45 @@ def why_no_window(
             f"optical gains of {gains.min():.2f} to {gains.max():.2f}, expected {GAIN_RANGE[0]} "
             f"to {GAIN_RANGE[1]}: wrong instrument file, or the dither is not on the mirror"
         )
-    if np.any(estimate.sigma > validity.USELESS_SIGMA):
+    if np.any(estimate.sigma > context.policy.useless_sigma):
         return (
             RefusalKind.OTHER,
             "too uncertain: raise the dither's amplitude or the window's length",
         )
-    near = context.nominal if context.registration is None else context.registration.alpha
+    near = context.start_of_fits if context.registration is None else context.registration.alpha
     distance = np.abs(estimate.alpha.vector - near.vector)
-    if np.any(distance > CAPTURE_RANGE):
+    if np.any(distance > CAPTURE_RANGE) and not _far_windows_agree(context, estimate):
         return RefusalKind.OUT_OF_REACH, (
             f"outside the capture range: {estimate.alpha.to_boundary()}, "
             f"the fit began at {near.to_boundary()}"
         )
     return None
+
+
+def _far_windows_agree(context: StepContext, estimate: DitheredEstimate) -> bool:
+    """Return whether windows far from where their fits began agree so often that α is there.
+
+    Only while α is unknown, and only windows that the model explains: a wrong order of modes or
+    slopes leads every window to the same wrong place, and leaves most of it unexplained.
+    """
+    if context.registration is not None:
+        return False
+    shares = None if estimate.unexplained is None else estimate.unexplained[estimate.strong]
+    if shares is None or shares.max(initial=0.0) > MAX_UNEXPLAINED:
+        context.alpha = replace(context.alpha, far_windows=())
+        return False
+    earlier = context.alpha.far_windows
+    window = TimedEstimate(
+        alpha=estimate.alpha, covariance=estimate.covariance, t_ns_utc=estimate.t_ns_utc
+    )
+    if earlier:
+        sigma = np.sqrt(np.diag(earlier[-1].covariance + estimate.covariance))
+        apart = np.abs(estimate.alpha.vector - earlier[-1].alpha.vector)
+        if np.any(apart > np.maximum(_FARTHEST * sigma, AGREEING)):
+            earlier = ()
+    together = (*earlier, window)[-FAR_WINDOWS:]
+    context.alpha = replace(context.alpha, far_windows=together)
+    return len(together) >= FAR_WINDOWS
 
 
 def why_no_measurement(state: TrackerState, when: TelemetrySpan) -> str | None:

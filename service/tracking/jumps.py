@@ -31,6 +31,10 @@ VARYING = 0.3
 """Share of the model error that differs from window to window: bright stars scatter by 0.1 % of a
 subaperture and 6 mdeg, twice what their own data say (docs/results/night.md)."""
 
+USUAL_MODEL_ERROR = 1.5
+"""Times the instrument's floor that windows of simulated telescopes find as their model error, and
+have in common: beyond it windows of other modes differ by it. Benches find 2 to 12 times."""
+
 ROTATION_LIMIT = 15.1
 """What the normalised square of one parameter exceeds once in 10 000, ``JUMP_THRESHOLD`` that of
 four. 0.1 deg are 4 to 6 σ of a window at magnitude 10 and do not stand out among four parameters; a
@@ -118,6 +122,7 @@ def window_innovation(
         (as_previous(registration), registration.previous_estimate),
         _scattering(registration, window),
         policy,
+        _model_scatter(registration, policy),
     )
 
 
@@ -138,11 +143,14 @@ def pair_innovation(
         seen_from = (before, before.previous_estimate)
     window = _scattering(registration, window)
     first = _scattering(registration, first)
+    varies = _model_scatter(registration, policy)
     alone = replace(window, alpha=first.alpha, covariance=first.covariance, t_ns_utc=first.t_ns_utc)
-    nearest = min(_farthest(seen_from, one, policy).mahalanobis_squared for one in (alone, window))
+    nearest = min(
+        _farthest(seen_from, one, policy, varies).mahalanobis_squared for one in (alone, window)
+    )
     if _squared_distance(first.alpha, first, window, policy) >= min(nearest, JUMP_THRESHOLD):
         return _jump_inside_first(registration, first, window, policy)
-    found = _farthest(seen_from, _together(first, window), policy)
+    found = _farthest(seen_from, _together(first, window), policy, varies)
     return replace(found, rotation_limit=ROTATION_LIMIT_OF_TWO)
 
 
@@ -156,7 +164,8 @@ def _jump_inside_first(
     """
     if registration.suspected_jump is None:
         return NEAR
-    found = _farthest((as_previous(registration),), window, policy)
+    varies = _model_scatter(registration, policy)
+    found = _farthest((as_previous(registration),), window, policy, varies)
     if found.excess <= FARTHEST:
         return NEAR
     total = _noise_of_two(first, window, policy)
@@ -280,12 +289,23 @@ def _drifted(elapsed_s: float, policy: Policy) -> Array:
     return np.asarray(policy.drift_rate**2 * elapsed_s * min(elapsed_s / STEADY_S, 1.0))
 
 
+def _model_scatter(registration: Registration, policy: Policy) -> Array:
+    """Return ``(4,)`` variance between windows by the model error that they have found.
+
+    A window of other modes, or of a loop with another reconstructor, has another share of it: the
+    whole of it may differ.
+    """
+    usual = USUAL_MODEL_ERROR * policy.floor
+    return np.asarray(np.maximum(registration.floor**2 - usual**2, 0.0))
+
+
 def _farthest(
-    seen_from: tuple[PreviousEstimate | None, ...], window: PointedEstimate, policy: Policy
+    seen_from: tuple[PreviousEstimate | None, ...],
+    window: PointedEstimate,
+    policy: Policy,
+    varies: Array,
 ) -> Innovation:
-    found = [
-        _innovation_from(earlier, window, policy, np.zeros(4)) for earlier in seen_from if earlier
-    ]
+    found = [_innovation_from(earlier, window, policy, varies) for earlier in seen_from if earlier]
     return max(found, key=lambda one: one.excess)
 
 

@@ -175,6 +175,14 @@ class ModeProof:
     session: str = ""
     """Session of the RTC in which the service before this one has seen it; empty: this one has."""
 
+    own_weights: tuple[float, ...] = ()
+    """Weight of each mode of the basis for the measurement of α, by how well the model explains
+    the RTC's own matrix; empty if all count alike."""
+
+    own_misfit: float | None = None
+    """Median share of its modes' response that the model does not explain, in norm; None if no
+    matrix was read."""
+
     own_response_ratio: float | None = None
     """Median over its modes of the response that the RTC's own matrix tells, over the drawing's;
     None: no matrix has told."""

@@ -133,7 +133,7 @@ def why_unproven(state: TrackerState, record: ReconstructorRecord) -> str | None
 def awaits_proof(context: StepContext, rtc: Status) -> bool:
     """Return whether modes that are wanted are still to be shown by a dither."""
     allowed = context.policy.dither_enabled and not context.dithers.stopped
-    return allowed and not context.policy.dither_modes and bool(_missing_modes(context, rtc))
+    return allowed and bool(_missing_modes(context, rtc))
 
 
 def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[int, ...]:
@@ -313,8 +313,11 @@ def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
         strange=frozenset(event.strange),
         own_response_ratio=event.response,
         own_uneven=event.uneven,
+        own_weights=event.weights,
+        own_misfit=event.misfit,
     )
     context.matrices = replace(context.matrices, mode_proof=proof)
+    context.alpha = replace(context.alpha, own_matrix_alpha=event.alpha)
     context.log("modes.recognised", f"{event.id}: {event.text}")
 
 

@@ -137,7 +137,7 @@ def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | No
 
 def _show_passive_alone(context: StepContext, event: ev.PassiveFitted) -> None:
     """Show a passive estimate while α is not known: nothing is made from it alone."""
-    step = event.estimate.alpha.vector - context.nominal.vector
+    step = event.estimate.alpha.vector - context.start_of_fits.vector
     if np.any(np.abs(step) > filtering.CAPTURE_RANGE):
         text = (
             f"it cannot tell: {event.estimate.alpha} is too far from where its fit "

@@ -136,7 +136,11 @@ class Policy:
     """A telescope that has moved further than this makes α invalid until the next window."""
 
     stale_sigma: NDArray[np.float64]
-    """``(4,)`` 1 σ from which on α is stale, numeric units."""
+    """``(4,)`` 1 σ from which on α is stale, numeric units, beyond what the model error adds."""
+
+    useless_sigma: NDArray[np.float64]
+    """``(4,)`` 1 σ of a window or of α that is too large to be useful, numeric units, beyond what
+    the model error adds."""
 
     acquires: bool
     """Whether the service finds α from nothing by itself, in mode auto."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from service.control.gate import GateVerdict
+from service.model.misregistration import Misregistration
 from service.tracking.alarms import Alarm, AlarmRecord
 from service.tracking.dither_request import Dither, DitherPolicyState
 from service.tracking.mode_limits import ModeLimit, ModeProof
@@ -22,6 +23,7 @@ from service.tracking.registration import (
     Offload,
     PassiveState,
     Registration,
+    TimedEstimate,
     VoidInterval,
 )
 from service.wire import Pointing, Status
@@ -131,6 +133,13 @@ class AlphaState:
     history: tuple[HistoryEntry, ...] = ()
     """Oldest first, bounded."""
 
+    own_matrix_alpha: Misregistration | None = None
+    """Registration that best explains the RTC's own matrix: fits begin there while α is unknown.
+    None if no matrix of the RTC's own was read."""
+
+    far_windows: tuple[TimedEstimate, ...] = ()
+    """Last windows that were too far from where their fit began, and agree with one another."""
+
     passive: PassiveState | None = None
 
     passive_unavailable_reason: str = ""
@@ -194,6 +203,10 @@ class MatrixStates:
 
     mismatched_id: str | None = None
     """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
+
+    hindrance: str = ""
+    """What keeps a reconstructor that is wanted from being made, and what to change; empty if
+    nothing does, or none is wanted."""
 
     applied_asked_ns_utc: int = 0
     """When the RTC was last asked for the matrix it uses."""

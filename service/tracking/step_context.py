@@ -186,6 +186,13 @@ class StepContext:
         return self.state.alpha.law.nominal or self.policy.start
 
     @property
+    def start_of_fits(self) -> Misregistration:
+        """Where fits begin while α is unknown."""
+        return (
+            self.state.alpha.law.nominal or self.state.alpha.own_matrix_alpha or self.policy.start
+        )
+
+    @property
     def acquisition(self) -> Acquisition:
         """The state of the acquisition."""
         return self.state.operations.acquisition

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from service.tracking.alarms import Interlock
 from service.tracking.dither import choose_dither, stop_unwanted
 from service.tracking.events import MakeMatrix
@@ -38,6 +40,9 @@ core with 500 modes, and only its star and its optical gains may be others."""
 JUDGE_REFUSED_S = 15.0
 """The same where the margin is short, or no answer came: a smaller σ may let it pass."""
 
+PATIENT_WINDOWS = 2
+"""Windows refused in a row from which on it is said that α stays unknown."""
+
 JUDGE_AGAIN_S = 2.0
 """Least time between two looks when the last one holds no longer."""
 
@@ -72,6 +77,9 @@ def decide_updates(context: StepContext) -> None:
         stop_unwanted(context, rtc)
         return
     choose_dither(context, rtc)
+    hindrance = explain_hindrance(context, rtc)
+    if hindrance != context.matrices.hindrance:
+        context.matrices = replace(context.matrices, hindrance=hindrance)
     unjudged = _unjudged_in_use(context)
     # asked for first: after a jump the loop waits for it, and nobody for the old one's margin
     _choose_update(context, rtc)
@@ -138,6 +146,97 @@ def _choose_update(context: StepContext, rtc: Status) -> None:
     if more and not awaits_proof(context, rtc):
         why = f"{n_now} of {more[0]} modes controlled"
         request_matrix(context, MakeMatrix(n_modes=more[0], why=why, fewer=more[1:]))
+
+
+def explain_hindrance(context: StepContext, rtc: Status) -> str:
+    """Return what keeps a wanted reconstructor from being made for good, and what to change.
+
+    Empty while nothing does, and while it is a matter of a few windows. What the operator has
+    ordered, and alarms that forbid all decisions, are said elsewhere.
+    """
+    state, registration = context.state, context.registration
+    in_use = state.reconstructor(state.matrices.in_use) if state.matrices.in_use else None
+    busy = state.operations.acquisition.under_way or state.on_probation
+    if state.operator.mode is Mode.HOLD or in_use is None or not rtc.in_loop or busy:
+        return ""
+    if registration is not None and not _is_wanted(context, rtc, in_use):
+        return ""
+    alarm = context.blocking_alarm(Interlock.SEND_NEW)
+    if alarm is not None:
+        return f"No reconstructor is sent during the alarm {alarm.name}: {alarm.text}"
+    if registration is None:
+        return _explain_no_window(context)
+    if not registration.usable and not registration.doubt:
+        return (
+            f"No reconstructor is made while α is invalid: {registration.validity.reason}. Raise "
+            "[dither] budget_m or longest_window_s for a smaller σ."
+        )
+    return _explain_modes(context, rtc)
+
+
+def _is_wanted(context: StepContext, rtc: Status, in_use: ReconstructorRecord) -> bool:
+    """Return whether a reconstructor would be made if nothing kept the service from it."""
+    if context.policy.wanted_modes(rtc) > rtc.n_controlled:
+        return True
+    return update_reason(context.state, in_use, context.policy, context.now_ns) is not None
+
+
+def _explain_modes(context: StepContext, rtc: Status) -> str:
+    """Return what keeps more modes, or those of the loop, from being controlled by a new one."""
+    state, n_wanted = context.state, context.policy.wanted_modes(rtc)
+    more = more_modes_to_try(state, rtc, context.policy, context.now_ns)
+    n_safe = n_proven_modes(state, max(n_wanted, rtc.n_controlled))
+    if n_safe < max(rtc.n_controlled, *more, 0):
+        return _explain_unproven(context, rtc, n_safe)
+    if more or n_wanted <= rtc.n_controlled:
+        return ""
+    if not rtc.gains[rtc.n_controlled - 1]:
+        return (
+            f"No more than {rtc.n_controlled} modes are controlled: the gain of mode "
+            f"{rtc.n_controlled - 1} is 0, and modes that are added get it. Give it a gain."
+        )
+    limit = state.matrices.mode_limit
+    return (
+        ""
+        if limit is None
+        else (
+            f"No more than {limit.n_modes} of {n_wanted} modes are controlled for now: "
+            f"{limit.reason}. Lower [control] n_modes_target to stop further attempts."
+        )
+    )
+
+
+def _explain_no_window(context: StepContext) -> str:
+    """Return why α stays unknown; empty while the first windows may still come."""
+    if not context.policy.dither_enabled:
+        return (
+            "No reconstructor is made because α is unknown and [dither] enabled is false: enable "
+            "it, or start a dither (pyrcal dither start)."
+        )
+    if context.windows.run > -PATIENT_WINDOWS:
+        return ""
+    return f"No reconstructor is made because no window gives α: {context.windows.refused_because}"
+
+
+def _explain_unproven(context: StepContext, rtc: Status, n_safe: int) -> str:
+    """Return why modes that are to be controlled are not shown to answer as the model says."""
+    proof = context.matrices.mode_proof
+    if not awaits_proof(context, rtc):
+        return (
+            f"Mode {n_safe} has not been shown to answer as the model says, and no dither may show "
+            "it: set [dither] enabled = true, or end pyrcal dither stop."
+        )
+    if n_safe in proof.contrary:
+        return (
+            f"Mode {n_safe} does not answer as the instrument file says: no reconstructor controls "
+            "it. Correct order and signs of the modes in the instrument file."
+        )
+    if proof.n_tries:
+        return (
+            f"Mode {n_safe} was not seen to answer in {proof.n_tries} dithers: raise [dither] "
+            "budget_m, or see why windows are refused."
+        )
+    return ""
 
 
 def _is_busy(context: StepContext) -> bool:

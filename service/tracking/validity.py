@@ -33,9 +33,6 @@ _POINTINGS_KEPT = 120
 _TURNED_DEG = 0.05
 """By how much the telescope turns before another line of its way is kept."""
 
-USELESS_SIGMA = np.array([0.1, 0.1, np.deg2rad(0.3), 0.01])
-"""1 σ that says nothing worth keeping, of a window or of α (numeric units)."""
-
 AGEING_SHARE = 0.5
 """Share of the stale limit from which on α is ageing."""
 
@@ -254,7 +251,8 @@ def _validity_of(context: StepContext, registration: Registration) -> ValiditySt
     policy, reason = context.policy, _why_invalid(context.state, registration, context.policy)
     if reason is not None:
         return ValidityState(level=Validity.INVALID, reason=reason)
-    sigma, limit, before = registration.sigma, policy.stale_sigma, context.before.alpha.registration
+    sigma, before = registration.sigma, context.before.alpha.registration
+    limit = beyond_model_error(policy.stale_sigma, registration.floor, policy)
     if registration.n_windows == 0:
         return ValidityState(level=Validity.STALE, reason="no window has confirmed it yet")
     was_stale = before is not None and before.validity.level is Validity.STALE
@@ -278,9 +276,20 @@ def _why_invalid(state: TrackerState, registration: Registration, policy: Policy
     moved_deg = slewed_deg(state, registration)
     if moved_deg > policy.slew_limit_deg and registration.nominal is None:
         return f"the telescope has moved by {moved_deg:.0f} deg since the last dithered window"
-    if np.any(registration.sigma > USELESS_SIGMA):
-        return _worst(registration.sigma, USELESS_SIGMA)
+    limit = beyond_model_error(policy.useless_sigma, registration.floor, policy)
+    if np.any(registration.sigma > limit):
+        return _worst(registration.sigma, limit)
     return None
+
+
+def beyond_model_error(limit: Array, floor: Array, policy: Policy) -> Array:
+    """Return a limit on σ ``(4,)``, larger by the model error that windows have found.
+
+    No further window reduces that error. Whether a loop is safe with it is for the stability gate,
+    which looks at all of α ± 3σ.
+    """
+    found = np.maximum(floor**2 - policy.floor**2, 0.0)
+    return np.asarray(np.sqrt(limit**2 + found))
 
 
 def _worst(sigma: Array, limit: Array) -> str:

@@ -259,7 +259,9 @@ define_view(
     "ProbationView", Probation, "id before state text since_ns_utc until_ns_utc finding rollback"
 )
 define_view("ModeLimitView", mode_limits.ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
-define_view("ModeProofView", mode_limits.ModeProof, "n_proven contrary_modes own_response_ratio")
+define_view(
+    "ModeProofView", mode_limits.ModeProof, "n_proven contrary_modes own_response_ratio own_misfit"
+)
 ALPHA = define_view(
     "AlphaView",
     Alpha,

@@ -25,7 +25,13 @@ from service.estimation.openloop import (
     find,
     not_found,
 )
-from service.estimation.own_matrix import OwnMatrix, recognise_modes
+from service.estimation.own_matrix import (
+    LeftOver,
+    OwnMatrix,
+    left_over,
+    recognise_modes,
+    weights_of_modes,
+)
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, fit_random
 from service.estimation.slope_convention import LIKELY, SlopeConvention, of_answer, of_reconstructor
@@ -49,11 +55,16 @@ from service.runtime.worker.records import (
 from service.runtime.worker.rows import SharedRows
 from service.runtime.worker.sensor import REACH, SensorAtWork, length, settled
 
-MAX_APPROACHES = 5
-"""Steps of the coarse model; from the edge of the capture range three are enough."""
+MAX_APPROACHES = 12
+"""Steps of the coarse model. From the edge of the capture range three are enough where the model
+is right. Where it is 20 to 40 % wrong per mode a step is 0.6 times the last: eight are needed."""
 
-CONTRACTION = 0.5
-"""A step longer than this share of the last one is not Newton's any more: the fit has failed."""
+MISFIT_RISE = 1.02
+"""A step that raises the misfit by more than this factor, and is not shorter than the last, has
+left the minimum: the fit has failed."""
+
+MAX_REFINEMENTS = 4
+"""Linearisations of the fine model about the estimate of the last, until one settles."""
 
 FAR_SAMPLING = 1
 """The same of the model that leads from afar: biased by some per cent of a subaperture."""
@@ -86,6 +97,7 @@ class OpticsWorker:
         self.rows = SharedRows(compute.threads, compute.cluster)
         self._compute = compute
         self._mode_response: NDArray[np.float64] | None = None
+        self._left_over: LeftOver | None = None
         self._basis = self._disk_cache.basis(instrument)
         self._equip(instrument)
 
@@ -140,7 +152,7 @@ class OpticsWorker:
         if config_id != instrument.config_id:
             instrument = instrument.in_mode(config_id)
             self._basis = self._disk_cache.basis(instrument)
-            self._mode_response = None
+            self._mode_response = self._left_over = None
             self._equip(instrument)
         return self.describe()
 
@@ -270,14 +282,18 @@ class OpticsWorker:
         if near is None and rotation_rad is not None:
             start = replace(start, rotation_rad=rotation_rad)
         found = recognise_modes(own, self._coarse.linearise, start)
+        self._left_over = None
         if found is None or found.wrong or not found.known.any():
             return found, self._mode_response
+        power = np.square(self._first().matrix).sum(axis=0)
+        found = replace(found, weights=weights_of_modes(found, power))
         response = found.response[found.known]
         if np.any(np.abs(response - 1.0) > AS_DRAWN):
             n_modes = self._basis.n_modes
             gains = CalibrationGains.of_modes(response, found.columns[found.known], n_modes).values
             now = 1.0 if self._mode_response is None else self._mode_response
             self.adopt(None, now * gains)
+        self._left_over = left_over(own, found, self._coarse.interaction_matrix(found.alpha))
         return found, self._mode_response
 
     def _settled_fit(
@@ -290,7 +306,9 @@ class OpticsWorker:
             if near is None:
                 return None
             estimate = fit_window(spectra, self._sensor.linearise(near), loop)
-        if not settled(estimate):
+        for _ in range(MAX_REFINEMENTS):
+            if settled(estimate) or length(estimate.step) > REACH:
+                break
             # near enough; or the coarse model's bias, flat as it is, was more than what settles
             estimate = fit_window(spectra, self._sensor.linearise(estimate.alpha), loop)
         return estimate if settled(estimate) else None
@@ -378,11 +396,11 @@ class OpticsWorker:
         for _ in range(MAX_APPROACHES):
             if np.any(np.abs(estimate.alpha.vector - start.vector) > FIT_RANGE):
                 return None
-            before = length(estimate.step)
+            before, misfit = length(estimate.step), estimate.misfit
             estimate = fit_window(spectra, self._coarse.linearise(estimate.alpha), loop)
             if length(estimate.step) <= REACH:
                 return estimate.alpha
-            if length(estimate.step) > CONTRACTION * before:
+            if length(estimate.step) > before and estimate.misfit > MISFIT_RISE * misfit:
                 return None
         return None
 
@@ -457,6 +475,8 @@ class OpticsWorker:
         alpha, noise = conditions.alpha, self._model.instrument.slopes.kind.noise
         loop = replace(conditions.loop, outer=outer_of(self._model), noise=noise)
         at_work = self._sensor.at_unit_gain(alpha)
+        if self._left_over is not None:
+            at_work = self._left_over.added_to(at_work)
         covariance, bound = conditions.covariance, conditions.bound
         return judge(reconstructor, at_work, alpha, covariance, loop, bound=bound)
 

@@ -1,0 +1,458 @@
+"""The live service on a plant that is a measured interaction matrix, in simulated time.
+
+The plant is linear: slopes are ``M (turbulence + command) + noise`` with a matrix M that the
+service's model explains only in part. M is a measurement (``--matrix``), or the model's own matrix
+at a registration that is hidden from the service, with an error of a given share of the norm of
+each mode's column. Half of that error is what a mirror with other influence functions would show,
+half a random smooth pattern. The turbulence of each mode is an autoregressive process, and the
+RTC starts with the pseudo-inverse of the first columns of M.
+
+Run: ``python -m pyrcal_studies.campaign.measured_plant --output var/measured_plant.jsonl --table
+table.md``. Rows that are in the file already are not computed again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+from typing_extensions import override
+
+from pyrcal_studies.campaign.observatory import Latencies, Observatory
+from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, Moment
+from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, tell
+from service.config import load_instrument, load_settings
+from service.config.policy import policy_of
+from service.control.loop import pole_radius
+from service.estimation.own_matrix import recognise_modes
+from service.model.instrument import Instrument
+from service.model.interaction import InteractionModel, RtcInteractionModel
+from service.model.misregistration import BOUNDARY_SCALE, Misregistration
+from service.model.modes import analytic_basis
+from service.model.surface import mirror_surface
+from service.runtime.worker import Compute, OpticsWorker
+from service.tracking import commands as cmd
+from service.tracking.products import MatrixState
+from service.tracking.state import Mode
+from service.wire import Status, checksum, decode, encode
+from sim_rtc.computer.feed import BATCH_FRAMES, Block, OpenLoopBlock
+from sim_rtc.computer.real_time_computer import RealTimeComputer
+from sim_rtc.computer.telemetry import Batch, FrameClock, Identity, LoopSettings, Reconstructor
+from sim_rtc.telescope.linear import LinearOptics
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+INSTRUMENT = "tests/data/bench.toml"
+ALPHA = (-0.30, -0.03, -3.1, 1.008)
+"""Registration of the plant, boundary units: a bench whose mirror is mounted 3 deg askew."""
+
+FRAME_RATE_HZ = 500.0
+GAIN, LEAK, DELAY_FRAMES = 0.4, 0.99, 2
+TURBULENCE_M = 336e-9
+"""RMS of the turbulence over all modes, metres."""
+
+MEMORY = 0.998
+"""Correlation of the turbulence from one frame to the next."""
+
+MAX_DITHER_MODES = 8
+"""Modes that the RTC dithers at once, as that of examples/rtc.py."""
+
+SLOPE_NOISE = 2e-3
+N_FIRST = 20
+"""Modes that the RTC controls at the start."""
+
+OTHER_COUPLING = 0.15
+"""Mechanical coupling of the mirror whose response makes the smooth half of the error."""
+
+LATE_S = 10.0
+"""Length of the end of a run over which the wavefront error is taken."""
+
+_BLOCK_FRAMES = 500
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """One run of the service on one plant."""
+
+    error: float = 0.2
+    """RMS error of the model over the norm of a mode's column."""
+
+    mode: str = "auto"
+    matrix: str = ""
+    """File of a measured matrix, npz with ``D`` (n_slopes, n_modes); empty: made from the model."""
+
+    instrument: str = INSTRUMENT
+    seed: int = 1
+    n_first: int = N_FIRST
+    seconds: float = 90.0
+    slope_noise: float = SLOPE_NOISE
+    settings: tuple[tuple[str, float | str | bool], ...] = ()
+
+
+class ModalDome(Dome):
+    """A telescope whose response is a given matrix, and whose modes are orthonormal."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        response: Array,
+        *,
+        alpha: Misregistration,
+        seed: int = 1,
+        slope_noise: float = SLOPE_NOISE,
+        n_first: int = N_FIRST,
+        wind: bool = True,
+    ) -> None:
+        """Take the plant's matrix ``(n_slopes, n_modes)`` and its registration, for the record."""
+        n_modes = response.shape[1]
+        self.instrument, self.rate_hz = instrument, FRAME_RATE_HZ
+        self.jump_times_s, self.frame, self.moments, self.orders = (), 0, [], []
+        self._rng, self._noise = np.random.default_rng(seed), slope_noise
+        weights = np.arange(2.0, n_modes + 2.0) ** -0.9
+        self._sigma_m = TURBULENCE_M * weights / np.linalg.norm(weights)
+        self._turbulence = self._sigma_m * self._rng.standard_normal(n_modes)
+        single = np.asfortranarray(response, np.float32)
+        self._response = single
+        self._optics = LinearOptics(
+            alpha=alpha,
+            opd_per_command=np.eye(n_modes, dtype=np.float32),
+            stuck_opd_m=np.zeros(n_modes, np.float32),
+            images=np.zeros((2, 2, 2, 2)),
+            slopes_per_command=single,
+        )
+        identity = Identity(
+            system=instrument.name.lower(),
+            basis_id=instrument.basis_id or "plant-1",
+            config_id=instrument.config_id or "plant-1",
+        )
+        own = np.linalg.pinv(response[:, :n_first]).astype(np.float32)
+        self.computer = RealTimeComputer(
+            self._blocks(),
+            identity=identity,
+            settings=LoopSettings(
+                frame_rate_hz=FRAME_RATE_HZ,
+                delay_frames=DELAY_FRAMES,
+                gains=(GAIN,) * n_modes,
+                leak=LEAK,
+                n_controlled_next=n_first,
+            ),
+            reconstructor=Reconstructor.own(
+                f"own-{n_first}-{checksum(own)[:8]}", own, identity, created_ns=START_NS
+            ),
+            optics=self._optics,
+            stroke_m=10e-6,
+        )
+        self._dt_ns = round(1e9 / FRAME_RATE_HZ)
+        self._clock = FrameClock(start_ns_utc=START_NS, dt_ns=self._dt_ns)
+        self._block_batches = 5
+
+    @override
+    def status(self) -> Status:
+        status = self._clock.stamped(self.computer.status())
+        return decode(Status, encode(replace(status, max_dither_modes=MAX_DITHER_MODES)))
+
+    @override
+    def _blocks(self) -> Iterator[Block]:
+        frame, response = 0, self._response
+        kick = np.sqrt(1.0 - MEMORY**2) * self._sigma_m
+        while True:
+            wind = np.empty((_BLOCK_FRAMES, len(kick)))
+            for row in wind:
+                self._turbulence = MEMORY * self._turbulence + kick * self._rng.standard_normal(
+                    len(kick)
+                )
+                row[:] = self._turbulence
+            noise = self._noise * self._rng.standard_normal((len(wind), len(response)))
+            yield OpenLoopBlock(
+                first_frame=frame,
+                optics=self._optics,
+                phases_m=wind[::BATCH_FRAMES].astype(np.float32),
+                slopes=(wind @ response.T + noise).astype(np.float32),
+            )
+            frame += _BLOCK_FRAMES
+
+    @override
+    def _moment(self, batches: list[Batch]) -> Moment:
+        errors = [batch.phase_m + batch.commands_m[0] for batch in batches]
+        power = np.mean([np.sum(error.astype(float) ** 2) for error in errors])
+        last = batches[-1]
+        dithers = [np.zeros(1) if b.dither_m is None else b.dither_m for b in batches]
+        return Moment(
+            time_s=self.time_s,
+            alpha=last.optics.alpha,
+            wavefront_nm=1e9 * float(np.sqrt(power)),
+            n_clipped=sum(batch.n_clipped for batch in batches),
+            cm_id=last.cm_id,
+            n_controlled=last.n_controlled,
+            closed=last.closed,
+            dither_nm=1e9
+            * float(np.sqrt(np.mean([float(np.sum(d**2)) / len(d) for d in dithers]))),
+        )
+
+
+@lru_cache(maxsize=2)
+def _models(file: str) -> tuple[Instrument, RtcInteractionModel, InteractionModel]:
+    """Return the instrument, its model, and the model of a mirror with another coupling."""
+    instrument = load_instrument(file)
+    basis = analytic_basis(instrument)
+    mirror = instrument.analytic_mirror
+    other = replace(
+        instrument, mirror=replace(mirror, shape=replace(mirror.shape, coupling=OTHER_COUPLING))
+    )
+    # the same strokes of actuators on a mirror of narrower influence functions
+    narrow = basis.of_surface(mirror_surface(other.analytic_mirror, other.subaperture_m))
+    return (
+        instrument,
+        RtcInteractionModel(instrument, basis, pupil_sampling=4, detector_nodes=4),
+        RtcInteractionModel(other, narrow, pupil_sampling=4, detector_nodes=4),
+    )
+
+
+def wrong_response(plan: Plan) -> Array:
+    """Return a plant ``(n_slopes, n_modes)`` that the model explains but for ``plan.error``."""
+    _, model, other = _models(plan.instrument)
+    rng = np.random.default_rng([plan.seed, 36])
+    alpha = true_alpha(plan)
+    drawn = model.interaction_matrix(alpha).astype(float)
+    norm = np.linalg.norm(drawn, axis=0)
+    narrow = other.interaction_matrix(alpha).astype(float)
+    parts = [narrow - drawn * (np.sum(narrow * drawn, axis=0) / norm**2)]
+    # smooth patterns that differ from mode to mode: what neighbouring modes look like
+    place = np.arange(drawn.shape[1])
+    mix = rng.standard_normal((len(place), len(place)))
+    mix *= np.exp(-0.5 * ((place[:, None] - place) / 6.0) ** 2)
+    np.fill_diagonal(mix, 0.0)
+    parts.append((drawn / norm) @ mix)
+    white = rng.standard_normal(drawn.shape)
+    parts.append(white)
+    shares = np.array([0.6, 0.6, 0.5])
+    error: Array = np.sum(
+        [
+            share * part / np.linalg.norm(part, axis=0)
+            for share, part in zip(shares, parts, strict=True)
+        ],
+        axis=0,
+    )
+    error /= np.linalg.norm(error, axis=0)
+    # the highest modes are explained worst, as on every bench measured so far
+    grown = np.linspace(0.8, 1.3, len(place)) * rng.uniform(0.7, 1.3, len(place))
+    grown *= plan.error / np.sqrt(np.mean(grown**2))
+    gains = rng.uniform(0.9, 1.1, len(place))
+    return np.asarray(gains * (drawn + error * norm * grown))
+
+
+def true_alpha(plan: Plan) -> Misregistration:
+    """Return where the mirror of a made plant lies: about ``ALPHA``, another place in each draw."""
+    rng = np.random.default_rng([plan.seed, 63])
+    spread = np.array([0.2, 0.2, 1.5, 0.006]) * rng.uniform(-1.0, 1.0, 4)
+    return Misregistration.from_vector((np.array(ALPHA) + spread) / BOUNDARY_SCALE)
+
+
+def response_of(plan: Plan) -> Array:
+    """Return the plant's matrix ``(n_slopes, n_modes)``."""
+    if plan.matrix:
+        with np.load(plan.matrix) as file:
+            return np.asarray(file["D"], float)
+    return wrong_response(plan)
+
+
+def fitted_alpha(plan: Plan, response: Array) -> Misregistration:
+    """Return the registration that best explains all columns of the plant's matrix."""
+    _, model, _ = _models(plan.instrument)
+    start = true_alpha(plan) if not plan.matrix else model.instrument.start
+    found = recognise_modes(
+        np.linalg.pinv(response, rcond=1e-6).astype(np.float32), model.linearise, start
+    )
+    if found is None:
+        raise ValueError("plant: found a matrix of zeros; expected a response of each mode")
+    return found.alpha
+
+
+def best_nm(plan: Plan, response: Array, n_modes: int) -> float:
+    """Return the wavefront error with the measured matrix' own inverse of so many modes."""
+    instrument, *_ = _models(plan.instrument)
+    dome = ModalDome(
+        instrument,
+        response,
+        alpha=true_alpha(plan),
+        seed=plan.seed,
+        slope_noise=plan.slope_noise,
+        n_first=n_modes,
+    )
+    while dome.time_s < LATE_S + 2.0:
+        dome.play()
+    return late_nm(dome.moments)
+
+
+def late_nm(moments: Sequence[Moment]) -> float:
+    """Return the RMS wavefront error of the end of a run, nm."""
+    end_s = moments[-1].time_s - LATE_S
+    return float(np.sqrt(np.mean([m.wavefront_nm**2 for m in moments if m.time_s > end_s])))
+
+
+def stable_modes(plan: Plan, response: Array, alpha: Misregistration) -> int:
+    """Return how many modes the model's reconstructor at ``alpha`` holds on the plant."""
+    _, model, _ = _models(plan.instrument)
+    matrix, most = model.interaction_matrix(alpha), 0
+    for n in range(1, response.shape[1] + 1):
+        inverse = np.linalg.pinv(matrix[:, :n], rcond=0.01)
+        values = np.linalg.eigvals(GAIN * inverse @ response[:, :n])
+        if float(pole_radius(values, leak=LEAK, delay_frames=DELAY_FRAMES).max()) < 0.97:
+            most = n
+    return most
+
+
+class Night(Observatory):
+    """The service at such a plant; keeps what alarms have said and when."""
+
+    def __init__(self, plan: Plan, response: Array) -> None:
+        instrument, *_ = _models(plan.instrument)
+        settings = load_settings(None, {}, dict(plan.settings))
+        self.said: dict[tuple[str, str], float] = {}
+        dome = ModalDome(
+            instrument,
+            response,
+            alpha=true_alpha(plan),
+            seed=plan.seed,
+            slope_noise=plan.slope_noise,
+            n_first=plan.n_first,
+        )
+        super().__init__(
+            (),
+            policy_of(settings, instrument),
+            Mode(plan.mode),
+            OpticsWorker(instrument, Compute(threads=1)),
+            latencies=Latencies(fit_s=0.1, make_s=0.2, judge_s=0.2, watch_s=0.1, listen_s=0.3),
+            with_poles=False,
+            dome=dome,
+        )
+
+    def pass_(self, until_s: float) -> None:
+        """Let time pass; an operator approves in mode propose."""
+        while self.time_s < until_s - 1e-9:
+            self.advance(0.5)
+            for alarm in self.state.alarms.active:
+                self.said.setdefault((alarm.name, alarm.text), round(self.time_s, 2))
+            if self.state.operator.mode is Mode.PROPOSE:
+                for record in self.state.matrices.reconstructors:
+                    if record.state is MatrixState.PROPOSED:
+                        try:
+                            self.command(cmd.Approve(id=record.id, by="study"))
+                        except Exception as error:  # noqa: BLE001 - a study that goes on
+                            self.said.setdefault(("approve", str(error)), self.time_s)
+
+
+def play(plan: Plan) -> Row:
+    """Run the service on one plant, and return what came of it."""
+    begun = time.process_time()
+    with threadpool_limits(1):
+        response = response_of(plan)
+        fit = fitted_alpha(plan, response)
+        night = Night(plan, response)
+        night.pass_(plan.seconds)
+        return {
+            **asdict(plan),
+            **came_of(plan, night, response, fit),
+            "cpu_s": round(time.process_time() - begun, 1),
+        }
+
+
+def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> Row:
+    """Return what came of a run."""
+    registration, last = night.state.alpha.registration, night.dome.moments[-1]
+    row: Row = {"fit": fit.to_boundary(), "truth": true_alpha(plan).to_boundary()}
+    if registration is not None:
+        off = registration.alpha.vector - fit.vector
+        row |= {
+            "alpha": registration.alpha.to_boundary(),
+            "off_sigma": (off / registration.sigma).tolist(),
+            "sigma": (registration.sigma * BOUNDARY_SCALE).tolist(),
+            "off": (off * BOUNDARY_SCALE).tolist(),
+            "validity": str(registration.validity.level),
+        }
+    proposed = [r for r in night.state.matrices.reconstructors if r.parent is not None]
+    first_ns = min((r.created_ns_utc for r in proposed), default=None)
+    return row | {
+        "first_s": None if first_ns is None else (first_ns - START_NS) / 1e9,
+        "swaps": [(round(s.time_s, 1), s.n_modes) for s in night.swaps],
+        "n_modes": last.n_controlled,
+        "n_stable": stable_modes(plan, response, fit),
+        "late_nm": late_nm(night.dome.moments),
+        "best_nm": best_nm(plan, response, last.n_controlled),
+        "alone_nm": best_nm(plan, response, plan.n_first),
+        "accepted": night.state.windows.accepted,
+        "refused": night.state.windows.refused,
+        "said": [(at, name, text) for (name, text), at in night.said.items()],
+        "closed": last.closed,
+    }
+
+
+def plans(given: argparse.Namespace) -> list[Plan]:
+    """Return the runs that are asked for."""
+    return [
+        Plan(error=error, mode=mode, seed=seed, matrix=given.matrix, seconds=given.seconds)
+        for error in given.errors
+        for mode in given.modes
+        for seed in range(given.first, given.first + given.draws)
+    ]
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Return the rows in Markdown."""
+    text = heading(
+        *("model error", "mode", "draw", "off, σ", "σ", "first matrix", "modes (stable)"),
+        *("wavefront (measured matrix)", "windows", "alarms"),
+    )
+    for row in rows:
+        off = "-" if "off" not in row else " ".join(f"{v:+.1f}" for v in row["off_sigma"])
+        sigma = "-" if "off" not in row else " ".join(f"{v:.3g}" for v in row["sigma"])
+        text += line(
+            *(row["matrix"] or f"{row['error']:.0%}", row["mode"], row["seed"], off, sigma),
+            "-" if row["first_s"] is None else f"{row['first_s']:.1f} s",
+            f"{row['n_modes']} ({row['n_stable']})",
+            f"{row['late_nm']:.1f} ({row['best_nm']:.1f}) nm",
+            f"{row['accepted']} + {row['refused']}",
+            ", ".join(sorted({name for _, name, _ in row["said"]})) or "none",
+        )
+    return text
+
+
+def main() -> int:
+    """Run what is missing, then print the table."""
+    parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.campaign.measured_plant")
+    parser.add_argument("--errors", type=float, nargs="+", default=[0.1, 0.2, 0.3, 0.4])
+    parser.add_argument("--modes", nargs="+", default=["auto"], help="auto, propose")
+    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1, help="first draw")
+    parser.add_argument("--seconds", type=float, default=90.0, help="of each run")
+    parser.add_argument("--matrix", default="", help="a measured matrix instead, npz with D")
+    parser.add_argument("--output", type=Path, default=Path("measured_plant.jsonl"))
+    parser.add_argument("--table", type=Path, metavar="FILE.md")
+    given = parser.parse_args()
+    file = RowFile(given.output)
+    for plan in plans(given):
+        if any(
+            all(
+                row.get(k) == (list(map(list, v)) if isinstance(v, tuple) else v)
+                for k, v in asdict(plan).items()
+            )
+            for row in file.rows
+        ):
+            continue
+        file.add(play(plan))
+        sys.stderr.write(table(file.rows[-1:]).splitlines()[-1] + "\n")
+    tell(table(file.rows), given.table, "python -m pyrcal_studies.campaign.measured_plant")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -358,7 +358,17 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
             "from calibrations of pyRTC 2, or bare arrays",
             (named, unit, described, *_REPORTED),
         ),
-        ("aot", "from an AOT file", (words("file FILE.fits", type=Path), unit, *_REPORTED)),
+        (
+            "aot",
+            "from an AOT file",
+            (
+                words("file FILE.fits", type=Path),
+                words("--loop N|UID", "of several loops: its number, from 1, or its uid"),
+                words("--positions FILE", "of actuators, x and y in metres", type=Path),
+                unit,
+                *_REPORTED,
+            ),
+        ),
         ("files", "from NumPy, FITS or HDF5 files", (named, unit, described, *_REPORTED)),
         ("npz", "the same as files", (named, unit, described, *_REPORTED)),
     ):

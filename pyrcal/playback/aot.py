@@ -60,23 +60,66 @@ def read_telemetry(path: Path, instrument: Instrument) -> AotTelemetry:
         If it is no AOT file, or not of this instrument: what was found and expected.
     """
     system = read_system(path)
-    if len(system.wavefront_sensors) != 1 or len(system.wavefront_correctors) != 1:
-        raise MatrixError(
-            f"{path}: found {len(system.wavefront_sensors)} sensors and "
-            f"{len(system.wavefront_correctors)} mirrors, expected one of each"
+    loops = [one for one in system.loops if _commands(one) is not None]
+    sensors = [one for one in system.wavefront_sensors if _is_of(one, instrument)]
+    if not sensors:
+        listed = ", ".join(
+            f"{one.uid} ({type(one).__name__}, {_n_valid(one)} subapertures)"
+            for one in system.wavefront_sensors
         )
-    (sensor,), (mirror,) = system.wavefront_sensors, system.wavefront_correctors
+        expected = int(rtc_valid_subapertures(instrument).sum())
+        raise MatrixError(
+            f"{path}: found the sensors {listed or 'none'}, expected one whose mask is "
+            f"that of {instrument.name}: {expected} valid subapertures"
+        )
+    loops = [
+        one
+        for one in loops
+        if any(one.input_sensor is sensor for sensor in sensors)
+        and one.input_sensor.measurements is not None
+    ]
+    loops.sort(key=lambda one: -len(_commands(one).data))
+    sensor = loops[0].input_sensor if loops else sensors[0]
+    mirror = loops[0].commanded_corrector if loops else _only_mirror(path, system)
     told = registrations_between(mirror, sensor, instrument.subaperture_m, str(path))
     night = AotTelemetry(registrations=() if told is None else told.over_time)
-    loops = [loop for loop in system.loops if _commands(loop) is not None]
-    if loops and sensor.measurements is not None:
-        loops.sort(key=lambda loop: -len(_commands(loop).data))
+    if len(system.wavefront_sensors) > 1:
+        night.notes.append(
+            f"of {len(system.wavefront_sensors)} sensors {sensor.uid} is taken, whose mask is the "
+            "instrument's"
+        )
+    if loops:
         night.arrays = _Reader(path=path, instrument=instrument, notes=night.notes).arrays(
             loops[0], sensor
         )
-        if rest := [loop.uid for loop in loops[1:]]:
+        if rest := [loop.uid for loop in system.loops if loop is not loops[0]]:
             night.notes.append(f"one loop is played; left out: {', '.join(rest)}")
     return night
+
+
+def _n_valid(sensor: Any) -> int:  # noqa: ANN401 - aotpy has no types
+    """Return how many subapertures the mask of a sensor lists; 0 without a mask."""
+    mask = getattr(sensor, "subaperture_mask", None)
+    return 0 if mask is None else int((np.asarray(mask.data) >= 0).sum())
+
+
+def _is_of(sensor: Any, instrument: Instrument) -> bool:  # noqa: ANN401
+    """Return whether a sensor may be the instrument's: without a mask the reader refuses it."""
+    mask = getattr(sensor, "subaperture_mask", None)
+    if mask is None:
+        return True
+    places = np.asarray(mask.data) >= 0
+    masks = valid_subapertures(instrument), rtc_valid_subapertures(instrument)
+    return any(places.shape == one.shape and np.array_equal(places, one) for one in masks)
+
+
+def _only_mirror(path: Path, system: Any) -> Any:  # noqa: ANN401
+    if len(system.wavefront_correctors) != 1:
+        raise MatrixError(
+            f"{path}: found {len(system.wavefront_correctors)} mirrors and no loop with commands, "
+            "expected one of either"
+        )
+    return system.wavefront_correctors[0]
 
 
 def _commands(loop: Any) -> Any:  # noqa: ANN401 - aotpy has no types

@@ -62,38 +62,55 @@ def _check(path: Path) -> None:
         raise MatrixError(f"{path}: found FITS without AOT-VERS, expected an AOT file")
 
 
-def from_aot(path: Path, reported: Reported) -> Imported:
-    """Return what an AOT file says of its system.
+def from_aot(
+    path: Path, reported: Reported, loop: str | None = None, positions: Array | None = None
+) -> Imported:
+    """Return the telescope, the sensor, the mirror and the matrix of one loop of an AOT file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    reported
+        What it does not say.
+    loop
+        Number of the loop, from 1, or its uid; None if only one has an interaction matrix.
+    positions
+        ``(n_actuators, 2)`` of a mirror without coordinates and influence functions, metres.
 
     Raises
     ------
     ConfigurationError
         If ``aotpy`` is not installed.
     MatrixError
-        If the file cannot be read, or has no loop with an interaction matrix.
+        If the file cannot be read, or has no such loop with an interaction matrix.
     """
     system = read_system(path)
-    loops = [loop for loop in system.loops if getattr(loop, "interaction_matrix", None)]
-    if len(loops) != 1:
-        raise MatrixError(
-            f"{path}: found {len(loops)} loops with an interaction matrix, expected one"
-        )
-    (loop,) = loops
-    sensor, mirror = loop.input_sensor, loop.commanded_corrector
+    chosen = _chosen_loop(path, system, loop)
+    sensor, mirror = chosen.input_sensor, chosen.commanded_corrector
     kind = SENSORS.get(type(sensor).__name__)
     if kind is None or sensor.subaperture_mask is None:
         raise MatrixError(
-            f"{path}: found a {type(sensor).__name__}, expected {' or '.join(SENSORS)} with its "
-            "subaperture_mask"
+            f"{path}: loop {chosen.uid}: found a {type(sensor).__name__}, expected "
+            f"{' or '.join(SENSORS)} with its subaperture_mask"
         )
     places = np.asarray(sensor.subaperture_mask.data)
-    matrix = _by_rows(loop.interaction_matrix.data, places, str(path))
+    matrix = _by_rows(chosen.interaction_matrix.data, places, str(path))
     notes: list[str] = []
     arrays = {
         "matrix": matrix,
         "valid": places >= 0,
-        **_mirror(mirror, loop, matrix.shape[1], notes),
+        **_mirror(mirror, chosen, matrix.shape[1], notes),
     }
+    if positions is not None:
+        arrays["positions"] = positions
+        arrays.pop("modes", None)
+    elif "modes" not in arrays and "positions" not in arrays:
+        raise MatrixError(
+            f"{path}: found no coordinates and no influence functions of the mirror {mirror.uid}, "
+            f"which has {mirror.n_valid_actuators} actuators; give --positions FILE, x and y in "
+            "metres"
+        )
     telescope = system.main_telescope
     diameter_m = telescope.enclosing_diameter or reported.diameter_m
     told = registrations_between(mirror, sensor, diameter_m / max(places.shape), str(path))
@@ -116,6 +133,38 @@ def from_aot(path: Path, reported: Reported) -> Imported:
         tables={**imported.tables, "mirror": {**imported.tables["mirror"], **told.mirror}},
         arrays={**imported.arrays, **told.arrays},
     ).noted(told.text)
+
+
+def _chosen_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
+    """Return the loop that is asked for, or the only one with an interaction matrix."""
+    measured = [one for one in system.loops if getattr(one, "interaction_matrix", None) is not None]
+    listed = "; ".join(
+        f"{number} {one.uid} ({_words(one)})" for number, one in enumerate(system.loops, start=1)
+    )
+    if wanted is None:
+        if len(measured) == 1:
+            return measured[0]
+        what = "no loop" if not measured else f"{len(measured)} loops"
+        raise MatrixError(
+            f"{path}: found {what} with an interaction matrix, expected one: choose with --loop: "
+            f"{listed or 'none'}"
+        )
+    for number, one in enumerate(system.loops, start=1):
+        if wanted in {str(number), one.uid}:
+            if one not in measured:
+                raise MatrixError(
+                    f"{path}: loop {one.uid}: found no interaction matrix, expected one: {listed}"
+                )
+            return one
+    raise MatrixError(f"{path}: --loop: found {wanted}, expected one of {listed or 'none'}")
+
+
+def _words(loop: Any) -> str:  # noqa: ANN401
+    """Return what a loop has, in words."""
+    matrix = getattr(loop, "interaction_matrix", None)
+    sensor = loop.input_sensor
+    about = "no interaction matrix" if matrix is None else f"matrix {np.shape(matrix.data)}"
+    return f"{type(sensor).__name__} {sensor.uid}, {about}"
 
 
 def registrations_between(
@@ -194,6 +243,8 @@ def places_of(places: Array, where: str) -> Array:
     """
     listed = places[places >= 0].ravel()
     n_valid = len(listed)
+    if n_valid and listed.min() == 1:
+        listed = listed - 1  # some writers count from 1
     if places.ndim != 2 or not np.array_equal(np.sort(listed), np.arange(n_valid)):
         raise MatrixError(
             f"{where}: subaperture_mask: expected -1 or the place of each valid subaperture, 0 to "

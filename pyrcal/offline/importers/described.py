@@ -20,6 +20,7 @@ from pyrcal.offline.importers.files import (
     read_slopes,
     usable_modes,
 )
+from pyrcal.offline.importers.frames import Frames, images_words, rounded_centres
 from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, Imported
 from pyrcal.offline.importers.pupil_images import find_pupil_images
 from service.config import instrument_path, load_instrument
@@ -30,6 +31,9 @@ from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
 
 OFF_CENTRE_SUBAP = 0.25
 """Distance between the centres of the file and those of the light that is mentioned."""
+
+WIDTH_TOLERANCE = 0.03
+"""Relative difference between the pupil image of the file and that of the frames."""
 
 _REFERENCES = ("modes", "positions", "mode_to_actuator", "influence_functions", "influence_origin")
 
@@ -79,6 +83,10 @@ def from_described(
         signals.arrays["interaction_matrix"] = signals.arrays["interaction_matrix"] / UNITS_M[unit]
     wfs = {**tables["wfs"], **signals.table}
     slopes = {**tables.get("slopes", {})}
+    if wfs.get("input") == "frames":
+        # both follow from where the images lie on the frames
+        wfs.pop("pupil_separation_subap", None)
+        slopes.pop("order", None)
     slopes.setdefault("orientation", "auto")
     kept = {key: table for key, table in tables.items() if key not in {"wfs", "mirror", "slopes"}}
     if "modes" in kept:
@@ -132,10 +140,15 @@ def _signals(
     notes: list[str],
 ) -> Signals:
     told = instrument.frames
-    if not isinstance(told, FrameWindows):
+    frames = read_frames(source, arrays, instrument.wfs.kind)
+    if isinstance(told, FrameWindows) and frames is None:
+        raise MatrixError(
+            f"{source}: matrix: found shape {np.shape(arrays['matrix'])}, expected camera frames: "
+            'wfs.input = "frames"; give the mask of lit pixels or the mean frame beside them'
+        )
+    if frames is None:
         signals = read_slopes(source, arrays, mirror.n_modes, notes)
-        n = instrument.wfs.n_subapertures
-        found = signals.table["n_subapertures"]
+        n, found = instrument.wfs.n_subapertures, signals.table["n_subapertures"]
         if found != n:
             raise MatrixError(
                 f"{source}: valid: found a mask that spans {found} subapertures, expected {n} as "
@@ -143,19 +156,38 @@ def _signals(
             )
         signals.table = {"valid_subapertures": Dataset("valid_subapertures")}
         return signals
-    frames = read_frames(source, arrays, "pyramid")
-    if frames is None:
-        raise MatrixError(
-            f"{source}: matrix: found shape {np.shape(arrays['matrix'])}, expected camera frames: "
-            'wfs.input = "frames"; give the mask of lit pixels or the mean frame beside them'
-        )
-    notes += _beside_the_light(told, frames.light, frames.light_name)
+    table: dict[str, Any] = {}
+    if isinstance(told, FrameWindows):
+        notes += _beside_the_light(told, frames.light, frames.light_name)
+    else:
+        table = _windows(source, instrument, frames, notes)
     return Signals(
-        table={},
+        table=table,
         arrays={"interaction_matrix": frames.cube, "flux_frame": frames.light},
         obscuration_ratio=0.0,
         columns=0,
     )
+
+
+def _windows(
+    source: str, instrument: Instrument, frames: Frames, notes: list[str]
+) -> dict[str, Any]:
+    """Return keys of ``[wfs]`` that make frames of an instrument whose RTC sends slopes."""
+    images = find_pupil_images(frames.light, f"{source}: {frames.light_name}")
+    width = instrument.wfs.pupil_diameter
+    pixels = max(1, round(images.diameter_px / width))
+    if abs(images.diameter_px / pixels / width - 1.0) > WIDTH_TOLERANCE:
+        raise MatrixError(
+            f"{source}: {frames.light_name}: found pupil images of {images.diameter_px:.1f} "
+            f"pixels, expected a multiple of wfs.pupil_diameter_subap = {width:g}"
+        )
+    notes.append(images_words(frames, images))
+    return {
+        "input": "frames",
+        "pixels_per_subaperture": pixels,
+        "pupil_centres_px": rounded_centres(images),
+        "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
+    }
 
 
 def _beside_the_light(told: FrameWindows, light: Array, name: str) -> list[str]:

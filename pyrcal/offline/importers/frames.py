@@ -111,12 +111,7 @@ def describe_frames(
     images = find_pupil_images(frames.light, f"{where}: {frames.light_name}")
     pixels = pixels_per_subaperture or _binning(images, n_actuators)
     n = _grid(images, pixels, frames.light.shape)
-    centres = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in images.centres_px)
-    notes.append(
-        f"matrix: camera frames of {frames.cube.shape[1]} x {frames.cube.shape[2]} pixels; pupil "
-        f"images {images.diameter_px:.1f} pixels wide with a hole of {images.hole_px:.1f}, centred "
-        f"at (row, column) {centres}, found in {frames.light_name}"
-    )
+    notes.append(images_words(frames, images))
     notes.append(f"{pixels} x {pixels} pixels are one subaperture; --pixels-per-subap changes that")
     valid = _valid(frames.light, images, n, pixels)
     table = {
@@ -124,7 +119,7 @@ def describe_frames(
         "pupil_diameter_subap": round(images.diameter_px / pixels, 3),
         "input": "frames",
         "pixels_per_subaperture": pixels,
-        "pupil_centres_px": [[round(float(v), 3) for v in at] for at in images.centres_px],
+        "pupil_centres_px": rounded_centres(images),
         "valid_subapertures": Dataset("valid_subapertures"),
     }
     arrays = {
@@ -133,6 +128,21 @@ def describe_frames(
         "valid_subapertures": valid.astype(np.uint8),
     }
     return table, arrays, images.obscuration_ratio
+
+
+def images_words(frames: Frames, images: PupilImages) -> str:
+    """Return where the pupil images were found, one sentence."""
+    centres = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in images.centres_px)
+    return (
+        f"matrix: camera frames of {frames.cube.shape[1]} x {frames.cube.shape[2]} pixels; pupil "
+        f"images {images.diameter_px:.1f} pixels wide with a hole of {images.hole_px:.1f}, centred "
+        f"at (row, column) {centres}, found in {frames.light_name}"
+    )
+
+
+def rounded_centres(images: PupilImages) -> list[list[float]]:
+    """Return the centres as an instrument file writes them."""
+    return [[round(float(value), 3) for value in at] for at in images.centres_px]
 
 
 def _binning(images: PupilImages, n_actuators: int) -> int:

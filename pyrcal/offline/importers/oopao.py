@@ -32,7 +32,7 @@ SAVED = {
     "ngs": ("wavelength",),
     "dm": (
         *("modes", "altitude", "initial_coordinates", "nActAlongDiameter", "mechCoupling"),
-        *("sign", "flip_", "flip_lr"),
+        *("sign", "flip_", "flip_lr", "validAct"),
     ),
     "dm.misReg": (
         *("rotationAngle", "shiftX", "shiftY", "anamorphosisAngle"),
@@ -46,7 +46,9 @@ SAVED = {
 }
 """Attributes that are looked at, of each object; what an object lacks does not concern it."""
 
-_OPTIONAL = {"pupilReflectivity", "altitude", "sign", "flip_", "flip_lr", "is_geometric"}
+_OPTIONAL = {
+    *("pupilReflectivity", "altitude", "sign", "flip_", "flip_lr", "is_geometric", "validAct"),
+}
 
 _OF_SENSOR = {
     **dict.fromkeys(
@@ -103,10 +105,12 @@ def from_oopao(
         )
     wavelength_m = _wavelength_m(tel, wfs, ngs)
     sensor, valid, slopes = _sensor(tel, wfs, notes)
-    mirror, arrays = _mirror(tel, dm, notes)
+    functions = _functions(tel, dm)
+    mirror, arrays = _mirror(tel, dm, functions, notes)
     if "positions" in arrays:
         notes += _where_it_lies(dm.misReg, tel, len(valid))
-    n_actuators = np.shape(dm.modes)[1]
+    pupil, diameter_m = _lit_pupil(tel, sensor, notes)
+    n_actuators = functions.shape[1]
     if M2C is None:
         mirror["basis"] = "zonal"
         n_modes = n_actuators
@@ -120,13 +124,13 @@ def from_oopao(
         matrix, turned = matrix_of(_numpy(getattr(calib, "D", calib)), 2 * valid.sum(), n_modes)
         notes += turned
         arrays["interaction_matrix"] = matrix
-    arrays |= {"valid_subapertures": valid.astype(np.uint8), "pupil": _pupil(tel)}
+    arrays |= {"valid_subapertures": valid.astype(np.uint8), "pupil": pupil}
     return Imported(
         source="OOPAO",
         tables={
             "instrument": {
                 "name": "oopao",
-                "diameter_m": float(tel.D),
+                "diameter_m": diameter_m,
                 "pupil": Dataset("pupil"),
                 "stop": "telescope",
                 "double_pass": False,
@@ -162,6 +166,38 @@ def _pupil(tel: Any) -> NDArray[np.float32]:  # noqa: ANN401
     """Return the share of light of every point: OOPAO's reflectivity is of the intensity."""
     reflectivity = _numpy(getattr(tel, "pupilReflectivity", 1.0))
     return np.asarray(_numpy(tel.pupil) * np.sqrt(reflectivity), dtype=np.float32)
+
+
+def _lit_pupil(
+    tel: Any,  # noqa: ANN401
+    sensor: dict[str, Any],
+    notes: list[str],
+) -> tuple[NDArray[np.float32], float]:
+    """Return the pupil without a dark rim, and its diameter; ``sensor`` is changed to match.
+
+    A padded telescope has an array that is wider than its light, and ``tel.D`` is the array's.
+    """
+    pupil = _pupil(tel)
+    side = len(pupil)
+    lit = np.argwhere(pupil > 0.0)
+    if pupil.ndim != 2 or side != pupil.shape[1] or not len(lit):
+        raise ConfigurationError(
+            f"tel.pupil: found shape {pupil.shape}, expected light on a square (n, n)"
+        )
+    rim = int(min(lit.min(), side - 1 - lit.max()))
+    if not rim:
+        return pupil, float(tel.D)
+    share = (side - 2 * rim) / side
+    diameter_m = float(tel.D) * share
+    sensor["pupil_diameter_subap"] = sensor["n_subapertures"] * share
+    if "modulation_lambda_over_d" in sensor:
+        sensor["modulation_lambda_over_d"] *= share  # it is counted in wavelengths over tel.D
+    notes.append(
+        f"tel.D = {float(tel.D):g} m is that of a padded array: a dark rim of {rim} points is cut, "
+        f"so that the pupil is {diameter_m:.4g} m wide, {sensor['pupil_diameter_subap']:.4g} of "
+        f"{sensor['n_subapertures']} subapertures"
+    )
+    return pupil[rim : side - rim, rim : side - rim], diameter_m
 
 
 def _steps(tel: Any) -> float:  # noqa: ANN401
@@ -240,21 +276,41 @@ def _lenslets(
 # --- the mirror
 
 
-def _mirror(
-    tel: Any,  # noqa: ANN401
-    dm: Any,  # noqa: ANN401
-    notes: list[str],
-) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return ``[mirror]`` and its arrays: drawn where it is OOPAO's Gaussian one, else a cube."""
+def _functions(tel: Any, dm: Any) -> Array:  # noqa: ANN401
+    """Return influence functions ``(tel.resolution ** 2, n_actuators)``.
+
+    OOPAO's ``InfluenceFunctions`` has them as a cube ``influence_function_2D``.
+    """
     side = int(tel.resolution)
+    cube = getattr(dm, "influence_function_2D", None)
+    if cube is not None and not hasattr(dm, "modes"):
+        cube = _numpy(cube)
+        if cube.ndim != 3 or cube.shape[1:] != (side, side):
+            raise ConfigurationError(
+                f"influence_function_2D: found shape {cube.shape}, expected (n_actuators, {side}, "
+                f"{side}) as tel.resolution says"
+            )
+        return np.asarray(cube.reshape(len(cube), -1).T)
     functions = _numpy(dm.modes)
     if functions.ndim != 2 or len(functions) != side**2:
         raise ConfigurationError(
             f"dm.modes: found shape {functions.shape}, expected (tel.resolution ** 2, n_actuators) "
             f"= ({side**2}, n)"
         )
-    if _is_gaussian(dm, functions, float(tel.D)):
-        return _gaussian(tel, dm)
+    return functions
+
+
+def _mirror(
+    tel: Any,  # noqa: ANN401
+    dm: Any,  # noqa: ANN401
+    functions: Array,
+    notes: list[str],
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return ``[mirror]`` and its arrays: drawn where it is OOPAO's Gaussian one, else a cube."""
+    side = int(tel.resolution)
+    places = _places(dm, functions.shape[1], notes)
+    if places is not None and _is_gaussian(dm, places, functions, float(tel.D)):
+        return _gaussian(tel, dm, places)
     notes.append(
         "dm.modes are not the Gaussian functions of dm.coordinates: taken as a cube, so α counts "
         "from where this mirror lies, and beyond the pupil its surface is unknown"
@@ -267,9 +323,43 @@ def _mirror(
     return table, {"influence_functions": cube}
 
 
-def _gaussian(tel: Any, dm: Any) -> tuple[dict[str, Any], dict[str, Array]]:  # noqa: ANN401
+def _places(dm: Any, n_functions: int, notes: list[str]) -> Array | None:  # noqa: ANN401
+    """Return where the actuators of the functions are drawn; None if that is not known.
+
+    With a scalar ``actuator_selection`` OOPAO drops functions, and leaves the coordinates as they
+    were: ``validAct`` lists those that are left.
+    """
+    places = getattr(dm, "initial_coordinates", None)
+    if places is None:
+        return None
+    places = _numpy(places)
+    if len(places) == n_functions:
+        return places
+    kept = getattr(dm, "validAct", None)
+    if kept is not None:
+        kept = _numpy(kept)
+        indices = np.flatnonzero(kept) if kept.dtype == bool else kept.astype(np.intp)
+        if len(indices) == n_functions and max(indices, default=0) < len(places):
+            notes.append(
+                f"dm.initial_coordinates lists {len(places)} actuators, dm.modes {n_functions}: "
+                "those of dm.validAct are taken"
+            )
+            return np.asarray(places[indices])
+    longer = "dm.initial_coordinates" if len(places) > n_functions else "dm.modes"
+    notes.append(
+        f"dm.initial_coordinates lists {len(places)} actuators, dm.modes {n_functions} functions: "
+        f"{longer} is the longer one, and which belong together is not known; save dm.validAct"
+    )
+    return None
+
+
+def _gaussian(
+    tel: Any,  # noqa: ANN401
+    dm: Any,  # noqa: ANN401
+    places: Array,
+) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return ``[mirror]`` of OOPAO's own Gaussian mirror where it lies without its misReg."""
-    places = _numpy(dm.initial_coordinates).astype(float) * _steps(tel) * _mirrored(dm)
+    places = places.astype(float) * _steps(tel) * _mirrored(dm)
     table = {
         "layout": "positions",
         "positions": Dataset("positions"),
@@ -286,13 +376,17 @@ def _mirrored(dm: Any) -> NDArray[np.float64]:  # noqa: ANN401
     return np.array([-x if getattr(dm, "flip_lr", False) else x, y])
 
 
-def _is_gaussian(dm: Any, functions: Array, diameter_m: float) -> bool:  # noqa: ANN401
-    """Return whether the influence functions are the Gaussians that its attributes tell."""
-    places = getattr(dm, "initial_coordinates", None)
-    if places is None or len(places) != functions.shape[1] or getattr(dm, "sign", 1) != 1:
+def _is_gaussian(
+    dm: Any,  # noqa: ANN401
+    places: Array,
+    functions: Array,
+    diameter_m: float,
+) -> bool:
+    """Return whether the influence functions are the Gaussians that its attributes describe."""
+    if getattr(dm, "sign", 1) != 1:
         return False
     some = np.unique(np.linspace(0, len(places) - 1, _SAMPLED_ACTUATORS).astype(int))
-    drawn = _drawn(dm, _numpy(places)[some].astype(float), len(functions), diameter_m)
+    drawn = _drawn(dm, places[some].astype(float), len(functions), diameter_m)
     return bool(np.abs(drawn - functions[:, some].T).max() <= _SAME_SHAPE)
 
 

@@ -108,7 +108,21 @@ def _cacao(options: argparse.Namespace) -> Imported:
 
 
 def _aot(options: argparse.Namespace) -> Imported:
-    return from_aot(options.file, _reported(options))
+    positions = None
+    if options.positions is not None:
+        positions = _positions(options.positions)
+    return from_aot(options.file, _reported(options), options.loop, positions)
+
+
+def _positions(path: Path) -> Array:
+    """Return positions ``(n_actuators, 2)`` of an array file, or of a text file of two columns."""
+    if path.suffix.lower() not in {".txt", ".csv", ".dat"}:
+        return _only(_read(path), str(path))
+    delimiter = "," if path.suffix.lower() == ".csv" else None
+    try:
+        return np.loadtxt(path, delimiter=delimiter, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise MatrixError(f"{path}: found {error}, expected x and y in a row") from error
 
 
 def _reported(options: argparse.Namespace) -> Reported:

@@ -1,6 +1,7 @@
 """Arrays of an instrument that a file describes: PAPYRUS' three files with one command."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pyrcal
 import pyrcal.offline.recorded
 from pyrcal.__main__ import main
 from pyrcal.offline.importers.described import from_described
+from service.config import packaged_file
 from service.errors import ConfigurationError, MatrixError
 from tests.unit.offline.discs import four_discs
 
@@ -43,6 +45,8 @@ def test_a_folder_of_frames_mask_and_modes_is_one_command(tmp_path, capsys):
     assert "took" in capsys.readouterr().out
     instrument = pyrcal.load_instrument(tmp_path / "bench" / "instrument.toml")
     assert instrument.modes.n_modes == 8
+    np.testing.assert_allclose(instrument.frames.centres_px, CENTRES, atol=0.05)
+    assert instrument.frames.pixels_per_subaperture == 2
     with pyrcal.offline.recorded.opened(tmp_path / "bench" / "matrix.h5") as file:
         np.testing.assert_array_equal(file.find("interaction_matrix").read(), FRAMES)
         np.testing.assert_array_equal(file.find("modes").read(), [1, 5, 7])
@@ -66,11 +70,21 @@ def test_columns_and_modes_that_cannot_be_used_are_named_and_left_out():
     assert found.arrays["interaction_matrix"].shape == (2, 240, 240)
 
 
-def test_light_beside_the_centres_of_the_file_is_said():
-    moved = np.roll(LIT, 1, axis=0)
-    notes = imported(valid=moved).notes
-    assert any("0.5" in note and "pupil_centres_px" in note for note in notes)
-    assert not any("pupil_centres_px" in note for note in imported().notes)
+def test_light_beside_the_centres_of_a_file_is_said(tmp_path):
+    centres = [list(at) for at in CENTRES]
+    frames = f'input = "frames"\npixels_per_subaperture = 2\npupil_centres_px = {centres}'
+    text = packaged_file("papyrus").read_text("utf-8")
+    text = re.sub(r"pupil_separation_subap.*", frames, text).replace('"papyrus"', '"bench"')
+    path = tmp_path / "bench.toml"
+    path.write_text(text, "utf-8")
+
+    def notes(valid):
+        found = from_described("bench", arrays(valid=valid), str(path), None, np.arange(3))
+        return [note for note in found.notes if "pupil_centres_px" in note]
+
+    (note,) = notes(np.roll(LIT, 1, axis=0))
+    assert "0.5" in note
+    assert not notes(LIT)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +93,7 @@ def test_light_beside_the_centres_of_the_file_is_said():
         ({}, (1, 5), ConfigurationError, "found 2 numbers"),
         ({}, (1, 5, 8), ConfigurationError, "expected numbers below 8"),
         ({"mode_to_actuator": STROKES[:200]}, (1, 5, 7), MatrixError, r"found shape \(200, 8\)"),
-        ({"valid": LIT[:200]}, (1, 5, 7), MatrixError, "expected camera frames"),
+        ({"valid": LIT[:200]}, (1, 5, 7), MatrixError, r"expected a mask \(n, n\)"),
     ],
 )
 def test_what_does_not_belong_to_the_instrument_is_refused(other, columns, refusal, says):

@@ -354,7 +354,7 @@ def test_an_aot_file_says_telescope_and_wavelength_itself(listed, tmp_path):
 
 def test_an_aot_file_without_a_matrix_and_what_is_none_are_refused(tmp_path):
     aot_file(tmp_path / "it.fits")
-    with pytest.raises(MatrixError, match="found 0 loops with an interaction matrix"):
+    with pytest.raises(MatrixError, match="found no loop with an interaction matrix"):
         from_aot(tmp_path / "it.fits", REPORTED)
     with pytest.raises(MatrixError, match="expected an AOT file"):
         from_aot(SPECULA[0], REPORTED)
@@ -430,3 +430,72 @@ def test_a_member_that_cannot_be_unpacked_is_refused(at, bit, tmp_path):
     (tmp_path / "it.npz").write_bytes(whole)
     with pytest.raises(MatrixError, match=r"it\.npz"):
         read_npz(tmp_path / "it.npz")
+
+
+@pytest.fixture
+def four_loops(tmp_path):
+    """An AOT file as a laser system's: four sensors of one mirror, listed column by column."""
+    aotpy = pytest.importorskip("aotpy")
+    places = np.full(VALID.T.shape, -1, dtype=np.int32)
+    places[VALID.T] = np.arange(VALID.sum())
+    places = places.T
+    by_columns = MATRIX.reshape(2, -1, 5)[:, np.argsort(places[VALID])].swapaxes(0, 1)
+    telescope = aotpy.MainTelescope(uid="t", enclosing_diameter=2.0, obstruction_diameter=0.4)
+    mirror = aotpy.DeformableMirror(uid="dsm", telescope=telescope, n_valid_actuators=5)
+    sensors, loops = [], []
+    for number in range(1, 5):
+        sensor = aotpy.ShackHartmann(
+            uid=f"LGS{number}",
+            source=aotpy.NaturalGuideStar(uid=f"star {number}"),
+            n_valid_subapertures=int(VALID.sum()),
+            subaperture_mask=aotpy.Image(f"mask {number}", places),
+            wavelength=589e-9,
+            centroiding_algorithm="cog",
+        )
+        sensors.append(sensor)
+        loops.append(
+            aotpy.ControlLoop(
+                uid=f"loop {number}",
+                input_sensor=sensor,
+                commanded_corrector=mirror,
+                interaction_matrix=aotpy.Image(f"matrix {number}", number * by_columns),
+            )
+        )
+    system = aotpy.AOSystem(
+        ao_mode="GLAO",
+        name="it",
+        main_telescope=telescope,
+        sources=[sensor.source for sensor in sensors],
+        wavefront_sensors=sensors,
+        wavefront_correctors=[mirror],
+        loops=loops,
+    )
+    path = tmp_path / "four.fits"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system.write_to_file(path, "fits")
+    return path
+
+
+def test_one_of_four_loops_is_chosen_and_a_mirror_without_places_given_some(
+    four_loops, tmp_path, capsys
+):
+    places = np.random.default_rng(8).normal(size=(5, 2))
+    np.savetxt(tmp_path / "xy.txt", places)
+    words = ["import", "aot", str(four_loops), "--diameter-m", "2"]
+    more = ["--positions", str(tmp_path / "xy.txt"), "--output", str(tmp_path / "bench")]
+    assert main([*words, *more]) == 2
+    said = capsys.readouterr().err
+    assert "found 4 loops" in said
+    assert "3 loop 3 (ShackHartmann LGS3" in said
+    for loop in ("3", "loop 3"):
+        assert main([*words, "--loop", loop, *more]) == 0
+        with pyrcal.offline.recorded.opened(tmp_path / "bench" / "matrix.h5") as file:
+            np.testing.assert_array_equal(file.find("interaction_matrix").read(), 3 * MATRIX)
+            np.testing.assert_allclose(file.find("positions").read(), places)
+    assert pyrcal.load_instrument(tmp_path / "bench" / "instrument.toml").wfs.n_subapertures == 6
+    assert main([*words, "--loop", "5", *more]) == 2
+    assert "--loop: found 5" in capsys.readouterr().err
+    assert main([*words, "--loop", "3", "--output", str(tmp_path / "other")]) == 2
+    assert "--positions FILE" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

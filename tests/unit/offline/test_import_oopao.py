@@ -14,7 +14,13 @@ import pytest
 import pyrcal
 from pyrcal.__main__ import main
 from pyrcal.offline.importers.imported import Imported, oriented
-from pyrcal.offline.importers.oopao import SAVED, from_saved, registration_of, to_oopao
+from pyrcal.offline.importers.oopao import (
+    SAVED,
+    from_oopao,
+    from_saved,
+    registration_of,
+    to_oopao,
+)
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.models import deciding_sampling
 from service.errors import ConfigurationError, MatrixError
@@ -187,3 +193,69 @@ def test_a_folder_that_cannot_be_written_is_named(saved, tmp_path):
     with pytest.raises(pyrcal.PyrcalError, match="cannot be written"):
         imported_of(saved).save(tmp_path / "file")
     assert isinstance(imported_of(saved), Imported)
+
+
+RIM = 5
+"""Dark points around the pupil of a padded telescope."""
+
+
+def padded(saved):
+    """The same telescope in an array that is wider by a dark rim, as ``tel.pad`` makes it."""
+    side = int(saved["tel.resolution"])
+    wide, diameter_m = side + 2 * RIM, float(saved["tel.D"])
+    # its mirror is drawn on points of which the first and the last are tel.D apart
+    stretch = (wide / side) * (side - 1) / (wide - 1)
+    cube = np.zeros((wide, wide, saved["dm.modes"].shape[1]))
+    inner = slice(RIM, RIM + side)
+    cube[inner, inner] = saved["dm.modes"].reshape(side, side, -1)
+    return {
+        "tel__D": np.array(diameter_m * wide / side),
+        "tel__resolution": np.array(wide),
+        "tel__pupil": np.pad(saved["tel.pupil"], RIM),
+        "tel__pupilReflectivity": np.array(1.0),
+        "dm__modes": cube.reshape(wide**2, -1),
+        "dm__initial_coordinates": saved["dm.initial_coordinates"] * stretch,
+    }
+
+
+def test_the_dark_rim_of_a_padded_telescope_is_cut(saved, tmp_path):
+    plain, found = imported_of(saved), imported_of(saved, **padded(saved))
+    about, expected = (one.tables["instrument"] for one in (found, plain))
+    assert about["diameter_m"] == pytest.approx(expected["diameter_m"])
+    np.testing.assert_array_equal(found.arrays["pupil"].shape, plain.arrays["pupil"].shape)
+    wide = int(saved["tel.resolution"]) + 2 * RIM
+    share = int(saved["tel.resolution"]) / wide
+    n = found.tables["wfs"]["n_subapertures"]
+    assert found.tables["wfs"]["pupil_diameter_subap"] == pytest.approx(n * share)
+    # OOPAO counts its modulation in wavelengths over tel.D, on the points' steps
+    modulation = float(saved["wfs.modulation"]) * wide / (wide - 1) * share
+    assert found.tables["wfs"]["modulation_lambda_over_d"] == pytest.approx(modulation)
+    assert any("padded" in note for note in found.notes)
+    pyrcal.load_instrument(found.save(tmp_path / "padded").instrument)
+
+
+def test_selected_actuators_are_those_that_validact_lists(saved):
+    """A scalar ``actuator_selection`` drops functions and leaves the coordinates as they were."""
+    kept = np.delete(np.arange(saved["dm.modes"].shape[1]), [0, 3])
+    chosen = {"dm__modes": saved["dm.modes"][:, kept], "M2C": saved["M2C"][kept]}
+    found = imported_of(saved, **chosen, dm__validAct=kept)
+    np.testing.assert_array_equal(
+        found.arrays["positions"], imported_of(saved).arrays["positions"][kept]
+    )
+    unknown = imported_of(saved, **chosen)
+    assert "influence_functions" in unknown.arrays
+    assert any("dm.initial_coordinates is the longer one" in note for note in unknown.notes)
+
+
+def test_influence_functions_of_its_own_class_are_taken(saved):
+    side = int(saved["tel.resolution"])
+    cube = np.moveaxis((saved["dm.modes"] ** 2).reshape(side, side, -1), -1, 0)
+    objects = {name: {} for name in ("tel", "wfs", "ngs")}
+    for name, values in saved.items():
+        owner, _, attribute = name.rpartition(".")
+        if owner in objects:
+            objects[owner][attribute] = values.item() if values.ndim == 0 else values
+    tel, wfs, ngs = (SimpleNamespace(**objects[name]) for name in ("tel", "wfs", "ngs"))
+    functions = SimpleNamespace(influence_function_2D=cube, sign=1)
+    found = from_oopao(tel, functions, wfs, saved["calib.D"], saved["M2C"], ngs)
+    np.testing.assert_allclose(found.arrays["influence_functions"], cube, rtol=1e-6)

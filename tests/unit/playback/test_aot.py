@@ -40,6 +40,7 @@ class Hand:
     """Someone's own AOT file of an instrument, to be spoilt before it is written."""
 
     def __init__(self, about):
+        self.others = []
         mask = rtc_valid_subapertures(about)
         n_valid = int(mask.sum())
         places = np.full(mask.shape, -1)
@@ -78,8 +79,8 @@ class Hand:
             ao_mode="SCAO",
             name="by hand",
             main_telescope=self.telescope,
-            sources=[self.sensor.source],
-            wavefront_sensors=[self.sensor],
+            sources=[self.sensor.source, *(one.source for one in self.others)],
+            wavefront_sensors=[self.sensor, *self.others],
             wavefront_correctors=[self.mirror],
             loops=[self.loop],
         )
@@ -101,6 +102,27 @@ def test_signals_of_somebody_elses_file_are_as_its_instrument_lists_them(small, 
     np.testing.assert_array_equal(night.arrays["commands_m"], hand.modal_m)
     assert night.arrays["delay_frames"] == 1.5
     assert night.notes == []
+
+
+def test_of_several_sensors_the_one_with_the_instruments_mask_is_played(small, tmp_path):
+    hand = Hand(small)
+    other = aotpy.Pyramid(
+        uid="other",
+        n_sides=4,
+        source=aotpy.NaturalGuideStar("other star"),
+        n_valid_subapertures=4,
+        subaperture_mask=aotpy.Image("other mask", np.arange(4).reshape(2, 2)),
+        measurements=aotpy.Image("other slopes", np.zeros((N, 2, 4), np.float32), time=hand.time),
+    )
+    hand.others = [other]
+    night = hand.read(tmp_path, small)
+    np.testing.assert_array_equal(night.arrays["slopes"], hand.slopes.reshape(N, -1))
+    assert any("2 sensors" in note for note in night.notes)
+    hand.sensor.subaperture_mask, hand.others = other.subaperture_mask, []
+    other_folder = tmp_path / "other"
+    other_folder.mkdir()
+    with pytest.raises(MatrixError, match=r"found the sensors sensor \(Pyramid, 4 subapertures\)"):
+        hand.read(other_folder, small)
 
 
 def test_frames_without_numbers_are_counted_by_their_times(small, tmp_path):

@@ -250,15 +250,14 @@ class Options:
     image_offsets_px: tuple[float, ...] | None = several(
         "--image-offsets X1,Y1,X2,Y2,X3,Y3,X4,Y4",
         "displacement of each pupil image of a pyramid from its place on the pixel grid, detector "
-        "pixels, of the images at -x -y, +x -y, -x +y, +x +y, less their mean; diffractive plant "
-        "only",
+        "pixels, of the images at -x -y, +x -y, -x +y, +x +y, less their mean",
         as_they_are,
         lambda *offsets: max(map(abs, offsets)) <= 4.0,
         ", at most 4 pixels either way",
     )
     image_offset_rms_px: float | None = option(
         "--image-offset-rms PX",
-        "the same, at random: RMS of the eight numbers; diffractive plant only",
+        "the same, at random: RMS of the eight numbers",
         within(0.0, 2.0),
     )
     model_error: float | None = option(
@@ -532,15 +531,6 @@ class Options:
             raise ConfigurationError(
                 f"--plant measured: found imperfections ({found}); expected none but "
                 "--optical-gain: the measured matrix has those of the bench"
-            )
-        if self.plant == "linear":
-            expected = "the linear plant has no pixels; expected --plant diffractive"
-            _refuse_given(
-                {
-                    "--image-offsets": self.image_offsets_px,
-                    "--image-offset-rms": self.image_offset_rms_px,
-                },
-                expected,
             )
         if self.image_offsets_px is not None and self.image_offset_rms_px is not None:
             raise ConfigurationError(

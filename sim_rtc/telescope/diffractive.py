@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from service.errors import ConfigurationError, ModelError
+from service.errors import ModelError
 from service.model.instrument import Instrument, Mirror, PupilMap
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from service.model.pupil import PupilGrid
-from service.model.sensors.pyramid.description import Pyramid, pyramid_in
+from service.model.sensors.pyramid.description import Pyramid, image_offsets, pyramid_in
 from service.model.sensors.pyramid.signals import reference_slopes
 from service.model.sensors.shack_hartmann.description import ShackHartmann
 from service.model.slopes import SlopeRecipe
@@ -165,23 +165,17 @@ class DiffractivePlant(SimulatedPlant):
         """Take the instrument as it is binned: the finest pixels set how finely it is computed."""
         lenslets = isinstance(instrument.wfs, ShackHartmann)
         sampling = LENSLET_SAMPLING if lenslets else _SAMPLING * binning
-        super().__init__(instrument, basis, centred_pupil(instrument, sampling), made)
+        super().__init__(instrument, basis, centred_pupil(instrument, sampling), made, binning)
         self._sensor: DiffractiveSensor
         if isinstance(self._wfs, ShackHartmann):
-            if self.image_offsets_px is not None:
-                raise ConfigurationError(
-                    f"--image-offsets: {instrument.name} has a Shack-Hartmann sensor; expected a "
-                    "pyramid, which has four pupil images"
-                )
             self._sensor = DiffractiveLenslets(self._wfs, self._pupil, instrument.subaperture_m)
             return
-        wfs = pyramid_in(replace(instrument, wfs=self._wfs))
-        offsets = self.image_offsets_px
+        wfs = pyramid_in(self._instrument)
         self._sensor = DiffractivePyramid(
             wfs,
             self._pupil,
             quadrature=quadrature or _quadrature(wfs, binning),
-            offsets_subap=None if offsets is None else offsets.reshape(2, 2, 2) / binning,
+            offsets_subap=image_offsets(self._instrument),
         )
 
     @override

@@ -6,7 +6,7 @@ points, by everything in ``Imperfections``, and by an optical gain for every mod
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Unpack
 
 import numpy as np
@@ -91,9 +91,10 @@ class LinearPlant(SimulatedPlant):
         self, instrument: Instrument, basis: ModalBasis, **made: Unpack[Departures]
     ) -> None:
         sampling, n_nodes = sampling_of(instrument), _NODES * instrument.binning
-        super().__init__(instrument, basis, instrument_pupil(instrument, sampling), made)
+        pupil = instrument_pupil(instrument, sampling)
+        super().__init__(instrument, basis, pupil, made, instrument.binning)
         self._sensor = kind_of(instrument).sensor(
-            replace(instrument, wfs=self._wfs),
+            self._instrument,
             self._pupil,
             Fineness(n_nodes=n_nodes, n_source_points=_SOURCE_POINTS),
         )

@@ -12,7 +12,8 @@ from typing import Any, Required, Self, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from service.model.instrument import Instrument, Mirror
+from service.errors import ConfigurationError, ModelError
+from service.model.instrument import Instrument, Mirror, SensorDescription
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
@@ -124,34 +125,46 @@ class Plant(ABC):
         return slopes
 
     def _image_shift(self, alpha: Misregistration) -> tuple[float, float]:
-        """Return by how much the pupil images move on the sensor, subapertures."""
+        """Return by how much the pupil images move on the sensor, subapertures.
+
+        With the telescope as stop they stay where the instrument file has them.
+        """
         if self._instrument.stop is Stop.TELESCOPE:
-            return (0.0, 0.0)
+            stated = kind_of(self._instrument).pupil_offset(self._instrument)
+            return self._instrument.pupil_shift_subap or stated or (0.0, 0.0)
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _on_mirror(self, alpha: Misregistration) -> Array:
         """Return where each point of the pupil lies on the mirror, ``(n_points, 2)``."""
-        points = self._points
-        if self._instrument.stop is Stop.TELESCOPE:
-            points = points - alpha.vector[:2]
-        return self._instrument.with_anamorphosis(alpha).on_mirror(points)
+        beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
+        return self._instrument.with_anamorphosis(alpha).on_mirror(self._points + beside)
 
 
 class SimulatedPlant(Plant):
     """A telescope simulated from its instrument file, with imperfections the file omits."""
 
     def __init__(
-        self, instrument: Instrument, basis: ModalBasis, pupil: PupilGrid, made: Departures
+        self,
+        instrument: Instrument,
+        basis: ModalBasis,
+        pupil: PupilGrid,
+        made: Departures,
+        binning: int = 1,
     ) -> None:
-        """Take the pupil as it is drawn."""
+        """Take the pupil of the instrument file, and detector pixels along a subaperture's side."""
         imperfections = made.get("imperfections") or Imperfections()
         scene = made.get("scene") or Scene()
         uneven_rng, position_rng, pixel_rng, path_rng, *later_rngs = made["rng"].spawn(6)
-        self._instrument = instrument
         self._passes = np.float32(scene.passes)
         width_m = instrument.subaperture_m
         pupil = scene.light(pupil, width_m)
+        self.image_offsets_px = image_offsets(imperfections, later_rngs[1])
         self._wfs = true_sensor(instrument, imperfections)
+        self._instrument = replace(instrument, wfs=self._wfs)
+        if self.image_offsets_px is not None:
+            offsets_subap = (self.image_offsets_px / binning).T.ravel()
+            self._wfs = _displaced(self._instrument, offsets_subap)
+            self._instrument = replace(instrument, wfs=self._wfs)
         self._pupil = uneven(pupil, imperfections.unevenness, uneven_rng)
         drawn, influence = instrument.analytic_mirror, made.get("influence")
         mirror = misplaced(drawn, imperfections.position_error, position_rng)
@@ -165,7 +178,6 @@ class SimulatedPlant(Plant):
         self._shape_errors = ShapeErrors(
             pupil.lit, strokes.shape[1], imperfections.model_error, later_rngs[0]
         )
-        self.image_offsets_px = image_offsets(imperfections, later_rngs[1])
         self._points = distorted(pupil.points, pupil.weights, imperfections)
         self.points_m = self._points * width_m
         self.pitch_m = width_m / pupil.sampling
@@ -189,6 +201,20 @@ class SimulatedPlant(Plant):
         shapes = np.concatenate([block.astype(np.float32) for block in blocks])
         modes = self._shape_errors.applied(shapes[:, :-1], on_mirror)
         return modes, np.ascontiguousarray(shapes[:, -1])
+
+
+def _displaced(instrument: Instrument, offsets_subap: Array) -> SensorDescription:
+    """Return the sensor with its pupil images displaced ``(8,)``: along x, then along y.
+
+    Raises
+    ------
+    ConfigurationError
+        If it has one image only.
+    """
+    try:
+        return kind_of(instrument).displaced(instrument, offsets_subap)
+    except ModelError as error:
+        raise ConfigurationError(f"--image-offsets: {error}") from error
 
 
 def between(first: Array32, last: Array32, share: float) -> Array32:

@@ -3,8 +3,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from service.model.kinds import SignalKind, Stop
+from service.config import load_instrument
+from service.errors import ConfigurationError
+from service.model.kinds import KarhunenLoeve, SignalKind, Stop
 from service.model.misregistration import Misregistration
+from service.model.modes import karhunen_loeve_basis
 from service.model.pupil import instrument_pupil
 from service.model.sensors.pyramid.signals import pixel_places
 from service.model.slopes import SlopeRecipe
@@ -264,3 +267,28 @@ def test_model_errors_move_with_the_mirror(small_instrument, small_basis):
     now, before = np.array(pairs).T
     error = there[now] - here[before]
     assert np.sqrt(np.mean(error**2)) < 0.02 * np.sqrt(np.mean(here**2))
+
+
+def test_displaced_images_of_a_linear_plant_are_those_of_the_model(small_instrument, small_basis):
+    changes = replace(IDEAL, image_offset_rms_px=0.2)
+    plant = LinearPlant(
+        small_instrument, small_basis, rng=np.random.default_rng(1), imperfections=changes
+    )
+    places = tuple(map(tuple, plant.image_offsets_px))
+    told = replace(small_instrument, wfs=replace(small_instrument.wfs, image_offsets_subap=places))
+    expected = LinearPlant(told, small_basis, rng=np.random.default_rng(1), imperfections=IDEAL)
+    found, known = (one.optics(ALIGNED).slopes_per_command for one in (plant, expected))
+    np.testing.assert_allclose(found, known, rtol=0, atol=1e-6 * np.abs(known).max())
+    ideal = LinearPlant(
+        small_instrument, small_basis, rng=np.random.default_rng(1), imperfections=IDEAL
+    )
+    off_grid = found - ideal.optics(ALIGNED).slopes_per_command
+    assert np.linalg.norm(off_grid) > 0.05 * np.linalg.norm(known)
+
+
+def test_a_shack_hartmann_has_no_pupil_images_to_displace():
+    instrument = replace(load_instrument("canary"), modes=KarhunenLoeve(n_modes=10))
+    basis = karhunen_loeve_basis(instrument)
+    changes = replace(IDEAL, image_offset_rms_px=0.1)
+    with pytest.raises(ConfigurationError, match="--image-offsets"):
+        LinearPlant(instrument, basis, rng=np.random.default_rng(1), imperfections=changes)

@@ -20,6 +20,7 @@ from check_rtc.connection import RtcConnection, systems_with_rtc
 from check_rtc.examine import Examination, examine
 from check_rtc.offload import Registered
 from check_rtc.requirements import REQUIREMENTS, Checked, Outcome
+from check_rtc.telemetry_checks import ImagePlaces
 from check_rtc.watch import TelemetryObserver
 from service.config import load_instrument, packaged_instrument
 from service.config.link_tables import ZenohTable, link_security, read_link_tables
@@ -31,6 +32,8 @@ from service.files.disk_cache import DiskCache, usual_folder
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
 from service.model.interaction import RtcInteractionModel
+from service.model.sensors.registry import kind_of
+from service.model.sensors.sensor import CannotTell
 from service.model.slopes import likely_kind
 
 if TYPE_CHECKING:
@@ -75,6 +78,7 @@ def check(options: argparse.Namespace) -> int:
             basis_id=instrument.basis_id,
             config_id=instrument.config_id,
             dialect=lambda matrix: compared(instrument, matrix),
+            images=lambda flux: found_images(instrument, flux),
             registered=registering(instrument),
         )
     checks = []
@@ -174,6 +178,27 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConven
     except ModelError as error:
         return f"the model of {instrument.name} cannot tell: {error}"
     return replace(dialect, adopted=instrument.slopes.orientation is None)
+
+
+def found_images(instrument: Instrument, flux: bytes) -> ImagePlaces | str:
+    """Return where the pupil images lie by the flux of a status, in the RTC's own axes."""
+    kind = kind_of(instrument)
+    as_listed = replace(instrument, slopes=replace(instrument.slopes, orientation=None))
+    light = kind.light(as_listed)
+    if isinstance(light, CannotTell):
+        return light.reason
+    try:
+        found = light.find_image_offsets(light.counts_of(flux))
+    except ModelError as error:
+        return str(error)
+    if isinstance(found, CannotTell):
+        return found.reason
+    stated = kind.image_offsets(as_listed)
+    return ImagePlaces(
+        found_px=found.subap * instrument.binning,
+        sigma_px=found.sigma_subap * instrument.binning,
+        stated_px=None if stated is None else stated * instrument.binning,
+    )
 
 
 def registering(instrument: Instrument) -> Registered:

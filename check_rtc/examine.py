@@ -30,7 +30,7 @@ from check_rtc.moving import (
 )
 from check_rtc.offload import STEP, Registered, offload
 from check_rtc.requirements import REQUIREMENTS, Checked, Moves, skipped, wrong
-from check_rtc.telemetry_checks import About, find_all
+from check_rtc.telemetry_checks import About, ImagePlaces, find_all
 from service.errors import LinkError, WireError
 from service.estimation.slope_convention import SlopeConvention
 from service.estimation.windows import WindowRefused
@@ -73,6 +73,9 @@ class Examination:
 
     dialect: Callable[[NDArray[np.float32]], SlopeConvention | str] = lambda _: NO_INSTRUMENT
     """Compares the matrix in use with the instrument file; a text says why it does not."""
+
+    images: Callable[[bytes], ImagePlaces | str] = lambda _: NO_INSTRUMENT
+    """Finds the pupil images in the flux of a status; a text says why they are not found."""
 
     registered: Registered = lambda _, __: WindowRefused(reason=NO_INSTRUMENT, t_ns_utc=0)
     """Makes α of a window of dither, by the instrument file."""
@@ -143,7 +146,18 @@ def _listening(client: RtcClient, examination: Examination) -> Iterator[Checked]
     )
     if observer.loop.matrix is not None and examination.wants("orientation"):
         about = replace(about, dialect=examination.dialect(observer.loop.matrix))
+    if examination.wants("images"):
+        about = replace(about, images=_images(observer.status, examination))
     yield from find_all(observer, about)
+
+
+def _images(status: Status | None, examination: Examination) -> ImagePlaces | str:
+    """Return where the pupil images lie, or why that is not known."""
+    if status is None:
+        return "no status has come"
+    if status.flux is None:
+        return "the status has no flux, which is optional: it would show where the pupil images lie"
+    return examination.images(status.flux)
 
 
 def _why_not(client: RtcClient, examination: Examination, status: Status, names: list[str]) -> str:

@@ -78,6 +78,10 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         "one session, until the RTC or its integrator starts over", "sessions-sequence-time"
     ),
     "status": Requirement("a status 1 to 10 times a second, that agrees with the frames", "status"),
+    "images": Requirement(
+        "the pupil images in the flux of the status lie where the instrument file has them",
+        "status",
+    ),
     "ids": Requirement(
         "one basis and one configuration, in frames, status and manifest",
         "slopes-commands-orientation",

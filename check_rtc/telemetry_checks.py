@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from check_rtc.requirements import Checked, fine, seen, skipped, wrong
 from check_rtc.watch import Arrival, TelemetryObserver, in_order, of_session
@@ -32,6 +33,28 @@ TOO_LATE_S: Final = 0.5
 
 FAR_NS: Final = 86_400 * 10**9
 """Between the RTC's clock and the one here."""
+
+
+NOTABLE_PX: Final = 0.03
+"""RMS displacement of pupil images that an instrument file should state: 0.05 pixel left out of the
+model moves a fitted shift by 0.016 subaperture."""
+
+SURE_SIGMA: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImagePlaces:
+    """Where the pupil images lie on the detector, beside their places on the pixel grid."""
+
+    found_px: NDArray[np.float64]
+    """``(4, 2)`` displacement x, y of the images at -x -y, +x -y, -x +y, +x +y, detector pixels in
+    the RTC's axes; their mean is 0."""
+
+    sigma_px: NDArray[np.float64]
+    """``(4, 2)`` 1 σ of each."""
+
+    stated_px: NDArray[np.float64] | None
+    """``(4, 2)`` those of the instrument file, less their mean; None if it states none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +81,9 @@ class About:
 
     dialect: SlopeConvention | str = ""
     """What the matrix says of signs and axes, or why nobody looked."""
+
+    images: ImagePlaces | str = ""
+    """Where the pupil images lie by the flux of the status, or why that is not known."""
 
     @property
     def span_s(self) -> float:
@@ -311,6 +337,21 @@ def _disagreement(observer: TelemetryObserver, status: Status) -> str:
     return ""
 
 
+def _images(_: TelemetryObserver, about: About) -> Checked:
+    places = about.images
+    if isinstance(places, str):
+        return skipped("images", places)
+    stated = np.zeros((4, 2)) if places.stated_px is None else places.stated_px
+    beside = places.found_px - stated
+    rms_px, sigma_px = (float(np.sqrt(np.mean(part**2))) for part in (beside, places.sigma_px))
+    where = "the pixel grid" if places.stated_px is None else "wfs.image_offsets_px"
+    found = f"they lie {rms_px:.3f} pixel RMS beside {where}, 1 sigma {sigma_px:.3f}"
+    if rms_px < max(NOTABLE_PX, SURE_SIGMA * sigma_px):
+        return fine("images", found)
+    offsets = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in places.found_px)
+    return seen("images", f"{found}: the instrument file may say image_offsets_px = [{offsets}]")
+
+
 def _ids(observer: TelemetryObserver, about: About) -> Checked:
     found = dict.fromkeys((a.header.basis_id, a.header.config_id) for a in observer.arrivals)
     found |= dict.fromkeys((s.basis_id, s.config_id) for _, s in observer.statuses)
@@ -429,6 +470,7 @@ _LOOKS: Final[tuple[Callable[[TelemetryObserver, About], Checked], ...]] = (
     _delivery,
     _session,
     _status,
+    _images,
     _ids,
     _matrix,
     _law,

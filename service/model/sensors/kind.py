@@ -292,6 +292,14 @@ class SensorKind(ABC):
         """
         raise ModelError(f"a {self.name}: found several images to be moved, expected a pyramid's")
 
+    def image_offsets(self, instrument: Instrument) -> NDArray[np.float64] | None:
+        """Return where the instrument file has the pupil images beside the pixel grid, ``(4, 2)``.
+
+        Subapertures, axes of conventions.md, (x, y) of the images at -x -y, +x -y, -x +y, +x +y,
+        less their mean. None if it does not say.
+        """
+        return None
+
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         """Return where the instrument file places the pupil's image on the grid, (x, y).
 

@@ -168,6 +168,18 @@ class PupilPosition:
     """1 σ of both."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImageOffsets:
+    """How far each of several pupil images lies from its place on the pixel grid."""
+
+    subap: NDArray[np.float64]
+    """``(4, 2)`` along x and y, subapertures, of the images at -x -y, +x -y, -x +y, +x +y; their
+    mean is 0."""
+
+    sigma_subap: NDArray[np.float64]
+    """``(4, 2)`` 1 σ of each."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CannotTell:
     """The map does not say; a value, because it may well happen."""
@@ -200,6 +212,15 @@ class Light(Protocol):
 
     def find_pupil(self, counts: NDArray[Any]) -> PupilPosition | CannotTell:
         """Return where the image of the pupil lies, at any shift that light can tell.
+
+        Raises
+        ------
+        ModelError
+            If the counts have another shape.
+        """
+
+    def find_image_offsets(self, counts: NDArray[Any]) -> ImageOffsets | CannotTell:
+        """Return how far each of several pupil images lies from its place on the pixel grid.
 
         Raises
         ------

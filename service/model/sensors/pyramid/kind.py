@@ -188,6 +188,13 @@ class PyramidKind(SensorKind):
         return displaced(instrument, offsets)
 
     @override
+    def image_offsets(self, instrument: Instrument) -> NDArray[np.float64] | None:
+        from service.model.sensors.pyramid.description import image_offsets
+
+        offsets = image_offsets(instrument)
+        return None if offsets is None else offsets.reshape(4, 2)
+
+    @override
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         from service.model.sensors.pyramid.description import pupil_offset
 

@@ -31,7 +31,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.models import FitModels, Optic
-from pyrcal.offline.solver import LONGEST_OPTIC_STEP, Nuisances, Solution, refine
+from pyrcal.offline.solver import (
+    LONGEST_OPTIC_STEP,
+    Nuisances,
+    Solution,
+    is_blurring,
+    refine,
+)
 from service.estimation.reference import Target
 from service.estimation.solver import (
     LIMIT,
@@ -63,9 +69,15 @@ LINEAR = 0.01
 LINEAR_IMAGES = 0.02
 """A pupil image displaced by less, in subapertures, is as good as linear."""
 
-IMAGE_REPEATS = 2
-"""Times that the images of the model are moved: four of the six displacements hardly change a
-matrix, and would wander."""
+BLURS = (-0.5, -0.25, 0.25, 0.5)
+"""Displacements of a pattern that are tried, subapertures: half of each in every image."""
+
+LONGEST_MOVE = 0.3
+"""Of one pattern of displaced images, subapertures: beyond it their derivatives point elsewhere."""
+
+IMAGES_GAIN = 0.9
+"""Share of χ² below which a fit about displaced images is worth another: four of the displacements
+hardly change a matrix, and would wander without end."""
 
 REACH = 20.0
 """Derivatives within so many settling lengths of where they were taken are as good as new."""
@@ -196,10 +208,21 @@ def settle(
     seen = _known(models, target, start)
     solution = refine(models, seen, start, nuisances)
     settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
-    models, nuisances = _with_nearest_sensor(settled)
-    for repeat in range(MAX_REPEATS):
+    # displaced images look like another modulation, so they come first where one is known
+    looks = [_with_nearest_images, _with_nearest_sensor]
+    if Optic.SENSOR in nuisances.unknown:
+        looks.reverse()
+    for look in looks:
+        models, nuisances = look(settled)
+        if models is not settled.models:
+            solution = refine(models, seen, settled.solution.alpha, nuisances)
+            settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+    before = np.inf
+    for _ in range(MAX_REPEATS):
+        left = settled.solution.projection.chi
         if models is settled.models:
-            models, nuisances = _adjusted(settled, move_images=repeat < IMAGE_REPEATS)
+            models, nuisances = _adjusted(settled, move_images=left < IMAGES_GAIN * before)
+        before = left
         there = _known(models, target, settled.solution.alpha)
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
             break
@@ -246,6 +269,43 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     return moved, replace(nuisances, optics=tuple(optics))
 
 
+def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
+    """Return the models with their pupil images where a few modes are explained best.
+
+    Only where the first steps displace them. Quadrupoles and common displacements change a matrix
+    to first order. The others blur it, and a blur hardly tells its sign: so each of them is looked
+    for in turn, on the cheap grid, all other unknowns left free to first order.
+    """
+    models, nuisances, solution = settled.models, settled.nuisances, settled.solution
+    values = solution.nuisances[nuisances.image_places]
+    if not np.any(np.abs(values @ nuisances.images) > LINEAR_IMAGES):
+        return models, nuisances
+    modes = spread(settled.target.n_modes)
+    few = settled.target.column_subset(modes)
+    subset = replace(models, basis=models.basis.subset(modes))
+    blurring = np.array([is_blurring(pattern) for pattern in nuisances.images])
+    # the derivatives with a blur, taken without one, would explain anything
+    free = np.ones(len(solution.nuisance_derivatives), dtype=bool)
+    free[nuisances.image_places] = ~blurring
+    every = np.concatenate([solution.derivatives, solution.nuisance_derivatives[free]])
+    every = every[:, :, modes]
+
+    def left(displaced: Array) -> float:
+        models.counter.n += 1
+        matrix = subset.displaced(displaced).cheap.interaction_matrix(solution.alpha)
+        return few.project(matrix, every).chi_at_best
+
+    displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
+    least = left(displaced)
+    for pattern in nuisances.images[blurring]:
+        tried = [displaced + size * pattern for size in BLURS]
+        found = [left(one) for one in tried]
+        best = int(np.argmin(found))
+        if found[best] < least:
+            displaced, least = tried[best], found[best]
+    return models.displaced(displaced), replace(nuisances, displaced=displaced)
+
+
 def spread(n_modes: int) -> NDArray[np.intp]:
     """Return a few columns, spread over all."""
     return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
@@ -262,7 +322,9 @@ def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisan
             models, offset = models.adjusted(optic, change), offset + change
         optics.append((optic, offset))
     nuisances = replace(nuisances, optics=tuple(optics))
-    displaced = nuisances.image_offsets(settled.solution.nuisances)
+    step = settled.solution.nuisances[nuisances.image_places]
+    step = np.clip(step, -LONGEST_MOVE, LONGEST_MOVE) @ nuisances.images
+    displaced = nuisances.displaced + step
     far = np.any(np.abs(displaced - nuisances.displaced) > LINEAR_IMAGES)
     if move_images and far:
         return models.displaced(displaced), replace(nuisances, displaced=displaced)

@@ -73,10 +73,6 @@ IMAGE_SIGMA_PX = 0.15
 pyramids have 0.05 to 0.3 px: the faces are polished to some 0.1 % of their angle, and the windows
 that cut the images begin at whole pixels."""
 
-LONGEST_IMAGE_STEP = 0.3
-"""A longer step of an image, in subapertures, trusts the derivatives too far."""
-
-
 def image_patterns(stop: Stop) -> Array:
     """Return orthonormal displacements of the four images ``(n_patterns, 8)``.
 
@@ -88,6 +84,17 @@ def image_patterns(stop: Stop) -> Array:
     along = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1], [1, -1, -1, 1], [1, 1, 1, 1]]) / 2.0
     both = np.kron(np.eye(2), along)  # those of x, then those of y
     return both if stop is Stop.TELESCOPE else both[[0, 1, 2, 4, 5, 6]]
+
+
+def is_blurring(pattern: Array) -> bool:
+    """Return whether a pattern of ``image_patterns`` does not move slopes to first order.
+
+    Images that are stretched apart or sheared blur the slopes. A quadrupole along one axis looks
+    like a shift along the other to one of the slopes, and so it can be told.
+    """
+    along_x, along_y = pattern.reshape(2, 2, 2)
+    even = np.abs(along_x + along_x[::-1, ::-1]) + np.abs(along_y + along_y[::-1, ::-1])
+    return bool(np.all(even < 1e-9))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -383,6 +390,5 @@ def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Arra
     stretches = step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
     first = 4 + nuisances.first_optic
     optics = np.abs(step[first : first + len(nuisances.optics)]) / LONGEST_OPTIC_STEP
-    images = np.abs(step[4:][nuisances.image_places]) / LONGEST_IMAGE_STEP
-    longest = [*excess, *images, *optics, *(np.abs(stretches) / LONGEST_STRETCH)]
+    longest = [*excess, *optics, *(np.abs(stretches) / LONGEST_STRETCH)]
     return np.asarray(step / max(1.0, *longest))

@@ -15,6 +15,7 @@ from typing import get_args
 from pyrcal_studies import dispatch, reference
 from pyrcal_studies.contract_tables import with_tables
 from pyrcal_studies.openapi import document
+from pyrcal_studies.packaged import packaged
 from service.config.schema_texts import described
 from service.tracking.alarms import AlarmState, Interlock, Severity
 from service.tracking.commands import Command
@@ -127,6 +128,7 @@ PAGES = {
     "reference/settings.md": reference.settings,
     "reference/access.md": reference.access,
     "reference/instrument.md": reference.instrument,
+    "reference/instruments.md": packaged,
     "reference/system.md": reference.system,
     "reference/cli.md": reference.commands,
     "understand/tracker.md": dispatch.page,

@@ -276,6 +276,11 @@ def _describe_reconstruct(make: argparse.ArgumentParser) -> None:
         words("--no-gains", gains),
         words("--flux-map FILE", "as of pyrcal fit, to light the model", type=Path),
         words("--reference FILE", "the measured matrix, for its checksum", type=Path),
+        words(
+            "--specula PUPDATA.fits",
+            "write SPECULA's Intmat and Recmat, too: its PupData or SubapData tells the order",
+            type=Path,
+        ),
     )
 
 

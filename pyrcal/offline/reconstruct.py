@@ -14,6 +14,7 @@ from typing import Any
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.importers.specula import write_specula
 from pyrcal.offline.instrument_checks import COUPLING_KEY
 from pyrcal.offline.light import read_light
 from pyrcal.offline.memory import check_reconstruction
@@ -99,7 +100,22 @@ def main(options: argparse.Namespace) -> int:
         f"condition number {inversion.condition_number:.2f}, {inversion.n_truncated} singular "
         "values left out"
     )
+    if options.specula is not None:
+        im, rec = (options.output.with_name(f"{options.output.stem}_{of}.fits") for of in _SPECULA)
+        write_specula(
+            options.specula,
+            im,
+            rec,
+            inverted[:, : options.modes],
+            inversion.matrix,
+            stroke_known=instrument.mirror.stroke_known,
+        )
+        print(f"{im}, {rec}: SPECULA's Intmat and Recmat, commands in nm")
     return 0
+
+
+_SPECULA = ("im", "rec")
+"""Ends of the names of the files for SPECULA."""
 
 
 def _fit_of(options: argparse.Namespace) -> KnownFit:

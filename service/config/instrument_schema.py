@@ -75,6 +75,13 @@ class MirrorTable(kinds.InfluenceShape):
     last_ring: Annotated[int, Field(ge=1, le=500)] = 14
     """Rings only."""
 
+    ring_actuators: tuple[kinds.Count, ...] | None = None
+    """Rings only: number of actuators on each ring, from the inside, the first of each on +x;
+    instead of ``first_ring`` and ``last_ring``."""
+
+    ring_radii_m: tuple[kinds.Positive, ...] | None = None
+    """Beside ``ring_actuators``: radius of each ring, metres."""
+
     n_across: Annotated[int, Field(ge=2, le=1000)] | None = None
     """Grid only: actuators along a diameter."""
 

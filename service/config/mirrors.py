@@ -25,7 +25,7 @@ from service.model.tabulated import (
 _KINDS = ("layout", "modes", "influence_functions")
 
 _LAYOUT_KEYS = {
-    "rings": {"first_ring", "last_ring", "pitch_m"},
+    "rings": {"first_ring", "last_ring", "pitch_m", "ring_actuators", "ring_radii_m"},
     "grid": {"n_across", "pitch_m", "diameter_m"},
     "hexagonal": {"pitch_m", "diameter_m", "hole_m"},
     "positions": {"positions", "pitch_m"},
@@ -216,6 +216,8 @@ def _segments(file: MirrorSection, positions_m: NDArray[np.float64]) -> tuple[fl
 
 def _rings(file: MirrorSection) -> NDArray[np.float64]:
     table = file.said
+    if table.ring_actuators is not None or table.ring_radii_m is not None:
+        return _listed_rings(file)
     if table.last_ring < table.first_ring:
         refuse(
             file.where("last_ring"),
@@ -225,6 +227,20 @@ def _rings(file: MirrorSection) -> NDArray[np.float64]:
     positions = rings(table.first_ring, table.last_ring, table.pitch_m or 0.30)
     _check_number(len(positions), f"{file.path}: mirror")
     return positions
+
+
+def _listed_rings(file: MirrorSection) -> NDArray[np.float64]:
+    numbers, radii_m = _mandatory(file, ("ring_actuators", "ring_radii_m"))
+    if len(numbers) != len(radii_m):
+        refuse(
+            file.where("ring_radii_m"),
+            f"{len(radii_m)} radii",
+            f"one for each of the {len(numbers)} rings of ring_actuators",
+        )
+    for key in sorted({"first_ring", "last_ring"} & file.given):
+        raise ConfigurationError(f"{file.where(key)}: has no meaning beside mirror.ring_actuators")
+    _check_number(sum(numbers), f"{file.path}: mirror")
+    return np.concatenate([ring_of(n, radius) for n, radius in zip(numbers, radii_m, strict=True)])
 
 
 def _grid(file: MirrorSection) -> NDArray[np.float64]:
@@ -309,12 +325,14 @@ def rings(first_ring: int, last_ring: int, pitch_m: float) -> NDArray[np.float64
     Ring k has 6k + 3 actuators at radius (k - 1/2) pitch, the first of each on +x: the layout is
     its own mirror image under y -> -y, so that the modes come out even or odd.
     """
-    found = []
-    for ring in range(first_ring, last_ring + 1):
-        n_actuators = 6 * ring + 3
-        angle = 2.0 * np.pi * np.arange(n_actuators) / n_actuators
-        found.append((ring - 0.5) * pitch_m * np.column_stack([np.cos(angle), np.sin(angle)]))
-    return np.concatenate(found)
+    each = range(first_ring, last_ring + 1)
+    return np.concatenate([ring_of(6 * k + 3, (k - 0.5) * pitch_m) for k in each])
+
+
+def ring_of(n_actuators: int, radius_m: float) -> NDArray[np.float64]:
+    """Return actuators evenly spaced on a circle, the first of them on +x, ``(n_actuators, 2)``."""
+    angle = 2.0 * np.pi * np.arange(n_actuators) / n_actuators
+    return np.asarray(radius_m * np.column_stack([np.cos(angle), np.sin(angle)]))
 
 
 def grid(n_across: int, pitch_m: float, diameter_m: float) -> NDArray[np.float64]:

@@ -220,8 +220,12 @@ def test_the_packaged_aof_is_what_its_sources_say():
     assert 6 * aof.wfs.pixel_scale_arcsec == pytest.approx(5.1)
     assert aof.wfs.wavelength_m == 589e-9
     assert len(aof.mirror.positions_m) == 1170
-    # its 10192 slopes are of four sensors; a mask of 1274 has no symmetry that ours could have
-    assert int(valid_subapertures(aof).sum()) == pytest.approx(10192 / 8, rel=0.005)
+    # the mask of GALACSI and ERIS that aotpy has: a hole of 6 x 6 subapertures without its corners
+    valid = valid_subapertures(aof)
+    assert int(valid.sum()) == 1240
+    hole = [2, 4, 6, 6, 4, 2]
+    assert [int(row[15:25].size - row[15:25].sum()) for row in valid[17:23]] == hole
+    assert [int(row.sum()) for row in valid[:4]] == [8, 16, 20, 22]
     assert 1 / aof.loop.frame_rate_hz == 0.001
     assert aof.modes.outer_scale_m == 25.0
     assert aof.modes.r0_m == pytest.approx(0.98 * 500e-9 / np.deg2rad(0.644 / 3600), rel=0.01)
@@ -231,16 +235,49 @@ def test_the_packaged_aof_is_what_its_sources_say():
 def test_every_value_of_the_packaged_aof_names_its_source():
     lines = packaged_file("aof-ut4").read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
-    named = re.compile(r"# (\[[SE]\]|ours)")
+    named = re.compile(r"# (\[[SEG]\]|ours)")
     assert [value for value in values if not named.search(value)] == ['name = "aof-ut4"']
 
 
-def test_the_packaged_maps_has_the_published_number_of_actuators():
-    """Rings 3 to 10 of 6k + 3 each: 3 (11^2 - 3^2) = 336, as Johnson et al. 2024 count them."""
+def test_the_packaged_maps_has_the_published_rings():
+    """act2Dpos.txt of cacao's example: 336 actuators on ten rings, out to .976 of the radius."""
     maps = load_instrument("maps-mmt")
-    assert len(maps.mirror.positions_m) == 336
+    radii = np.hypot(*maps.mirror.positions_m.T) / 3.25
+    found, numbers = np.unique(np.round(radii, 2), return_counts=True)
+    assert found.tolist() == [0.13, 0.23, 0.33, 0.42, 0.52, 0.62, 0.72, 0.81, 0.91, 0.98]
+    assert numbers.tolist() == [6, 12, 18, 24, 30, 36, 42, 48, 60, 60]
+    assert maps.mirror.shape.influence is Influence.GAUSSIAN
     assert (maps.diameter_m, maps.wfs.kind, maps.stop) == (6.5, "pyramid", Stop.MIRROR)
     assert not maps.remarks
+
+
+def test_the_packaged_papyrus_is_what_its_twin_and_its_data_say():
+    """ALPAO DM 241 at a pitch of 2.5 mm, of which the calibration pupil lights 37.5 mm."""
+    papyrus = load_instrument("papyrus")
+    assert len(papyrus.mirror.positions_m) == 241
+    assert papyrus.diameter_m / papyrus.mirror.pitch_m == pytest.approx(15.0, abs=1e-3)
+    assert papyrus.obscuration_ratio == 0.0
+    assert (papyrus.wfs.wavelength_m, papyrus.wfs.modulation_lambda_over_d) == (640e-9, 5.0)
+    assert papyrus.wfs.pupil_diameter == 37.0
+    assert not papyrus.remarks
+
+
+@pytest.mark.parametrize(
+    ("rings", "says"),
+    [
+        ("ring_actuators = [6, 12]", "ring_radii_m: missing"),
+        ("ring_actuators = [6, 12]\nring_radii_m = [1.0]", "found 1 radii"),
+        ("ring_actuators = [6]\nring_radii_m = [1.0]\nlast_ring = 3", "last_ring: has no meaning"),
+        ("ring_actuators = [3]\nring_radii_m = [1.0]", "found 3 actuators"),
+    ],
+)
+def test_rings_that_are_listed_belong_together(rings, says, tmp_path):
+    text = packaged_file("maps-mmt").read_text("utf-8")
+    text = re.sub(r"ring_radii_m = .*\n", "", text)
+    path = tmp_path / "it.toml"
+    path.write_text(re.sub(r"ring_actuators = .*", rings, text), "utf-8")
+    with pytest.raises(ConfigurationError, match=says):
+        load_instrument(path)
 
 
 def test_the_packaged_canary_is_what_soapys_tutorial_says():
@@ -254,11 +291,11 @@ def test_the_packaged_canary_is_what_soapys_tutorial_says():
     assert not canary.remarks
 
 
-@pytest.mark.parametrize("name", ["maps-mmt", "canary"])
+@pytest.mark.parametrize("name", ["maps-mmt", "canary", "papyrus"])
 def test_every_value_of_maps_and_canary_names_its_source(name):
     lines = packaged_file(name).read_text(encoding="utf-8").splitlines()
     values = [line for line in lines if "=" in line and not line.startswith("#")]
-    named = re.compile(r"# (\[[JTS]\]|ours)")
+    named = re.compile(r"# (\[[JTSCOM]\]|ours)")
     assert [value for value in values if not named.search(value)] == [f'name = "{name}"']
 
 
@@ -549,7 +586,7 @@ def test_an_unknown_mode_names_those_that_are_known(write):
 def test_an_unknown_packaged_name_lists_the_known_ones():
     assert (
         "neither a packaged name (aof-ut4, canary, flao-lbt, gpao-ut, maps-mmt, metis-elt, "
-        "micado-elt, soul-lbt)" in refusal(load_instrument, "flao-lbtt")
+        "micado-elt, papyrus, soul-lbt)" in refusal(load_instrument, "flao-lbtt")
     )
 
 

@@ -1,4 +1,6 @@
-"""From SPECULA's own FITS files, and SynIM's, which are SPECULA's: known by what is in them.
+"""From SPECULA's own FITS files, and SynIM's, which are SPECULA's; and back into them.
+
+Files are known by what is in them.
 
 Nothing of either is imported. How they list things was read from SPECULA 1.1.0 and SynIM 2.0.0:
 
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported, oriented
-from service.errors import MatrixError
+from service.errors import MatrixError, StorageError
 from service.files.container import Container, opened
 
 UNIT = "nm"
@@ -155,3 +157,69 @@ def _subapertures(container: Container) -> Subapertures:
     image = image[image >= 0]
     n_columns = int(container.facts["fsizey"])
     return Subapertures(image // n_columns, image % n_columns)
+
+
+NANOMETRE_M = 1e-9
+
+
+def write_specula(
+    places: Path,
+    intmat: Path,
+    recmat: Path,
+    matrix: Array,
+    reconstructor: Array,
+    *,
+    stroke_known: bool,
+) -> None:
+    """Write a matrix and its reconstructor as SPECULA's ``Intmat`` and ``Recmat``.
+
+    Subapertures are in the order of ``places``, all x first, commands are nanometres. ``Intmat`` is
+    ``[slopes, modes]`` and ``Recmat`` ``[modes, slopes]``, as SPECULA 1.1.0 has them.
+
+    Parameters
+    ----------
+    places
+        The ``PupData`` or ``SubapData`` that the matrix was imported with.
+    intmat, recmat
+        Files to write; those that are there are replaced.
+    matrix
+        ``(n_slopes, n_modes)`` as `from_specula` lists slopes.
+    reconstructor
+        ``(n_modes, n_slopes)``.
+    stroke_known
+        Whether commands are metres; False if they have SPECULA's own unit already.
+
+    Raises
+    ------
+    MatrixError
+        If the subapertures are others.
+    StorageError
+        If the disk refuses.
+    """
+    from astropy.io import fits
+
+    with opened(places) as container:
+        if "fsizex" not in container.facts and "np_sub" not in container.facts:
+            raise MatrixError(
+                f"{places}: found {container.listing()}, expected PupData or SubapData"
+            )
+        listed = _subapertures(container)
+    n_slopes = 2 * len(listed.rows)
+    if len(matrix) != n_slopes:
+        raise MatrixError(
+            f"{places}: found {len(listed.rows)} subapertures, expected the {len(matrix) // 2} of "
+            "the matrix"
+        )
+    by_listing = np.argsort(listed.by_rows)
+    order = np.concatenate([by_listing, by_listing + n_slopes // 2])
+    unit_m = NANOMETRE_M if stroke_known else 1.0
+    for path, name, values in (
+        (intmat, "INTMAT", matrix[order] * unit_m),
+        (recmat, "RECMAT", reconstructor[:, order] / unit_m),
+    ):
+        header = fits.Header({"VERSION": 1, "PUP_TAG": "", "SA_TAG": "", "NORMFACT": 0.0})
+        arrays = fits.ImageHDU(np.ascontiguousarray(values, dtype=np.float32), name=name)
+        try:
+            fits.HDUList([fits.PrimaryHDU(header=header), arrays]).writeto(path, overwrite=True)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be written: {error}") from error

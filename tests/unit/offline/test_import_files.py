@@ -24,7 +24,7 @@ from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.layouts import by_role, cube_of, maps_of, mask_of
 from pyrcal.offline.importers.pyrtc import calibration_of
 from pyrcal.offline.importers.saved import read_npz
-from pyrcal.offline.importers.specula import from_specula
+from pyrcal.offline.importers.specula import from_specula, write_specula
 from service.errors import MatrixError
 from tests.unit.test_house import ROOT
 
@@ -499,3 +499,36 @@ def test_one_of_four_loops_is_chosen_and_a_mirror_without_places_given_some(
     assert main([*words, "--loop", "3", "--output", str(tmp_path / "other")]) == 2
     assert "--positions FILE" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
+
+
+def test_a_matrix_goes_back_into_speculas_own_files(tmp_path):
+    """Shuffled subapertures: the Intmat that is written is the one that was read."""
+    order = np.random.default_rng(9).permutation(len(fits.getdata(SPECULA[1], 1)))
+
+    def shuffled(file):
+        file[1].data = file[1].data[order]
+
+    def matrix_too(file):
+        both = np.stack(np.split(file[1].data, 2))
+        file[1].data = both[:, order].reshape(file[1].data.shape)
+
+    pup = changed(SPECULA[1], tmp_path / "pup.fits", shuffled)
+    im = changed(SPECULA[0], tmp_path / "im.fits", matrix_too)
+    matrix = from_specula([im, pup, SPECULA[2]], REPORTED).arrays["interaction_matrix"]
+    inverse = np.linalg.pinv(matrix)
+    files = tmp_path / "back_im.fits", tmp_path / "back_rec.fits"
+    write_specula(pup, *files, matrix, inverse, stroke_known=True)
+    back, given = fits.getdata(files[0], "INTMAT"), fits.getdata(im, 1)
+    np.testing.assert_allclose(back, given, rtol=1e-6, atol=1e-7 * np.abs(given).max())
+    identity = fits.getdata(files[1], 1).astype(float) @ back
+    np.testing.assert_allclose(identity, np.eye(20), atol=1e-4)
+    with pytest.raises(MatrixError, match="found 136 subapertures, expected the 135"):
+        write_specula(pup, *files, matrix[:270], inverse, stroke_known=True)
+
+
+def test_the_kind_of_sensor_is_that_of_its_subapertures():
+    synim = [DATA / f"synim-{name}.fits" for name in ("im", "subap", "ifunc")]
+    found = from_specula(synim, replace(REPORTED, sensor=None), "SynIM")
+    assert found.tables["wfs"]["kind"] == "shack-hartmann"
+    with pytest.raises(MatrixError, match="subapertures of a shack-hartmann"):
+        from_specula(synim, replace(REPORTED, sensor="pyramid"))

@@ -195,9 +195,7 @@ class PyramidOptics:
                     signs=self._signs(len(roof_y.weights), len(roof_x.weights), grid),
                 )
             )
-        return PreparedRows(
-            images=images, parts=tuple(parts), finish=self._finish(of_row.shapes)
-        )
+        return PreparedRows(images=images, parts=tuple(parts), finish=self._finish(of_row.shapes))
 
     def lines(self, row: int, columns: Array, rows: PreparedRows) -> Array:
         """Return the lines of subapertures in these columns of a row, ``(n_lines, n_shapes)``."""

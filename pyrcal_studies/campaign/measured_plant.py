@@ -399,10 +399,18 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
 def plans(given: argparse.Namespace) -> list[Plan]:
     """Return the runs that are asked for."""
     return [
-        Plan(error=error, mode=mode, seed=seed, matrix=given.matrix, seconds=given.seconds)
+        Plan(
+            error=error,
+            mode=mode,
+            seed=seed,
+            matrix=given.matrix,
+            instrument=given.instrument,
+            n_first=given.n_first,
+            seconds=given.seconds,
+        )
+        for seed in range(given.first, given.first + given.draws)
         for error in given.errors
         for mode in given.modes
-        for seed in range(given.first, given.first + given.draws)
     ]
 
 
@@ -435,19 +443,15 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=1, help="first draw")
     parser.add_argument("--seconds", type=float, default=90.0, help="of each run")
     parser.add_argument("--matrix", default="", help="a measured matrix instead, npz with D")
+    parser.add_argument("--instrument", default=INSTRUMENT, help="its instrument file")
+    parser.add_argument(
+        "--n-first", type=int, default=N_FIRST, help="modes of the RTC's own matrix"
+    )
     parser.add_argument("--output", type=Path, default=Path("measured_plant.jsonl"))
     parser.add_argument("--table", type=Path, metavar="FILE.md")
     given = parser.parse_args()
     file = RowFile(given.output)
-    for plan in plans(given):
-        if any(
-            all(
-                row.get(k) == (list(map(list, v)) if isinstance(v, tuple) else v)
-                for k, v in asdict(plan).items()
-            )
-            for row in file.rows
-        ):
-            continue
+    for plan in file.missing(plans(given)):
         file.add(play(plan))
         sys.stderr.write(table(file.rows[-1:]).splitlines()[-1] + "\n")
     tell(table(file.rows), given.table, "python -m pyrcal_studies.campaign.measured_plant")

@@ -36,6 +36,10 @@ STALE = np.array([0.05, 0.1, 0.003])
 """1 σ of a shift in subapertures, of rotation in degrees and of magnification from which on α is
 stale: half of what 594 modes of FLAO tolerate."""
 
+UPDATE = np.array([0.08, 0.08, 0.005])
+"""Change of a shift in subapertures, of rotation in degrees and of magnification that makes a new
+reconstructor whatever it wins: about what 594 modes of FLAO tolerate."""
+
 MEASURED_PITCH = 0.30 / 8.22
 """Distance between actuators over the pupil's diameter where these floors were measured: FLAO."""
 
@@ -107,8 +111,13 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,
-        update_threshold=_vector(
-            control.update_shift_subap, control.update_rotation_deg, control.update_magnification
+        update_threshold=_limits(
+            (
+                control.update_shift_subap,
+                control.update_rotation_deg,
+                control.update_magnification,
+            ),
+            UPDATE * tolerance_scale(settings, instrument)[1:],
         ),
         update_gain_m=control.update_gain_nm * 1e-9,
         update_margin=control.update_margin,
@@ -156,16 +165,23 @@ def tolerance_scale(
 def _stale_sigma(settings: Settings, instrument: Instrument | None) -> NDArray[np.float64]:
     """Return from which σ on α is stale: no window mends what a coarse mirror adds to the floor."""
     tracking = settings.tracking
-    given = (tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification)
-    shift, rotation, magnification = (
-        usual if limit is None else limit
-        for usual, limit in zip(
-            STALE * tolerance_scale(settings, instrument)[1:], given, strict=True
-        )
+    limit = _limits(
+        (tracking.stale_shift_subap, tracking.stale_rotation_deg, tracking.stale_magnification),
+        STALE * tolerance_scale(settings, instrument)[1:],
     )
-    limit = _vector(float(shift), float(rotation), float(magnification))
     usual, floor = (floor_of(settings, about) / BOUNDARY_SCALE for about in (None, instrument))
     return np.where(floor > usual, np.sqrt(limit**2 + floor**2 - usual**2), limit)
+
+
+def _limits(
+    given: tuple[float | None, float | None, float | None], usual: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return limits ``(4,)`` in numeric units: as they are set, else the usual ones."""
+    shift, rotation, magnification = (
+        float(default if value is None else value)
+        for value, default in zip(given, usual, strict=True)
+    )
+    return _vector(shift, rotation, magnification)
 
 
 def _sensor_modes(instrument: Instrument) -> dict[str, SensorModePolicy]:

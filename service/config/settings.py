@@ -216,14 +216,15 @@ class ControlTable(Table):
     update_margin: float = Field(default=0.08, gt=0.0, lt=1.0)
     """Gain in stability margin that does, as a share of the new one's."""
 
-    update_shift_subap: Positive = 0.08
-    """A new reconstructor at this change of a shift, whatever it wins, subapertures."""
+    update_shift_subap: Positive | None = None
+    """A new reconstructor at this change of a shift, whatever it wins, subapertures. None: 0.08 for
+    500 modes on 30 subapertures, more for fewer modes."""
 
-    update_rotation_deg: Positive = 0.08
-    """Of the rotation, degrees."""
+    update_rotation_deg: Positive | None = None
+    """Of the rotation, degrees. None: 0.08 for 500 modes, more for fewer."""
 
-    update_magnification: Positive = 0.005
-    """Of the magnification."""
+    update_magnification: Positive | None = None
+    """Of the magnification. None: 0.005 for 500 modes, more for fewer."""
 
     wind_m_s: Positive = 15.0
     """Wind for the expected loss, metres per second."""

@@ -66,6 +66,9 @@ measured ones 0.15 to 0.4."""
 N_FITTED = 8
 """Modes of the RTC's own matrix from which the misfit of others may be extrapolated."""
 
+N_DITHERED = 4
+"""Modes of a dither that measures α."""
+
 N_PARAMETERS = 4
 """Parameters of a registration: so many modes say nothing of their own scatter."""
 
@@ -109,6 +112,18 @@ class OwnMatrix:
     def typical_misfit(self) -> float | None:
         """Median misfit of the modes that are known; None: none is."""
         return float(np.median(self.misfit[self.known])) if self.known.any() else None
+
+    @property
+    def model_error(self) -> tuple[float, float, float, float] | None:
+        """1 σ by which the model leads a window of ``N_DITHERED`` modes astray, numeric units.
+
+        From the scatter between modes; None if the model explains them well, or too few are known.
+        """
+        if not self.weights or not self.tells_registration:
+            return None
+        share = self.known.sum() / N_DITHERED
+        x, y, rotation, magnification = np.sqrt(np.diag(self.covariance) * share).tolist()
+        return x, y, rotation, magnification
 
     @property
     def tells_registration(self) -> bool:

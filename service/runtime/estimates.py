@@ -245,6 +245,7 @@ async def read_own_matrix(
                 alpha=None if wrong or not own.tells_registration else own.alpha,
                 weights=() if wrong else own.weights,
                 misfit=own.typical_misfit,
+                model_error=None if wrong else own.model_error,
             )
         )
     return events

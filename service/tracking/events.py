@@ -287,6 +287,10 @@ class ModesRecognised:
     """Weight of each mode of the basis for the measurement of α, by how well the model explains
     it; empty if all modes count alike."""
 
+    model_error: tuple[float, float, float, float] | None = None
+    """1 σ by which the model leads a window astray, numeric units, from the scatter between the
+    modes of the RTC's own matrix; None if it explains them well, or is not known."""
+
     misfit: float | None = None
     """Median share of the RTC's own matrix that the model leaves unexplained, per mode, in norm;
     None if unknown."""

@@ -362,17 +362,26 @@ def history_entry(
 
 
 def model_error_of(
-    registration: Registration | None, estimate: DitheredEstimate, policy: Policy
+    registration: Registration | None,
+    estimate: DitheredEstimate,
+    policy: Policy,
+    own: tuple[float, ...] | None = None,
 ) -> Array:
     """Return the model error by all windows so far: what is set, and what they do not explain.
 
     A window weaker than what is asked of α cannot tell: the chance in its misfit, times its own σ,
-    would be more than any model error.
+    would be more than any model error. ``own`` ``(4,)`` is what the RTC's own matrix tells of it:
+    no window makes it smaller.
     """
     before = policy.floor if registration is None else registration.floor
+    if own is not None:
+        before = np.maximum(before, np.hypot(policy.floor, own))
     if np.any(np.diag(estimate.covariance) > policy.dither_sigma**2):
         return before
-    squared = policy.floor**2 + model_error(estimate.covariance, estimate.misfit) ** 2
+    told = model_error(estimate.covariance, estimate.misfit)
+    if own is not None:
+        told = np.maximum(told, own)
+    squared = policy.floor**2 + told**2
     share = 1.0 if registration is None else 1.0 / min(registration.n_windows + 1, MISFIT_WINDOWS)
     return np.asarray(np.sqrt(before**2 + share * (squared - before**2)))
 

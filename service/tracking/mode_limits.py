@@ -179,6 +179,10 @@ class ModeProof:
     """Weight of each mode of the basis for the measurement of α, by how well the model explains
     the RTC's own matrix; empty if all count alike."""
 
+    own_model_error: tuple[float, float, float, float] | None = None
+    """1 σ by which the model leads a window of α astray, numeric units, by the scatter between the
+    modes of the RTC's own matrix; None if it explains them well, or none was read."""
+
     own_misfit: float | None = None
     """Median share of its modes' response that the model does not explain, in norm; None if no
     matrix was read."""

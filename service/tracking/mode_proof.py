@@ -315,6 +315,7 @@ def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
         own_uneven=event.uneven,
         own_weights=event.weights,
         own_misfit=event.misfit,
+        own_model_error=event.model_error,
     )
     context.matrices = replace(context.matrices, mode_proof=proof)
     context.alpha = replace(context.alpha, own_matrix_alpha=event.alpha)

@@ -90,7 +90,9 @@ def on_window(context: StepContext, event: ev.WindowFitted) -> None:
             gain_sigma,
             estimate.t_ns_utc,
         ),
-        floor=filtering.model_error_of(registration, estimate, context.policy),
+        floor=filtering.model_error_of(
+            registration, estimate, context.policy, context.matrices.mode_proof.own_model_error
+        ),
         misfit=estimate.misfit,
         with_stretches=estimate.with_stretches,
     )

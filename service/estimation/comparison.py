@@ -5,33 +5,58 @@ Numbers are from docs/results/probation.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.estimation.residual import GROUP, MIN_PARTS, Residual, ResidualLevel, ratio, total_of
+from service.estimation.residual import Residual, ResidualLevel
 
 Array = NDArray[np.float64]
 
-WORSE = 1.7
-"""Power of a mode over its own before: less is not worth a swap, whatever is known of it. Of
-hundreds of modes the one that a good matrix makes worst has 1.6 after three seconds."""
+RECENT_S = 4.0
+"""Telemetry before the swap that the loop is compared with."""
 
-LASTING = 3
-"""Parts in a row, two at least, in each of which a mode moves so much more: turbulence does that
-for one. A loop that is being lost has no time for more: soon everything moves."""
+DECIDE_S = 4.0
+"""Telemetry with the new matrix after which a moderate change is decided. A gust of one second is a
+quarter of it, so the median does not see it."""
 
-SIGMAS = 4.5
-"""Of a part's scatter beyond that: hundreds of modes are looked at thirty times."""
+LASTING_S = 2.0
+"""How long a large change must last to be acted on before that: longer than a gust."""
 
-MIN_SCATTER = 0.1
-"""Of the logarithm of a mode's power in one part."""
+LASTING_SHARE = 0.8
+"""Share of the parts of that time that must show it; a gust of a second fills 0.6 of them."""
+
+SIGMAS = 3.0
+"""Noise of the median, in σ, that a change of the residual must exceed beyond ``WORSE``. With
+``WORSE`` itself, one to three σ, fewer than one healthy swap in 5,000 exceeds both."""
+
+WORSE = 1.21
+"""Residual power that is worse, 1.1 in RMS, if nothing were known to vary."""
+
+MODE_SIGMAS = 4.5
+"""The same of single modes: the worst of hundreds is looked at."""
+
+MODE_WORSE = 1.7
+"""Power of a mode's steps that is worse: of hundreds of modes the one that a good matrix makes
+worst has 1.6."""
+
+SEVERAL = 6.25
+"""Power ratio, 2.5 in RMS, that is acted on as soon as it has lasted. A gust that raises the
+residual 1.6 times makes 2.6 in power, and seeing that doubles in 10 s another 1.3."""
+
+DIVERGED = 9.0
+"""Power of all slopes over that before that is acted on in ``DIVERGED_PARTS`` parts. Single modes
+have no such limit: a vibration of tip and tilt that raises the residual 1.6 times raises the steps
+of these two modes up to 30 times."""
+
+DIVERGED_PARTS = 3
 
 COMMON_WORSE = 4.0
-"""Power of the steps of all modes, their median: seeing changes it by half in three seconds."""
+"""Power of the steps of the median mode: seeing changes it by half in three seconds."""
 
 SLOPES_WORSE = 6.0
 """Power of all slopes: seeing that doubles within three seconds makes it 3.2."""
@@ -39,8 +64,30 @@ SLOPES_WORSE = 6.0
 RING_WORSE = 6.0
 """Power of the outer ring over that of the mirror inside of it."""
 
-SLOW_PARTS = 10
-"""Parts before slopes and ring are looked at: turbulence and vibrations are slow in them."""
+GROUP_S = 0.5
+"""Parts of so much time are summed for the decision: a ringing mode and a slow loop vary much from
+part to part, and the median of parts would be far below their mean."""
+
+MEDIAN_NOISE = 1.25
+"""1 σ of a median of independent values over that of their mean."""
+
+NOISE_LENGTHS = (1, 2)
+"""Groups from whose scatter the noise of one is measured. Where turbulence or vibrations are
+correlated for longer than a group, the sum of two scatters more than independent groups would, and
+the larger estimate counts."""
+
+PRIOR_SCATTER = 0.2
+"""1 σ of the logarithm of power in a group that is assumed before any is measured; 0.1 to 0.25 were
+measured (docs/results/probation.md)."""
+
+PRIOR_VALUES = 4
+"""Measured values that this assumption counts for."""
+
+MIN_SCATTER = 0.1
+"""The same of the residual, at least: turbulence is never steadier."""
+
+MIN_MODE_SCATTER = 0.05
+"""The same of a mode's steps: white noise has 0.06 in a group of 500 frames."""
 
 SLOPES, OUTER, INNER = -3, -2, -1
 
@@ -115,6 +162,11 @@ class Part:
     peak: float = 0.0
     """Largest sum of squares of one frame's slopes."""
 
+    def without_samples(self) -> Part:
+        """Return the sums without the slopes that another matrix could read."""
+        residual = self.residual
+        return self if residual is None else replace(self, residual=replace(residual, kept=()))
+
     def plus(self, other: Part) -> Part:
         """Return the sums over both."""
         residual = other.residual
@@ -134,106 +186,164 @@ class Before:
     modes: NDArray[np.intp]
     """In the loop with it."""
 
-    n_parts: int
-    power: Array
-    """As in a part, per frame."""
+    part_s: float
+    """Length of a part, seconds."""
 
-    scatter: float
-    """1 σ of the logarithm of a mode's power in one part, what all have in common taken out."""
+    power: Array
+    """``(n_modes + 3,)`` median over the last groups of the power per frame, as in a part."""
+
+    mode_sigma: float
+    """1 σ of the logarithm of a mode's power in a group, what all modes have in common taken
+    out."""
+
+    residual_sigma: float
+    """The same of the residual, seeing taken out."""
+
+    n_groups: int
+    """Groups that the median is of."""
 
     level: ResidualLevel | None = None
-    """Of the residual; None: it is not known."""
+    """Of the residual; None if it is not known."""
 
     peak: float = 0.0
     """Largest sum of squares of one frame's slopes."""
 
     @classmethod
-    def of(cls, cm_id: str, parts: tuple[Part, ...], modes: NDArray[np.intp]) -> Before:
-        """Return what these parts of a matrix that controls these modes come to."""
-        power = _mean(parts)
+    def of(
+        cls, cm_id: str, parts: tuple[Part, ...], modes: NDArray[np.intp], part_s: float
+    ) -> Before:
+        """Return the reference from these parts of a matrix that controls these modes."""
+        groups = grouped(parts, part_s)
+        n_recent = min(max(round(RECENT_S / GROUP_S), 2), len(groups))
+        powers = _powers(groups)
+        power = np.asarray(np.median(powers[-n_recent:], axis=0))
         moving = modes[power[modes] > 0.0]
-        powers = np.array([part.power[moving] / part.n_frames for part in parts])
-        logs = np.log(np.maximum(powers / power[moving], 1e-30))
-        scatter = 0.0
+        logs = np.log(np.maximum(powers[:, moving] / power[moving], 1e-30))
         if logs.size:
             logs -= np.median(logs, axis=1, keepdims=True)
-            scatter = 1.4826 * float(np.median(np.abs(logs)))
+        level = ResidualLevel.of(_residuals(groups), n_recent)
+        residual_logs = np.zeros((0, 1)) if level is None else level.log_ratios[:, None]
         return cls(
             id=cm_id,
             modes=moving,
-            n_parts=len(parts),
+            part_s=part_s,
             power=power,
-            scatter=max(scatter, MIN_SCATTER),
-            level=ResidualLevel.of(_residuals(parts)),
+            mode_sigma=measure_sigma(logs, MIN_MODE_SCATTER),
+            residual_sigma=measure_sigma(residual_logs, MIN_SCATTER),
+            n_groups=n_recent,
+            level=level,
             peak=max(part.peak for part in parts),
         )
 
+    def noise(self, sigma: float, n_groups: int) -> float:
+        """Return 1 σ of how the median of so many groups differs from that before."""
+        return MEDIAN_NOISE * sigma * float(np.sqrt(1.0 / n_groups + 1.0 / self.n_groups))
+
+
+def measure_sigma(logs: Array, least: float) -> float:
+    """Return 1 σ of ``logs`` ``(n_groups, n)`` in one group, correlation between groups included.
+
+    The interquartile range is used, which a gust in a tenth of the time does not change.
+    """
+    found = PRIOR_SCATTER * PRIOR_SCATTER
+    for length in NOISE_LENGTHS:
+        n = len(logs) // length
+        if n < 2 or not logs.shape[1]:
+            continue
+        means = logs[len(logs) - n * length :].reshape(n, length, -1).mean(axis=1)
+        quartiles = np.quantile(means - np.median(means, axis=0), (0.25, 0.75))
+        square = length * (float(quartiles[1] - quartiles[0]) / 1.349) ** 2
+        n_values = n * logs.shape[1]
+        mixed = (n_values * square + PRIOR_VALUES * PRIOR_SCATTER**2) / (n_values + PRIOR_VALUES)
+        found = mixed if length == 1 else max(found, mixed)
+    return max(float(np.sqrt(found)), least)
+
+
+def grouped(parts: tuple[Part, ...], part_s: float) -> tuple[Part, ...]:
+    """Return the sums over groups of parts, the newest whole; an incomplete first one is left out.
+
+    Fewer parts than one group are summed as they are.
+    """
+    size = max(round(GROUP_S / part_s), 1)
+    first = len(parts) % size if len(parts) >= size else 0
+    groups = [parts[k : k + size] for k in range(first, len(parts), size)]
+    return tuple(reduce(Part.plus, group) for group in groups)
+
 
 def compared(
-    before: Before, parts: tuple[Part, ...], modes: NDArray[np.intp], after_id: str
+    before: Before,
+    parts: tuple[Part, ...],
+    modes: NDArray[np.intp],
+    after_id: str,
+    *,
+    decides: bool,
 ) -> ProbationFinding:
     """Return what telemetry of a matrix says of it; ``modes`` are in the loop with both.
 
-    A mode's power is compared with its own; what all have in common is taken out, unless it has
-    become less: then a mode that has not is no worse. A mode is worse beyond ``WORSE`` times by
-    ``SIGMAS`` of what the logarithm of its power scatters from part to part before, and in each of
-    the last ``LASTING`` parts beyond ``WORSE``.
+    Every quantity is a series of power ratios. ``decides`` compares the median of all groups of
+    parts with a limit that includes the measured noise; otherwise only what has lasted in most
+    parts and is several times larger counts, and what diverges. A mode's power is compared with its
+    own; what all modes have in common is taken out, unless it has become less: then a mode that has
+    not is no worse.
     """
-    after = _mean(parts)
-    moving = modes[after[modes] > 0.0]
+    looked = _Look(n_last=max(round(LASTING_S / before.part_s), 2), decides=decides)
+    series = grouped(parts, before.part_s) if decides else parts
+    after = _powers(series)
+    moving = modes[np.median(after, axis=0)[modes] > 0.0]
     if len(moving) == 0:
         return not_compared(before.id, after_id, "no mode is in the loop with both, and moves")
-    grown = np.log(after[moving] / before.power[moving])
-    common = float(np.median(grown))
-    single = grown - max(common, 0.0)
-    worst = int(np.argmax(single))
-    scatter = before.scatter * np.sqrt(1.0 / before.n_parts + 1.0 / len(parts))
-    limit = float(np.log(WORSE) + SIGMAS * scatter)
-    rings = single[worst] > limit and _lasts(before, parts, int(moving[worst]), max(common, 0.0))
-    slopes = _log_ratio(before.power[SLOPES], after[SLOPES])
-    ring = None
-    edges = [power[k] for power in (before.power, after) for k in (OUTER, INNER)]
-    if min(edges) > 0.0:
-        ring = _log_ratio(edges[0] / edges[1], edges[2] / edges[3])
-    slow = len(parts) >= SLOW_PARTS
-    whole = _residual(before, parts, modes)
-    lost = before.level is not None and before.level.lost(_residuals(parts))
-    rms = [float(np.exp(0.5 * x)) for x in (single[worst], limit, common, slopes)]
-    ring_rms = None if ring is None else float(np.exp(0.5 * ring))
-    whole_rms = (None, None) if whole is None else tuple(float(np.sqrt(x)) for x in whole)
+    grown = np.log(np.maximum(after[:, moving], 1e-40) / before.power[moving])
+    common = np.median(grown, axis=1)
+    single = grown - np.maximum(common, 0.0)[:, None]
+    worst = int(np.argmax(looked.value(single)))
+    noise = before.noise(before.mode_sigma, len(series))
+    limit = float(np.log(MODE_WORSE)) + MODE_SIGMAS * noise
     grounds = [
-        _Ground(
-            bool(rings),
-            f"mode {moving[worst]} moves {rms[0]:.2f} times as much, against all modes,",
-            rms[0] / rms[1],
-            rms[1],
+        looked.ground(
+            f"mode {moving[worst]} moves {{:.2f}} times as much, against all modes,",
+            single[:, worst],
+            limit,
         ),
-        _ground("the median mode moves {:.2f} times as much", rms[2], COMMON_WORSE),
-        _ground("all slopes are {:.2f} times as large", rms[3], SLOPES_WORSE, tells=slow),
+        looked.ground("the median mode moves {:.2f} times as much", common, np.log(COMMON_WORSE)),
+        looked.ground(
+            "all slopes are {:.2f} times as large",
+            _log_growth(before.power, after, SLOPES),
+            np.log(SLOPES_WORSE),
+            diverged=float(np.log(DIVERGED)),
+        ),
     ]
-    if whole is not None:
-        words = "the residual, seeing taken out, is {:.2f} times as large"
-        tells = len(parts) >= MIN_PARTS
-        grounds.append(_ground(words, float(np.sqrt(whole[0])), whole[1], tells=tells))
-    if ring_rms is not None:
-        words = "the outer ring moves {:.2f} times as much"
-        grounds.append(_ground(words, ring_rms, RING_WORSE, tells=slow))
+    residual = None
+    if before.level is not None:
+        logs = before.level.log_ratios_of(_residuals(series), moving)
+        if len(logs):
+            noise = before.noise(before.residual_sigma, len(logs))
+            residual = looked.ground(
+                "the residual, seeing taken out, is {:.2f} times as large",
+                logs,
+                np.log(WORSE) + SIGMAS * noise,
+            )
+            grounds.append(residual)
+    ring = None
+    if min(before.power[OUTER], before.power[INNER]) > 0.0 and after[:, [OUTER, INNER]].all():
+        logs = _log_growth(before.power, after, OUTER) - _log_growth(before.power, after, INNER)
+        ring = looked.ground("the outer ring moves {:.2f} times as much", logs, np.log(RING_WORSE))
+        grounds.append(ring)
+    lost = before.level is not None and before.level.lost(_residuals(parts))
     worse = lost or any(ground.worse for ground in grounds)
-    text = _in_words(grounds, before.id, lost=lost)
     return ProbationFinding(
         verdict=Verdict.WORSE if worse else Verdict.AS_GOOD,
         before=before.id,
         after=after_id,
-        text=text,
+        text=_in_words(grounds, before.id, lost=lost),
         mode=int(moving[worst]),
-        mode_ratio=rms[0],
-        limit=rms[1],
-        common_ratio=rms[2],
-        slopes_ratio=rms[3],
+        mode_ratio=grounds[0].rms,
+        limit=grounds[0].limit,
+        common_ratio=grounds[1].rms,
+        slopes_ratio=grounds[2].rms,
         lost=lost,
-        residual_ratio=whole_rms[0],
-        residual_limit=whole_rms[1],
-        ring_ratio=ring_rms,
+        residual_ratio=None if residual is None else residual.rms,
+        residual_limit=None if residual is None else residual.limit,
+        ring_ratio=None if ring is None else ring.rms,
     )
 
 
@@ -242,60 +352,63 @@ class _Ground(NamedTuple):
 
     worse: bool
     words: str
-    beyond: float
-    """Over its limit."""
+    rms: float
+    """RMS over that before: the median of all parts, or what the last ones have in common."""
 
     limit: float
     """RMS."""
 
 
-def _ground(words: str, rms: float, power_limit: float, *, tells: bool = True) -> _Ground:
-    """Return an RMS against its limit, a power."""
-    limit = float(np.sqrt(power_limit))
-    return _Ground(tells and rms > limit, words.format(rms), rms / limit, limit)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Look:
+    """How a series of power ratios is read: as the decision, or before it."""
+
+    n_last: int
+    """Parts that a large change must have lasted."""
+
+    decides: bool
+
+    def value(self, logs: Array) -> Array:
+        """Return the median; before the decision what most of the last parts exceed."""
+        if self.decides:
+            return np.asarray(np.median(logs, axis=0))
+        if len(logs) < self.n_last:
+            return np.full(logs.shape[1:], -40.0)
+        return np.asarray(np.quantile(logs[-self.n_last :], 1.0 - LASTING_SHARE, axis=0))
+
+    def ground(
+        self, words: str, logs: Array, limit: float, *, diverged: float | None = None
+    ) -> _Ground:
+        """Return one quantity's verdict from ``logs`` ``(n,)`` of its power ratios."""
+        value, newest = float(self.value(logs)), logs[-DIVERGED_PARTS:]
+        if diverged is not None and len(newest) == DIVERGED_PARTS and newest.min() > diverged:
+            value, limit = float(newest.min()), diverged
+        elif not self.decides:
+            limit = max(float(np.log(SEVERAL)), limit)
+        rms = float(np.exp(0.5 * max(value, -40.0)))
+        return _Ground(value > limit, words.format(rms), rms, float(np.exp(0.5 * limit)))
 
 
 def _in_words(grounds: list[_Ground], before: str, *, lost: bool) -> str:
     """Return the one number that an operator needs: the farthest beyond its limit, or nearest."""
     worse = [ground for ground in grounds if ground.worse]
-    one = max(worse or grounds, key=lambda ground: ground.beyond)
+    one = max(worse or grounds, key=lambda ground: ground.rms / ground.limit)
     text = f"{one.words} as with {before} ({one.limit:.2f} is too much)"
     if lost:
         return f"the loop is lost: {text}" if worse else "the loop is lost: it corrects nothing"
-    if worse:
-        return text
-    return f"as good: at most, {text}" if one.beyond <= 1.0 else f"as good: {text}, did not last"
+    return text if worse else f"as good: at most, {text}"
 
 
-def _lasts(before: Before, parts: tuple[Part, ...], mode: int, common: float) -> bool:
-    """Return whether a mode moves more in each of the last parts, not only in one of them."""
-    least = WORSE * np.exp(common) * before.power[mode]
-    last = parts[-LASTING:]
-    return len(last) > 1 and all(part.power[mode] > least * part.n_frames for part in last)
+def _powers(parts: tuple[Part, ...]) -> Array:
+    """Return ``(n_parts, n_modes + 3)`` power per frame."""
+    return np.array([part.power / part.n_frames for part in parts])
 
 
-def _mean(parts: tuple[Part, ...]) -> Array:
-    """Return the mean power per frame of all parts."""
-    total = np.sum([part.power for part in parts], axis=0)
-    return np.asarray(total / sum(part.n_frames for part in parts))
-
-
-def _log_ratio(one: float, other: float) -> float:
-    return float(np.log(other / one)) if min(one, other) > 0.0 else 0.0
-
-
-def _residual(
-    before: Before, parts: tuple[Part, ...], modes: NDArray[np.intp]
-) -> tuple[float, float] | None:
-    """Return power of the residual over that before, seeing taken out, and its limit."""
-    level, after = before.level, total_of(_residuals(parts))
-    if level is None or after is None:
-        return None
-    known = modes[modes < len(after.seen)]
-    last = total_of(_residuals(parts[-GROUP:])) or after
-    # it lasts: no single gust
-    least = min(ratio(level.total, after, known), ratio(level.total, last, known))
-    return least, level.limit(len(parts))
+def _log_growth(before: Array, after: Array, column: int) -> Array:
+    """Return the logarithm of a power over that before, one per part."""
+    if before[column] <= 0.0:
+        return np.zeros(len(after))
+    return np.asarray(np.log(np.maximum(after[:, column], 1e-40) / before[column]))
 
 
 def _residuals(parts: tuple[Part, ...]) -> tuple[Residual, ...]:

@@ -9,6 +9,11 @@ leaves turbulence out. What all modes have in common, their median, is seeing, l
 Whatever single modes do, the residual as a whole is compared as well, as both matrices read it
 (``residual``); and the slopes, block by block, for a loop that is lost has no tenth of a second.
 
+Turbulence makes all of these vary with a healthy loop. How much is measured before the swap
+(``comparison.measure_noise``), and a moderate change is decided once, after ``DECIDE_S``, from the
+median of all parts. Before that only what no turbulence does counts: divergence at once, and a
+factor of several that lasts longer than a gust.
+
 Numbers are from docs/results/probation.md.
 """
 
@@ -23,8 +28,10 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from service.estimation.comparison import (
+    DECIDE_S,
     INNER,
     OUTER,
+    RECENT_S,
     SLOPES,
     Before,
     Part,
@@ -42,8 +49,11 @@ from service.wire import Status
 
 Array = NDArray[np.float64]
 
-WITHIN_S = 3.0
+WITHIN_S = DECIDE_S
 """Telemetry with the new matrix that is looked at; the verdict comes at the latest then."""
+
+HISTORY_S = 10.0
+"""Telemetry with the matrix before from which the noise of a healthy loop is measured."""
 
 PART_S = 0.1
 """Between two looks."""
@@ -101,7 +111,11 @@ class Comparison(Detector):
     """In the loop, by the last block."""
 
     tail: FrameBlock | None = None
-    """The last frames, as many as a step and its change reach back."""
+    """The last frames, as many as a step and its change reach back; None if the last block had
+    fewer."""
+
+    session: str | None = None
+    """Of the last block."""
 
     n_skipped: int = 0
     """Frames since the swap that do not count yet."""
@@ -179,7 +193,7 @@ def observe(
     cuts = np.linspace(0, block.n_frames, max(n_parts, 1) + 1).astype(int).tolist()
     for start, stop in pairwise(cuts):
         some = block.rows(start, stop)
-        if some.cm_id != state.cm_id or (state.tail and some.session != state.tail.session):
+        if some.cm_id != state.cm_id or (state.session and some.session != state.session):
             state = _swapped(state, some)
         if state.before is None and state.healthy is None:
             state = _believe(state, matrix)
@@ -246,7 +260,8 @@ def _observed(
     rows = block.commands_m[:, :n_modes]
     if tail is not None and block.follows(tail):
         rows = np.concatenate((tail.commands_m[:, :n_modes], rows))
-    state = replace(state, tail=block.last(_REACH) if block.n_frames >= _REACH else None)
+    last = block.last(_REACH) if block.n_frames >= _REACH else None
+    state = replace(state, tail=last, session=block.session)
     if moved and not lines_hz:
         return state
     if not state.dithered.issuperset(moved):
@@ -265,7 +280,7 @@ def _observed(
 
 def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
     """Return what is compared from now on: what there is of the matrix until now is the before."""
-    same_session = state.tail is not None and state.tail.session == block.session
+    same_session = state.session == block.session
     fresh = Comparison(cm_id=block.cm_id, dithered=state.dithered, of_loop=state.of_loop)
     if state.healthy is not None and block.cm_id is not None and same_session:
         return replace(fresh, before=state.healthy, reader=state.reader, returned=True)
@@ -275,7 +290,8 @@ def _swapped(state: Comparison, block: FrameBlock) -> Comparison:
     if lasted_s < MIN_BEFORE_S:
         why = f"only {lasted_s:.1f} s of telemetry with {state.cm_id} to compare with"
         return replace(fresh, found=not_compared(state.cm_id, block.cm_id, why))
-    before = Before.of(state.cm_id, state.parts, state.modes)
+    part_s = max(PART_S, MIN_PART * block.dt_ns * 1e-9)
+    before = Before.of(state.cm_id, state.parts, state.modes, part_s)
     return replace(fresh, before=before, reader=state.reader)
 
 
@@ -328,8 +344,16 @@ def _added(state: Comparison, part: Part, block: FrameBlock) -> Comparison:
     last = parts[-1] if parts else None
     if last is not None and last.n_frames < length - _REACH:
         part, parts = last.plus(part), parts[:-1]
-    kept = round(WITHIN_S / dt_s / length)
-    return replace(state, parts=(*parts, part)[-kept:])
+    parts = (*parts, part)
+    if state.before is not None:
+        return replace(state, parts=parts)
+    # the history of the next swap
+    parts = parts[-round(HISTORY_S / dt_s / length) :]
+    n_recent = round(RECENT_S / dt_s / length)
+    if len(parts) > n_recent:
+        old = parts[-n_recent - 1]
+        parts = (*parts[: -n_recent - 1], old.without_samples(), *parts[-n_recent:])
+    return replace(state, parts=parts)
 
 
 def _looked(state: Comparison, block: FrameBlock) -> Comparison:
@@ -347,8 +371,9 @@ def _looked(state: Comparison, block: FrameBlock) -> Comparison:
     if state.returned and after_s < RETURNED_S:
         return state
     looked_at = state.parts[-RETURNED_PARTS:] if state.returned else state.parts
-    found = compared(before, looked_at, modes.astype(np.intp), block.cm_id)
     over = after_s >= WITHIN_S - PART_S
+    decides = over or state.returned
+    found = compared(before, looked_at, modes.astype(np.intp), block.cm_id, decides=decides)
     waits = found.verdict is (Verdict.WORSE if state.returned else Verdict.AS_GOOD)
     if waits and not over and not (state.returned and found.lost):
         return state

@@ -25,8 +25,8 @@ from service.estimation.frames import FrameBlock
 
 Array = NDArray[np.float64]
 
-STRIDE = 8
-"""One of so many frames is looked at."""
+SAMPLE_S = 0.008
+"""Time between two frames that are sampled: turbulence moves little in it, at any frame rate."""
 
 LAG = 4
 """Samples between two positions of the turbulence whose difference counts."""
@@ -34,23 +34,17 @@ LAG = 4
 KEPT = 4
 """One of so many samples is kept, for a matrix to come to read."""
 
-GROUP = 5
-"""Parts that are taken together to see how much the residual scatters."""
-
-WORSE = 1.21
-"""Residual power, seeing taken out, that is worse: 1.1 in wavefront error."""
-
-SIGMAS = 4.0
-"""Of the scatter beyond that: it is known from a few groups only."""
-
-MIN_SCATTER = 0.12
-"""Of the logarithm of the residual's power in one group: turbulence is never steadier."""
-
-MIN_PARTS = GROUP + 1
-"""Fewer say nothing: what is worse by far shows in the steps and in the slopes."""
+CALM_SHARE = 0.7
+"""Share of the groups before that make the reference. The others may be a gust, which would hide in
+the reference how far the turbulence usually moves."""
 
 LATELY = 3
-"""Parts by which it is told whether a loop is lost."""
+"""Parts in which a loop is checked for being lost."""
+
+LOST_RATIO = 9.0
+"""Residual power over that before which a lost loop exceeds at least: a gust makes it 2.6. The
+power of the commands alone says nothing: tip and tilt wander, and a healthy mirror may move ten
+times as much as in the seconds before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,7 +121,8 @@ class Reader:
 
         ``own`` is the matrix ``(n_modes, n_slopes)`` that closes the loop, if it is another one.
         """
-        rows = np.arange(-block.first_seq % STRIDE, block.n_frames, STRIDE)
+        stride = stride_frames(block.dt_ns)
+        rows = np.arange(-block.first_seq % stride, block.n_frames, stride)
         if not len(rows):
             return self, None
         n_modes = len(self.matrix)
@@ -136,8 +131,8 @@ class Reader:
         seq = np.concatenate([self.seq, block.first_seq + rows])
         turbulence = np.concatenate([self.turbulence_m, residual - commands])
         moved = turbulence[LAG:] - turbulence[:-LAG]
-        moved = moved[seq[LAG:] - seq[:-LAG] == LAG * STRIDE]
-        kept = (block.first_seq + rows) % (KEPT * STRIDE) == 0
+        moved = moved[seq[LAG:] - seq[:-LAG] == LAG * stride]
+        kept = (block.first_seq + rows) % (KEPT * stride) == 0
         sums = Residual(
             n_seen=len(rows),
             seen=_squares(residual),
@@ -152,49 +147,67 @@ class Reader:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ResidualLevel:
-    """The residual of a loop that is believed: what another one is compared with."""
+    """The residual of a trusted loop, as the reference for another one."""
 
     total: Residual
-    scatter: float
-    """1 σ of the logarithm of the residual's power in one group, seeing taken out."""
+    """Sums over the calmer of the last groups with that loop."""
 
-    n_groups: int
+    log_ratios: Array
+    """``(n_groups,)`` logarithm of each group's residual power over ``total``, seeing taken out,
+    oldest first; groups older than ``total`` are included, to measure the noise."""
+
+    n_recent: int
+    """Groups at the end of ``log_ratios`` that the loop is compared with: their median."""
 
     @classmethod
-    def of(cls, parts: tuple[Residual, ...]) -> ResidualLevel | None:
-        """Return the level of these parts; None: they are too few."""
-        total = total_of(parts)
-        groups = [total_of(parts[k : k + GROUP]) for k in range(0, len(parts) - GROUP + 1, GROUP)]
-        if total is None or not total.n_moved or len(groups) < 2:
+    def of(cls, groups: tuple[Residual, ...], n_recent: int) -> ResidualLevel | None:
+        """Return the level of these, oldest first; None if there are none."""
+        known = tuple(group for group in groups if group.n_moved)
+        recent = known[-n_recent:]
+        by_power = sorted(recent, key=lambda group: float(group.seen.sum()) / group.n_seen)
+        total = total_of(tuple(by_power[: max(round(CALM_SHARE * len(recent)), 1)]))
+        if total is None:
             return None
-        modes = np.arange(len(total.seen))
-        known = [g for g in groups if g is not None and g.n_moved]
-        logs = [np.log(ratio(total, group, modes)) for group in known]
-        scatter = max(float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0, MIN_SCATTER)
-        return cls(total=total, scatter=scatter, n_groups=len(known))
+        modes, plain = np.arange(len(total.seen)), replace(total, own=None)
+        # those with another number of modes were read by another matrix
+        logs = [log_ratio(plain, one, modes) for one in known if len(one.seen) == len(total.seen)]
+        return cls(total=total, log_ratios=np.array(logs), n_recent=len(recent))
 
     def read_by(self, matrix: NDArray[np.float32] | None) -> ResidualLevel:
         """Return the level with ``own`` as this matrix reads it."""
         return replace(self, total=self.total.read_by(matrix))
 
-    def limit(self, n_parts: int) -> float:
-        """Return the ratio of powers beyond which so many parts are worse."""
-        n_groups = max(n_parts / GROUP, 0.2)
-        scatter = self.scatter * np.sqrt(1.0 / self.n_groups + 1.0 / n_groups)
-        return float(WORSE * np.exp(SIGMAS * scatter))
+    def log_ratios_of(self, parts: tuple[Residual, ...], modes: NDArray[np.intp]) -> Array:
+        """Return each part's residual power over the median of those before, as a logarithm."""
+        usual = float(np.median(self.log_ratios[-self.n_recent :]))
+        known = modes[modes < len(self.total.seen)]
+        logs = [log_ratio(self.total, part, known) for part in parts if part.n_seen]
+        return np.array(logs) - usual
 
     def lost(self, parts: tuple[Residual, ...]) -> bool:
-        """Return whether the loop does no longer what it is for.
+        """Return whether the loop no longer does what it is for.
 
-        Its residual is as large as the turbulence that the mirror followed before, or the mirror
-        moves by far more than that.
+        Its residual is far larger than before, and either as large as the turbulence that the
+        mirror followed then, or the mirror itself moves by far more.
         """
         last = total_of(parts[-LATELY:])
         if last is None or not last.n_seen:
             return False
         followed = self.total.commanded.sum() / self.total.n_seen
+        before = self.total.seen.sum() / self.total.n_seen
         left, moves = last.seen.sum() / last.n_seen, last.commanded.sum() / last.n_seen
-        return bool(left > followed or moves > 10.0 * followed)
+        far_larger = left > LOST_RATIO * before
+        return bool(far_larger and (left > followed or moves > 10.0 * followed))
+
+
+def stride_frames(dt_ns: int) -> int:
+    """Return how many frames lie between two samples."""
+    return max(round(SAMPLE_S * 1e9 / dt_ns), 1)
+
+
+def log_ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:
+    """Return the logarithm of ``ratio``, finite."""
+    return float(np.log(max(ratio(before, after, modes), 1e-30)))
 
 
 def total_of(parts: tuple[Residual, ...]) -> Residual | None:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scipy
 
-from service.estimation.comparison import Verdict
+from service.estimation.comparison import PRIOR_SCATTER, Verdict, measure_sigma
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import WITHIN_S, Comparison, begun_anew, observe
 
 N_MODES, BLOCK, DT_NS = 60, 50, 1_000_000
-BEFORE_S, AFTER_S = 2.0, 3.5
+BEFORE_S, AFTER_S = 2.0, 4.5
 LINE_HZ = (205.0, 293.0)
 
 
@@ -79,7 +79,7 @@ def test_a_few_modes_at_the_edge_of_stability_are_found(turns):
     found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
     assert found.verdict is Verdict.WORSE
     assert 40 <= found.mode < 44
-    assert found.after_s < 2.0
+    assert found.after_s <= WITHIN_S
     assert found.common_ratio == pytest.approx(1.0, abs=0.1)
     assert re.fullmatch(
         rf"mode {found.mode} moves [\d.]+ times as much, against all modes, as with a "
@@ -103,7 +103,7 @@ def test_a_matrix_after_a_bad_one_is_not_blamed_for_what_has_become_calm():
     assert judged([("a", bad), ("b", residual(rng, AFTER_S))]).verdict is Verdict.AS_GOOD
 
 
-def test_the_verdict_comes_within_three_seconds_and_no_sooner_if_all_is_well():
+def test_a_good_matrix_passes_at_the_decision_and_no_sooner():
     rng = np.random.default_rng(5)
     found = judged([("a", residual(rng, BEFORE_S)), ("b", residual(rng, AFTER_S))])
     assert WITHIN_S - 0.15 < found.after_s <= WITHIN_S
@@ -166,3 +166,41 @@ def test_a_burst_in_one_mode_right_after_the_swap_is_turbulence():
     found = judged([("a", residual(rng, BEFORE_S)), ("b", after)])
     assert found.verdict is Verdict.AS_GOOD
     assert found.text.endswith("did not last") == (found.mode_ratio > found.limit)
+
+
+def test_a_swap_right_after_a_block_of_a_few_frames_is_compared():
+    rng, state, n_before = np.random.default_rng(10), Comparison(), round(BEFORE_S * 1000)
+    parts = [("a", residual(rng, BEFORE_S)), ("b", residual(rng, AFTER_S))]
+    for block in blocks(parts):
+        last = block.first_seq + BLOCK == n_before
+        for piece in (block.rows(0, BLOCK - 3), block.rows(BLOCK - 3, BLOCK)) if last else (block,):
+            state = observe(state, piece, np.arange(N_MODES))
+    assert state.found is not None
+    assert state.found.verdict is Verdict.AS_GOOD
+
+
+@pytest.mark.parametrize("begins_s", [0.0, 0.8, 1.7, 3.2])
+@pytest.mark.parametrize("modes", [slice(0, 2), slice(None)])
+def test_a_gust_of_one_second_is_not_the_matrix_s_doing(begins_s, modes):
+    """Twice the RMS in all modes, or a vibration of four times in two: turbulence does that."""
+    rng = np.random.default_rng(11)
+    after = residual(rng, AFTER_S)
+    some = slice(round(begins_s * 1000), round(begins_s * 1000) + 1000)
+    after[some, modes] *= 2.0 if modes == slice(None) else 4.0
+    found = judged([("a", residual(rng, 4.0)), ("b", after)])
+    assert found.verdict is Verdict.AS_GOOD, found.text
+    assert found.after_s > WITHIN_S - 0.15
+
+
+def test_noise_that_is_correlated_for_several_groups_counts_more():
+    rng = np.random.default_rng(12)
+    white = rng.normal(size=(20, 200))
+    slow = scipy.signal.lfilter([0.6], [1.0, -0.8], rng.normal(size=(400, 200)), axis=0)[-20:]
+    assert measure_sigma(white, 0.0) == pytest.approx(1.0, rel=0.1)
+    assert measure_sigma(slow, 0.0) > 1.15 * measure_sigma(rng.permuted(slow, axis=0), 0.0)
+
+
+def test_before_noise_is_measured_it_is_assumed():
+    assert measure_sigma(np.zeros((1, 1)), 0.0) == pytest.approx(PRIOR_SCATTER)
+    few = measure_sigma(np.zeros((4, 1)), 0.0)
+    assert few == pytest.approx(PRIOR_SCATTER * np.sqrt(4.0 / 6.0))

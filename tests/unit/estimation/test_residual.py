@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy
@@ -9,9 +11,10 @@ import scipy
 from service.estimation.comparison import Verdict
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import Comparison, observe
-from service.estimation.residual import LAG, STRIDE, Reader, Residual, ratio
+from service.estimation.residual import LAG, Reader, Residual, ResidualLevel, ratio, stride_frames
 
 N_MODES, N_SLOPES, BLOCK, DT_NS = 40, 100, 20, 1_000_000
+STRIDE = stride_frames(DT_NS)
 RNG = np.random.default_rng(1)
 RESPONSE = np.linalg.qr(RNG.normal(size=(N_SLOPES, N_MODES)))[0]
 MATRIX = np.float32(RESPONSE.T)
@@ -84,18 +87,18 @@ def with_sign(mode):
 
 
 def test_a_loop_at_a_third_of_its_gain_is_worse_though_no_mode_rings():
-    (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, 0.3 * MATRIX, 1.0)])
+    (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 4.5, 0.3 * MATRIX, 1.0)])
     assert found.verdict is Verdict.WORSE
     assert found.residual_ratio > 1.4
     assert not found.lost
-    (unread,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, 0.3 * MATRIX, 1.0)], whole=False)
+    (unread,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 4.5, 0.3 * MATRIX, 1.0)], whole=False)
     assert unread.residual_ratio is None
 
 
 @pytest.mark.parametrize("seeing", [0.6, 0.8, 1.25, 1.6])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_same_matrix_in_other_seeing_is_not(seeing, seed):
-    (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 3.5, MATRIX, seeing)], seed)
+    (found,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 4.5, MATRIX, seeing)], seed)
     assert found.verdict is Verdict.AS_GOOD, found.text
     assert found.residual_ratio < found.residual_limit
 
@@ -103,20 +106,20 @@ def test_the_same_matrix_in_other_seeing_is_not(seeing, seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_loop_is_no_worse_for_what_the_matrix_before_takes_for_its_own(seed):
     """The loop of the one before had that at zero, and the other's has not."""
-    loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 3.5, reading_beyond(2), 1.0)]
+    loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 4.5, reading_beyond(2), 1.0)]
     (found,) = judged(loops, seed, beyond_m=60e-9)
     assert found.verdict is Verdict.AS_GOOD, found.text
 
 
 def test_a_third_of_the_gain_is_found_behind_modes_beyond_as_well():
-    loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 3.5, 0.3 * reading_beyond(2), 1.0)]
+    loops = [("a", 4.0, reading_beyond(1), 1.0), ("b", 4.5, 0.3 * reading_beyond(2), 1.0)]
     (found,) = judged(loops, beyond_m=30e-9)
     assert found.verdict is Verdict.WORSE, found.text
 
 
 def test_residuals_of_a_matrix_of_more_modes_are_not_mixed_with_those_of_fewer():
     """The third comes a second after the verdict on the second: half is read by the first."""
-    loops = [("a", 4.0, MATRIX, 1.0), ("b", 4.0, MATRIX, 1.0), ("c", 3.5, MATRIX, 1.0)]
+    loops = [("a", 4.0, MATRIX, 1.0), ("b", 5.0, MATRIX, 1.0), ("c", 4.5, MATRIX, 1.0)]
     numbers, state, found = {"a": MATRIX[:20].copy(), "b": MATRIX.copy(), "c": MATRIX}, None, []
     for _, block in played(loops, np.random.default_rng(2)):
         state = observe(state or Comparison(), block, np.arange(20), matrix=numbers[block.cm_id])
@@ -137,7 +140,7 @@ def test_a_mode_of_the_other_sign_is_noticed_within_a_tenth_of_a_second(mode):
 
 def test_back_on_the_matrix_before_the_loop_is_held_against_what_it_was():
     before, worse = ("a", 2.0, MATRIX, 1.0), ("b", 0.1, with_sign(10), 1.0)
-    worst, again = judged([before, worse, ("c", 3.5, MATRIX, 1.0)])
+    worst, again = judged([before, worse, ("c", 4.5, MATRIX, 1.0)])
     assert (worst.before, worst.after) == ("a", "b")
     assert (again.before, again.after) == ("a", "c")
     assert again.verdict is Verdict.AS_GOOD, again.text
@@ -178,3 +181,13 @@ def test_a_mode_that_runs_away_is_not_taken_for_seeing():
     assert ratio(before, after, np.arange(4)) == pytest.approx((100.0 / 2.0 + 3.0) / 4.0)
     calm = Residual(n_seen=1, seen=ones, n_moved=1, moved=0.1 * ones, commanded=ones)
     assert ratio(before, calm, np.arange(4)) == pytest.approx(1.0)
+
+
+def test_commands_that_wander_are_no_lost_loop():
+    """Tip and tilt of a small telescope: ten times the power of the seconds before, followed."""
+    ones = np.ones(4)
+    before = Residual(n_seen=10, seen=ones, n_moved=1, moved=ones, commanded=100.0 * ones)
+    level = ResidualLevel.of((before, before, before), 3)
+    wandered = replace(before, commanded=2000.0 * ones)
+    assert not level.lost((wandered,))
+    assert level.lost((replace(wandered, seen=20.0 * ones),))

@@ -51,11 +51,11 @@ def trial(told):
     return told.state.operations.probation
 
 
-def test_every_matrix_that_was_sent_is_on_probation_for_three_seconds():
+def test_every_matrix_that_was_sent_is_on_probation_for_four_seconds():
     told = story()
     assert trial(told).state is ProbationState.RUNNING
     assert (trial(told).before, trial(told).id) == ("cm-1", "cm-2")
-    assert trial(told).until_ns_utc - trial(told).since_ns_utc == 3_000_000_000
+    assert trial(told).until_ns_utc - trial(told).since_ns_utc == 4_000_000_000
     told.tell(found(Verdict.AS_GOOD))
     assert (trial(told).state, trial(told).text) == (ProbationState.PASSED, NUMBERS)
     assert told.state.operator.mode is Mode.AUTO

@@ -18,6 +18,10 @@ Array = NDArray[Any]
 DEAD = 1e-4
 """A column with less than this share of the median column's size is no measurement."""
 
+DEAD_ROW_SHARE = 0.5
+"""A slope that is not finite in more than this share of the columns belongs to a dead subaperture;
+otherwise the columns are at fault."""
+
 PLAUSIBLE = 1e-4
 """RMS slope per metre of OPD times the wavelength is some units; outside this share of 1 to its
 reciprocal the unit is another one: nanometres and micrometres are 1e-9 and 1e-6."""
@@ -54,7 +58,9 @@ def checked(
         unit is not the metre.
     """
     _check_shape(reference, n_slopes, n_modes)
+    reference, silenced = _without_dead_rows(reference)
     kept, left_out = _usable(reference)
+    left_out = (*silenced, *left_out)
     matrix = np.asarray(reference.matrix, dtype=np.float64)[:, kept]
     usable = replace(
         reference,
@@ -96,6 +102,25 @@ def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:
         )
 
 
+def _without_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]]:
+    """Return the reference with slopes that hold no numbers as 0, and a sentence that names them.
+
+    A dead subaperture gives NaN in every column. Slopes of 0 do not count in a fit, so that it
+    costs two rows and not all columns.
+    """
+    unknown = ~np.isfinite(reference.matrix)
+    measured = ~unknown.all(axis=0)
+    if not measured.any():
+        return reference, ()
+    dead = unknown[:, measured].mean(axis=1) > DEAD_ROW_SHARE
+    if not dead.any():
+        return reference, ()
+    matrix = np.array(reference.matrix)
+    matrix[np.ix_(dead, measured)] = 0.0
+    rows = _listed(np.flatnonzero(dead), "slope")
+    return replace(reference, matrix=matrix), (f"not finite: {rows}",)
+
+
 def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     """Return which columns are measurements, and a sentence for each kind that is not."""
     finite = np.isfinite(reference.matrix).all(axis=0)
@@ -116,10 +141,10 @@ def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     return kept, tuple(left_out)
 
 
-def _listed(modes: NDArray[np.intp]) -> str:
-    named = ", ".join(str(mode) for mode in modes[:8])
-    more = f" and {len(modes) - 8} more" if len(modes) > 8 else ""
-    return f"mode{'s' if len(modes) > 1 else ''} {named}{more}"
+def _listed(numbers: NDArray[np.intp], what: str = "mode") -> str:
+    named = ", ".join(str(number) for number in numbers[:8])
+    more = f" and {len(numbers) - 8} more" if len(numbers) > 8 else ""
+    return f"{what}{'s' if len(numbers) > 1 else ''} {named}{more}"
 
 
 def _check_unit(matrix: Array, wavelength_m: float) -> None:

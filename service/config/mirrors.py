@@ -46,6 +46,9 @@ _FOREIGN = {
 _ON_A_GAP = 1e-9
 """Of a mirror's half width, by which an actuator may lie beside a gap and yet on it."""
 
+_BROKEN_SHARE = 0.1
+"""Share of a table that a broken function lacks beyond what the others lack, as outside a pupil."""
+
 _CHUNK = 256
 """Actuators compared with all others at once."""
 
@@ -417,6 +420,8 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     if cube.ndim != 3 or min(cube.shape) < 1:
         refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
     strokes = _strokes(file, len(cube)) if key == "influence_functions" else None
+    cube, broken = _without_broken(file, key, cube)
+    crops = cube
     whole = None if file.said.influence_origin is not None else known_samples(cube)
     of_functions = key == "influence_functions"
     ending = local_functions(file, _opd(file, cube), strokes, whole) if of_functions else None
@@ -431,6 +436,7 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
         if strokes is not None:
             cube = np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
     remarks = (
+        *broken,
         *_judged(file, pupil, key, known, file.said.modes_pitch_m),
         *remarks_on_crops(file, crops),
     )
@@ -442,6 +448,39 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
         **_mount(file.said),
     )
     return modes, remarks
+
+
+def _without_broken(
+    file: MirrorSection, key: str, cube: NDArray[np.floating]
+) -> tuple[NDArray[np.floating], tuple[str, ...]]:
+    """Return a cube whose broken influence functions are 0, and a note that names them.
+
+    A function is broken if it holds no numbers in much more of the table than the others do:
+    otherwise it would make the surface unknown for all of them.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is a mode: what was measured with it is not known.
+    """
+    unknown = np.mean(~np.isfinite(cube), axis=(1, 2))
+    broken = np.flatnonzero(unknown > np.median(unknown) + _BROKEN_SHARE)
+    if not len(broken):
+        return cube, ()
+    named = ", ".join(str(number) for number in broken[:12])
+    more = f" and {len(broken) - 12} more" if len(broken) > 12 else ""
+    if key == "modes":
+        refuse(
+            file.where(key),
+            f"modes {named}{more} without numbers (NaN)",
+            "numbers: leave them out of the cube, and their columns out of the matrix",
+        )
+    mended = np.array(cube)
+    mended[broken] = 0.0
+    return mended, (
+        f"{file.where(key)}: functions {named}{more} hold no numbers (NaN): taken as 0, actuators "
+        "that do not move",
+    )
 
 
 def _strokes(file: MirrorSection, n_actuators: int) -> NDArray[np.floating] | None:

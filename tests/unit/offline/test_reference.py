@@ -43,6 +43,16 @@ def test_a_matrix_of_another_instrument_is_refused_with_both_shapes():
         check(Reference(matrix=matrix()[1:]))
 
 
+def test_a_dead_subaperture_costs_its_slopes_and_no_column():
+    given = matrix()
+    given[3] = np.nan
+    given[:, 4] = np.nan
+    found = check(Reference(matrix=given))
+    assert found.left_out == ("not finite: slope 3", "not finite: mode 4")
+    assert not found.matrix[3].any()
+    assert found.matrix.shape[1] == given.shape[1] - 1
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(1e-9, "nanometre"), (1e-6, "micrometre")])
 def test_another_unit_than_the_metre_is_named(factor, unit):
     with pytest.raises(MatrixError, match=f"looks like slope per {unit}"):

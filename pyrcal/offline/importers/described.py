@@ -139,9 +139,9 @@ def _signals(
     mirror: Mirror,
     notes: list[str],
 ) -> Signals:
-    told = instrument.frames
+    windows = instrument.frames
     frames = read_frames(source, arrays, instrument.wfs.kind)
-    if isinstance(told, FrameWindows) and frames is None:
+    if isinstance(windows, FrameWindows) and frames is None:
         raise MatrixError(
             f"{source}: matrix: found shape {np.shape(arrays['matrix'])}, expected camera frames: "
             'wfs.input = "frames"; give the mask of lit pixels or the mean frame beside them'
@@ -157,8 +157,8 @@ def _signals(
         signals.table = {"valid_subapertures": Dataset("valid_subapertures")}
         return signals
     table: dict[str, Any] = {}
-    if isinstance(told, FrameWindows):
-        notes += _beside_the_light(told, frames.light, frames.light_name)
+    if isinstance(windows, FrameWindows):
+        notes += _beside_the_light(windows, frames.light, frames.light_name)
     else:
         table = _windows(source, instrument, frames, notes)
     return Signals(
@@ -190,17 +190,17 @@ def _windows(
     }
 
 
-def _beside_the_light(told: FrameWindows, light: Array, name: str) -> list[str]:
+def _beside_the_light(windows: FrameWindows, light: Array, name: str) -> list[str]:
     """Return a note if the centres of the file do not lie where the light is."""
-    if told.centres_px is None:
+    if windows.centres_px is None:
         return []
     try:
         images = find_pupil_images(light, name)
         found = by_quadrant(images.centres_px).reshape(4, 2)
     except MatrixError:
         return []
-    expected = by_quadrant(told.centres_px).reshape(4, 2)
-    away = np.hypot(*(found - expected).T) / told.pixels_per_subaperture
+    expected = by_quadrant(windows.centres_px).reshape(4, 2)
+    away = np.hypot(*(found - expected).T) / windows.pixels_per_subaperture
     if away.max() <= OFF_CENTRE_SUBAP:
         return []
     words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in found)

@@ -5,6 +5,7 @@ An array that fits no layout, or several, is refused.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.importers.imported import Array
 from service.errors import MatrixError
+
+_NUMBERED = re.compile(r"(?:_\d{1,6})+$")
 
 ROLES = {
     "matrix": ("interaction_matrix", "im", "imat", "intmat", "int_mat", "D", "matrix"),
@@ -149,6 +152,16 @@ def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
 
 
 def role_of_name(name: str) -> str | None:
-    """Return the role that an array of this name has; None if the name says nothing."""
-    known = (role for role, names in ROLES.items() if name.lower() in {n.lower() for n in names})
+    """Return the role that an array or a file of this name has; None if the name says nothing.
+
+    Numbers may follow the name, as in ``int_mat_1_5_10``.
+    """
+    plain = _NUMBERED.sub("", name).lower()
+    known = (role for role, names in ROLES.items() if plain in {n.lower() for n in names})
     return next(known, None)
+
+
+def numbers_of_name(name: str) -> list[int]:
+    """Return the numbers at the end of a name like ``int_mat_1_5_10``."""
+    match = _NUMBERED.search(name)
+    return [] if match is None else [int(number) for number in match[0].split("_")[1:]]

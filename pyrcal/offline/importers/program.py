@@ -16,7 +16,7 @@ from pyrcal.offline.importers.cacao import from_cacao
 from pyrcal.offline.importers.described import from_described
 from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
-from pyrcal.offline.importers.layouts import by_role, role_of_name
+from pyrcal.offline.importers.layouts import by_role, numbers_of_name, role_of_name
 from pyrcal.offline.importers.pyrtc import RECORD, calibration_of
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.importers.specula import UNIT, from_specula
@@ -41,6 +41,8 @@ def _arrays(options: argparse.Namespace) -> Imported:
         arrays = _by_role(role, path, options.source)
         if not arrays:
             inventory.append(f"ignored {path}: no name of a role, see docs/integrate/importing.md")
+        if "matrix" in arrays and options.modes is None:
+            options.modes = _modes_of_name(path, arrays["matrix"], inventory)
         twice = found.keys() & arrays.keys()
         if twice:
             raise MatrixError(f"{path}: found a second {min(twice)}, expected one")
@@ -80,6 +82,16 @@ def _by_role(role: str | None, path: Path, source: str) -> dict[str, Array]:
         if named is not None:
             return {named: next(iter(arrays.values()))}
     return found
+
+
+def _modes_of_name(path: Path, matrix: Array, inventory: list[str]) -> Array | None:
+    """Return the modes that the name of a file lists, one for each column of its matrix."""
+    numbers = numbers_of_name(path.name.partition(".")[0])
+    if len(numbers) not in np.shape(matrix) or len(set(numbers)) < len(numbers):
+        return None
+    listed = ",".join(str(number) for number in numbers)
+    inventory.append(f"took the modes of the columns from the name of {path.name}: {listed}")
+    return np.array(numbers)
 
 
 def _role_of(path: Path) -> str | None:

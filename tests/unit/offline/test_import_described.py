@@ -52,6 +52,17 @@ def test_a_folder_of_frames_mask_and_modes_is_one_command(tmp_path, capsys):
         np.testing.assert_array_equal(file.find("modes").read(), [1, 5, 7])
 
 
+def test_the_modes_of_the_columns_may_stand_in_the_name_of_the_file(tmp_path, capsys):
+    for name, values in (("int_mat_1_5_7", FRAMES.reshape(3, -1).T), ("valid_pixel", LIT)):
+        np.save(tmp_path / f"{name}.npy", values)
+    np.save(tmp_path / "M2C.npy", STROKES)
+    words = ["import", "files", str(tmp_path), "--instrument", "papyrus"]
+    assert main([*words, "--output", str(tmp_path / "bench")]) == 0
+    assert "from the name of int_mat_1_5_7.npy: 1,5,7" in capsys.readouterr().out
+    with pyrcal.offline.recorded.opened(tmp_path / "bench" / "matrix.h5") as file:
+        np.testing.assert_array_equal(file.find("modes").read(), [1, 5, 7])
+
+
 def test_frames_of_lit_pixels_alone_are_put_into_their_frame():
     found = imported(matrix=FRAMES[:, LIT].T)
     np.testing.assert_array_equal(found.arrays["interaction_matrix"], FRAMES)

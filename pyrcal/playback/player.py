@@ -27,6 +27,7 @@ from service.link.intake import Intake
 from service.link.matrices import MeasuredMatrix
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
+from service.model.slopes import SlopeRecipe
 from service.runtime.engine import Engine
 from service.runtime.estimates import fit_passive, fitted, read_own_matrix
 from service.runtime.worker import Done, OpticsWorker
@@ -89,6 +90,8 @@ class Player:
 
     first: Callable[[], Done[None]] | None = None
     """The one worker there is learns what it is told by itself; nobody else would need it."""
+
+    found_slopes: SlopeRecipe | None = None
 
     def __init__(self, instrument: Instrument, settings: Settings, system: str) -> None:
         """Prepare the optical model.

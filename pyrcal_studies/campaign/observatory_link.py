@@ -14,6 +14,7 @@ from pyrcal_studies.campaign.observatory_dome import Dome
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
 from service.errors import PyrcalError, UnknownIdError, WorkerError
+from service.model.slopes import SlopeRecipe
 from service.runtime.worker import Done, OpticsWorker
 from service.tracking.operation_records import MeasurementRecord
 from service.tracking.products import ReconstructorRecord
@@ -88,6 +89,7 @@ class OwnHands:
 
     def __init__(self, workbench: OpticsWorker) -> None:
         self.first: Callable[[], Done[None]] | None = None
+        self.found_slopes: SlopeRecipe | None = None
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
         """Processor time of the jobs, seconds, by name."""
 

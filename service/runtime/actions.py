@@ -128,7 +128,8 @@ class Actions:
         WorkerError
             If the worker dies of it.
         """
-        self._workers.first = partial(run_job, OpticsWorker.adopt, None, None, config_id)
+        slopes = self._workers.found_slopes
+        self._workers.first = partial(run_job, OpticsWorker.adopt, slopes, None, config_id)
         self._commanded_modes = None
         self.instrument = self.instrument.in_mode(config_id)
         return await self._workers.call(OpticsWorker.enter_mode, config_id)

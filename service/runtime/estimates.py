@@ -227,8 +227,10 @@ async def read_own_matrix(
         text = f'orientation "auto": found {orientation.setting_written(slopes)} by {record.id}'
         events.append(ev.LogEvent(name="slopes.adopted", text=text))
     if not dialect.wrong:
-        at = state.loop.config_id
-        workers.first = partial(run_job, OpticsWorker.adopt, slopes, response, at)
+        # a matrix that comes later finds the orientation settled, and names none
+        workers.found_slopes = slopes or workers.found_slopes
+        at, known = state.loop.config_id, workers.found_slopes
+        workers.first = partial(run_job, OpticsWorker.adopt, known, response, at)
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} agrees with the instrument file"

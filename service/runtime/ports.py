@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
+from service.model.slopes import SlopeRecipe
 from service.runtime.worker import Done, OpticsWorker
 from service.tracking.operation_records import MeasurementRecord
 from service.tracking.products import ReconstructorRecord
@@ -44,6 +45,10 @@ class WorkerPort(Protocol):
 
     first: Callable[[], Done[None]] | None
     """What every new worker does before anything else; None: nothing."""
+
+    found_slopes: SlopeRecipe | None
+    """Order and signs of the slopes that were found on the sky, for every new worker, whatever the
+    sensor's mode; None if the instrument file has them or none were found."""
 
     async def call(
         self, job: Callable[Concatenate[OpticsWorker, P], R], *args: P.args, **kwargs: P.kwargs

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Concatenate, ParamSpec, TypeVar
 
 from service.errors import WorkerError
+from service.model.slopes import SlopeRecipe
 from service.runtime.processes import Worker
 from service.runtime.snapshot import WorkerLoad
 from service.runtime.worker import Done, OpticsWorker, run_job
@@ -57,6 +58,8 @@ class WorkerPool:
         self._worker = early
         self.first: Callable[[], Done[None]] | None = None
         """What every new worker does before anything else; None: nothing."""
+
+        self.found_slopes: SlopeRecipe | None = None
 
         self._threads: ThreadPoolExecutor | None = None
         self._waiting: list[tuple[float, int, asyncio.Future[None]]] = []

@@ -312,8 +312,8 @@ define_view("OffloadView", Offload, "id state text step total n_moves asked_ns_u
 RECONSTRUCTOR = define_view(
     "ReconstructorView",
     products.ReconstructorRecord,
-    "id state n_modes created_ns_utc alpha sigma parent origin sha256 condition_number gate reason "
-    "published_ns_utc applied_frame_seq",
+    "id state n_modes config_id created_ns_utc alpha sigma parent origin sha256 condition_number "
+    "gate reason published_ns_utc applied_frame_seq",
 )
 RECONSTRUCTORS = define_view(
     "ReconstructorsView",

@@ -81,3 +81,26 @@ def test_a_button_is_disabled_for_the_reason_that_the_tracker_has():
             reason = state[order]["reason"]
             title = f"cannot be used now: {reason}" if reason else ""
             assert said[button] == [str(bool(reason)).lower(), title]
+
+
+def test_a_rollback_names_no_matrix_of_another_mode_of_the_sensor():
+    """The service goes back to cm-1; the tag of cm-2 would never be the one it expects."""
+    records = [
+        {"id": "cm-0", "state": "superseded", "config_id": None},
+        {"id": "cm-1", "state": "superseded", "config_id": "fine"},
+        {"id": "cm-2", "state": "superseded", "config_id": "coarse"},
+    ]
+    script = f"""
+      globalThis.document = {{ querySelector: () => document, addEventListener: () => {{}} }};
+      globalThis.localStorage = {{}};
+      const {{ Orders }} = await import('{(FILES / "orders.js").as_uri()}');
+      const service = {{ reconstructors: {json.dumps(records)} }};
+      const orders = new Orders(service);
+      console.log(JSON.stringify(["fine", "coarse", "third"].map((config_id) => {{
+        service.state = {{ config_id }};
+        return orders.before.id;
+      }})));
+    """
+    command = [NODE, "--input-type=module", "--no-warnings", "-e", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    assert json.loads(done.stdout) == ["cm-1", "cm-2", "cm-0"]

@@ -44,9 +44,9 @@ export class Orders {
     return this.#service.reconstructors.find((r) => r.id === this.state?.in_use) ?? null;
   }
 
-  // What a rollback goes back to.
+  // The matrix that a rollback sends again: as in the service, one of the sensor's mode of now.
   get before() {
-    return beforeOf(this.#service.reconstructors);
+    return beforeOf(this.#service.reconstructors, this.state?.config_id);
   }
 
   // What takes long and can be ended, with how far it is; null: nothing of the kind runs.
@@ -241,8 +241,9 @@ function needs(so, otherwise) {
   if (!so) throw new Error(otherwise);
 }
 
-function beforeOf(reconstructors) {
-  return reconstructors.filter((r) => r.state === "superseded").at(-1) ?? null;
+function beforeOf(reconstructors, configId) {
+  const fits = (r) => (r.config_id ?? configId) === configId;
+  return reconstructors.filter((r) => r.state === "superseded" && fits(r)).at(-1) ?? null;
 }
 
 export function described(record, wins = null) {

@@ -9,12 +9,15 @@ from threadpoolctl import threadpool_limits
 
 from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.observatory_dome import Dome
+from pyrcal_studies.campaign.observatory_link import OwnHands
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
 from service.errors import ModelError
 from service.estimation.windows import RefusalKind
 from service.model.misregistration import BOUNDARY_SCALE
-from service.runtime.estimates import fitted
+from service.model.slopes import Orientation, SlopeRecipe
+from service.runtime.actions import Actions
+from service.runtime.estimates import fitted, read_own_matrix
 from service.runtime.worker import OpticsWorker
 from service.tracking.products import MatrixState
 from service.tracking.resume import resumed, saved_of
@@ -194,6 +197,52 @@ def test_a_worker_that_begins_anew_enters_the_mode_before_anything_else(tmp_path
     assert worker.describe().n_slopes == worker.enter_mode("coarse").n_slopes
     with pytest.raises(ModelError, match="found mode third, expected one of: fine, coarse"):
         worker.enter_mode("third")
+
+
+async def test_a_worker_after_a_change_of_mode_has_the_orientation_that_was_found(tmp_path):
+    """A worker that is replaced in the second mode knows how the RTC lists its slopes, too."""
+    path = tmp_path / "modes.toml"
+    path.write_text(FILE.replace("[mirror]", '[slopes]\norientation = "auto"\n\n[mirror]'), "utf-8")
+    instrument = load_instrument(path)
+    found = SlopeRecipe(orientation=Orientation(flip_x=True))
+    workers = OwnHands(OpticsWorker(instrument, COMPUTE))
+    workers.found_slopes = found
+    actions = Actions(
+        bridge=None,
+        workers=workers,
+        archive=SimpleNamespace(measured=None, noisy=None),
+        instrument=instrument,
+        publishing=None,
+        clock_ns=lambda: 0,
+    )
+    await actions.enter_sensor_mode("coarse")
+    job, *given = workers.first.args
+    another = OpticsWorker(instrument, COMPUTE)
+    job(another, *given)
+    assert another._model.instrument.slopes == found
+    assert another._model.instrument.config_id == "coarse"
+
+
+async def test_a_second_matrix_of_the_rtc_does_not_make_workers_forget_the_orientation():
+    """It finds the orientation settled, and names none."""
+    found = SlopeRecipe(orientation=Orientation(flip_x=True))
+
+    class Fake:
+        first = found_slopes = None
+        adopted = True
+
+        async def call(self, job, *_):
+            if job is OpticsWorker.recognise:
+                return None, None
+            slopes = found if self.adopted else None
+            return SimpleNamespace(found=slopes, adopted=self.adopted, wrong="", rotation_rad=None)
+
+    workers, state = Fake(), TrackerState(system="s")
+    record = SimpleNamespace(judged=None, id="own")
+    for adopted in (True, False):
+        workers.adopted = adopted
+        await read_own_matrix(record, np.zeros((1, 1), np.float32), state, workers)
+    assert workers.first.args[1] == found
 
 
 async def test_a_window_of_a_session_before_is_not_fitted(night):

@@ -37,7 +37,7 @@ def quiet():
     world.pass_(2.0)
     world.tell(cmd.StopDither())
     world.tell(cmd.SetMode(mode=Mode.PROPOSE))
-    world.pass_(4.0)
+    world.pass_(5.0)
     assert world.state.matrices.in_use == "cm-1"
     assert not running_operations(world.state, world.now_ns)
     return world

@@ -94,3 +94,20 @@ def test_a_coarse_mirror_does_not_make_alpha_stale_for_good():
 def test_a_floor_that_is_given_overrules_the_measured_one():
     settings = load_settings(None, {"PYRCAL_TRACKING__FLOOR_ROTATION_DEG": "0"})
     np.testing.assert_array_equal(floor_of(settings), [FLAT[0], FLAT[0], 0.0, FLAT[2]])
+
+
+def test_a_coarse_basis_tolerates_more():
+    """40 modes on 11 subapertures: each mode is sqrt(500/40) as wide a share of the pupil as one
+    of 500, and 11/30 of that in subapertures."""
+    settings = load_settings(None, {})
+    usual, coarse = (
+        policy_of(settings),
+        policy_of(settings, load_instrument("tests/data/bench.toml")),
+    )
+    wider = np.sqrt(500 / 40)
+    scale = np.array([wider * 11 / 30, wider * 11 / 30, wider, wider])
+    np.testing.assert_allclose(coarse.useless_sigma, scale * usual.useless_sigma)
+    np.testing.assert_allclose(coarse.update_threshold, scale * usual.update_threshold)
+    given = load_settings(None, {"PYRCAL_CONTROL__UPDATE_SHIFT_SUBAP": "0.01"})
+    threshold = policy_of(given, load_instrument("tests/data/bench.toml")).update_threshold
+    np.testing.assert_allclose(threshold[:2], 0.01)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from service.config import load_instrument
-from service.estimation.own_matrix import recognise_modes
+from service.estimation.own_matrix import (
+    LeftOver,
+    left_over,
+    recognise_modes,
+    weights_of_modes,
+)
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
@@ -157,3 +162,82 @@ def test_rows_of_zeros_control_nothing():
     assert recognise_modes(nothing, model(2).linearise, Misregistration()) is None
     nothing[0, 0] = np.nan
     assert recognise_modes(nothing, model(2).linearise, Misregistration()) is None
+
+
+def wrong_by(share, seed=5):
+    """Each column with an error of this share of its norm, of patterns like neighbouring modes."""
+
+    def twist(response):
+        rng = np.random.default_rng(seed)
+        norm = np.linalg.norm(response, axis=0)
+        place = np.arange(response.shape[1])
+        mix = rng.standard_normal((len(place), len(place)))
+        mix *= np.exp(-0.5 * ((place[:, None] - place) / 5.0) ** 2)
+        np.fill_diagonal(mix, 0.0)
+        error = (response / norm) @ mix
+        return response + share * norm * error / np.linalg.norm(error, axis=0)
+
+    return twist
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_what_the_model_leaves_of_each_mode_is_told(share):
+    """Noise of 0.1 of the mean size per slope comes on top; α takes a little of the error."""
+    found = told_by(wrong_by(share))
+    assert found.known.all()
+    assert found.typical_misfit == pytest.approx(np.hypot(share, 0.08), rel=0.15)
+    assert f"{found.typical_misfit:.0%} of their response unexplained" in found.text
+
+
+def test_the_registration_of_a_wrong_model_is_as_sure_as_its_modes_agree():
+    """Over draws of the error α scatters by the σ that one of them tells, in each parameter.
+
+    About its mean: the coarser sampling of the model that is compared moves all draws alike.
+    """
+    found = [told_by(wrong_by(0.3, seed)) for seed in range(12)]
+    vectors = np.array([one.alpha.vector for one in found])
+    sigma = np.array([np.sqrt(np.diag(one.covariance)) for one in found])
+    ratio = np.std(vectors, axis=0, ddof=1) / np.sqrt(np.mean(sigma**2, axis=0))
+    # twelve draws tell a scatter to a fifth of itself
+    assert np.all((ratio > 0.4) & (ratio < 2.0))
+
+
+def test_modes_that_are_explained_well_all_count_alike():
+    alpha, _ = true_response("as a night leaves it")
+    clean = model(4).interaction_matrix(alpha).astype(float)
+    own = np.linalg.pinv(clean[:, :N_CONTROLLED]).astype(np.float32)
+    found = recognise_modes(own, model(2).linearise, Misregistration())
+    assert weights_of_modes(found, np.ones(90)) == ()
+    assert found.model_error is None
+    assert "unexplained" not in found.text
+
+
+def test_modes_that_are_explained_badly_count_less():
+    def twist(response):
+        worse = wrong_by(0.6)(response)
+        return np.where(np.arange(response.shape[1]) < 30, wrong_by(0.15)(response), worse)
+
+    found = told_by(twist)
+    weights = np.array(weights_of_modes(found, np.ones(90)))
+    assert np.median(weights[:30]) > 3.0 * np.median(weights[30:N_CONTROLLED])
+    # those that it does not control are taken for no better than the worst of its own
+    assert weights[N_CONTROLLED:].max() < np.median(weights[:30])
+
+
+def test_what_is_left_over_makes_the_measured_response_of_the_models_own():
+    """The gate judges a matrix on it."""
+    _, response = true_response("as a night leaves it")
+    measured = wrong_by(0.3)(response)
+    own = np.linalg.pinv(measured[:, :N_CONTROLLED]).astype(np.float32)
+    found = recognise_modes(own, model(2).linearise, Misregistration())
+    near = model(2).linearise(found.alpha)
+    there = left_over(own, found, near.matrix).added_to(near)
+    gain = np.median(found.response)
+    np.testing.assert_allclose(
+        there.matrix[:, :N_CONTROLLED],
+        measured[:, :N_CONTROLLED] / gain,
+        atol=2e-3 * np.abs(measured).max(),
+    )
+    np.testing.assert_array_equal(there.matrix[:, N_CONTROLLED:], near.matrix[:, N_CONTROLLED:])
+    none = LeftOver(columns=np.arange(0), slopes=np.zeros((len(own[0]), 0), np.float32))
+    np.testing.assert_array_equal(none.added_to(near).matrix, near.matrix)

@@ -327,3 +327,10 @@ def test_the_state_on_the_network_is_short_and_in_boundary_units():
 
 
 # ---------------------------------------------------------------- losses
+
+
+def test_what_keeps_a_matrix_from_being_made_is_waited_for():
+    state = tracker_state(system="small", hindrance="Mode 30 does not answer.")
+    found = waits(link(*WELL), state)["new-matrix"]
+    assert (found.responsible, found.blocks) == (Responsible.OPERATOR, False)
+    assert found.text == "Mode 30 does not answer."

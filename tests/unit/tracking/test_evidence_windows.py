@@ -135,6 +135,57 @@ def test_while_alpha_is_not_known_the_capture_range_is_about_the_nominal_rotatio
     assert not story.state.operations.acquisition.under_way
 
 
+FAR = Misregistration(rotation_rad=np.deg2rad(5.0))
+
+
+def test_windows_far_from_their_start_that_agree_are_used_while_alpha_is_unknown(story):
+    """The third: a bench that is turned by more than a window captures."""
+    story.see(FAR, n_windows=2, unexplained=np.full(4, 0.3))
+    assert story.state.alpha.registration is None
+    story.see(moved(FAR, shift_x_subap=0.004), unexplained=np.full(4, 0.3))
+    known = story.state.alpha.registration
+    assert known.alpha.rotation_rad == pytest.approx(FAR.rotation_rad)
+    assert story.state.alpha.far_windows == ()
+
+
+@pytest.mark.parametrize("share", [0.6, None])
+def test_far_windows_that_the_model_does_not_explain_are_never_used(story, share):
+    """Modes in another order lead every window to the same wrong place."""
+    unexplained = None if share is None else np.full(4, share)
+    story.see(FAR, n_windows=8, unexplained=unexplained)
+    assert story.state.alpha.registration is None
+
+
+def test_far_windows_that_disagree_are_never_used(story):
+    for k in range(8):
+        far = moved(FAR, shift_x_subap=0.1 * (k % 2))
+        story.see(far, unexplained=np.full(4, 0.1))
+    assert story.state.alpha.registration is None
+
+
+def test_a_known_alpha_is_not_moved_by_far_windows_that_agree(story):
+    story.see(n_windows=2)
+    story.see(FAR, n_windows=4, unexplained=np.full(4, 0.1))
+    assert story.state.alpha.registration.alpha.rotation_rad == pytest.approx(ALPHA.rotation_rad)
+
+
+def test_fits_begin_where_the_rtcs_own_matrix_was_measured(story):
+    recognised = ev.ModesRecognised(id="initial", strange=(), text="all", alpha=FAR)
+    story.tell(recognised)
+    story.see(moved(FAR, rotation_rad=0.01))
+    known = story.state.alpha.registration
+    assert known.alpha.rotation_rad == pytest.approx(FAR.rotation_rad + 0.01)
+
+
+def test_the_model_error_that_the_own_matrix_tells_is_in_sigma_of_weak_windows_too(story):
+    own = (0.02, 0.03, 0.004, 0.005)
+    story.tell(ev.ModesRecognised(id="initial", strange=(), text="all", model_error=own))
+    weak = np.diag(np.maximum(np.diag(PRECISE), (1.1 * story.policy.dither_sigma) ** 2))
+    story.see(n_windows=3, covariance=weak)
+    floor = story.state.alpha.registration.floor
+    np.testing.assert_allclose(floor, np.hypot(story.policy.floor, own))
+
+
 def test_misaligned_columns_are_an_alarm_until_a_window_is_good_again(story):
     story.tell(ev.WindowFitted(estimate=estimate(lag_frames=np.full(4, -0.5))))
     assert "columns-misaligned" in story.alarms

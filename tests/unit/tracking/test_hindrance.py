@@ -1,0 +1,101 @@
+"""What keeps a wanted reconstructor from being made is in the state, with what to change."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.tracking import events as ev
+from service.tracking.mode_limits import ModeProof
+from service.tracking.mode_proof import awaits_proof
+from service.tracking.state import Mode
+from service.tracking.step_context import StepContext
+from tests.states import changed
+from tests.unit.tracking.situations import POLICY, PRECISE, Story, rtc
+
+
+def hindrance(story):
+    return story.state.matrices.hindrance
+
+
+def test_nothing_hinders_a_service_that_has_just_begun():
+    assert hindrance(Story().meet()) == ""
+
+
+def test_a_dither_that_the_settings_forbid_is_named():
+    story = Story(policy=replace(POLICY, dither_enabled=False)).meet()
+    assert "[dither] enabled" in hindrance(story)
+
+
+def test_windows_that_give_no_registration_are_named_with_their_reason():
+    story = Story().meet()
+    for _ in range(3):
+        story.see(covariance=PRECISE * 1e4)
+    assert "too uncertain" in hindrance(story)
+
+
+def test_an_alarm_that_forbids_sending_is_named():
+    story = Story().meet()
+    story.tell(ev.ConditionChanged(name="matrix-mismatch", text="mode 10 has the other sign"))
+    story.tell(ev.Tick(), after_s=1.0)
+    assert "matrix-mismatch" in hindrance(story)
+    story.tell(ev.ConditionChanged(name="matrix-mismatch", text="over", over=True))
+    story.tell(ev.Tick(), after_s=1.0)
+    assert hindrance(story) == ""
+
+
+def test_an_invalid_registration_is_named_with_the_settings_that_make_it_surer():
+    story = Story().meet()
+    story.see(n_windows=2)
+    known = story.state.alpha.registration
+    wide = replace(known, covariance=np.diag(POLICY.useless_sigma**2) * 4.0)
+    story.state = changed(story.state, registration=wide)
+    story.tell(ev.Tick(), after_s=1.0)
+    assert "budget_m" in hindrance(story)
+
+
+class Unseen(Story):
+    all_shown = False
+
+
+def test_modes_that_no_dither_may_show_are_named():
+    story = Unseen().meet()
+    story.see(n_windows=2)
+    story.policy = replace(POLICY, dither_enabled=False)
+    story.tell(ev.Tick(), after_s=1.0)
+    assert "has not been shown" in hindrance(story)
+
+
+def test_a_mode_that_answers_otherwise_is_named():
+    story = Unseen().meet()
+    story.see(n_windows=2)
+    proof = ModeProof(proven=frozenset(range(420)), contrary=frozenset({420}))
+    story.state = changed(story.state, mode_proof=proof)
+    story.tell(ev.Tick(), after_s=1.0)
+    assert "Mode 420 does not answer" in hindrance(story)
+
+
+def test_in_hold_nothing_is_wanted():
+    story = Story(Mode.HOLD, policy=replace(POLICY, dither_enabled=False)).meet()
+    assert hindrance(story) == ""
+
+
+@pytest.mark.parametrize("modes", [None, (20, 22, 24, 26)])
+def test_modes_that_the_settings_dither_leave_the_proof_of_others_on(modes):
+    story = Unseen(policy=replace(POLICY, dither_modes=modes)).meet()
+    view = rtc()
+    context = StepContext(story.state, story.policy, story.now_ns)
+    assert awaits_proof(context, view)
+
+
+def test_not_found_names_order_and_signs_only_where_the_own_matrix_does_not_deny_it():
+    for recognised, said in ((False, "in another order"), (True, "are not the cause")):
+        story = Story(policy=replace(POLICY, acquires=True)).meet()
+        if recognised:
+            event = ev.ModesRecognised(id="initial", strange=(), text="all", response=1.0)
+            story.tell(event)
+        story.state = changed(story.state, holds=True)
+        for _ in range(8):
+            story.see(replace(story.policy.start, rotation_rad=1.0))
+        text = {a.name: a.text for a in story.state.alarms.active}["registration-not-found"]
+        assert said in text

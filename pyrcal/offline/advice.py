@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.alternatives import Alternative, moved_words, preference
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import left_over
-from pyrcal.offline.verdict import CANNOT_TELL, MOST_STRUCTURE, Refusal
+from pyrcal.offline.verdict import CANNOT_TELL, Refusal
 
 Array = NDArray[np.float64]
 
@@ -82,17 +82,12 @@ def recommendation(fit: Fit, grounds: Grounds) -> str:
         return _of_refused(fit, grounds)
     radius = _radius(fit)
     edge = float(_at_edge(fit.sigma, radius))
-    if edge > ENOUGH_SUBAP:
-        return (
-            f"{Advice.MEASURE_MORE}: at the pupil's edge the mirror is known to {edge:.3f} "
-            f"subapertures (1 sigma), {ENOUGH_SUBAP:g} is enough; average more, or push more modes"
-        )
-    for other in fit.alternatives:
-        if other.undecided and _at_edge(other.moved, radius) > ENOUGH_SUBAP:
-            return (
-                f"{Advice.MEASURE_MORE}: the matrix cannot tell {other.words} from what the file "
-                f"says, which would move {moved_words(other.moved)}; push more modes"
-            )
+    control = fit.reconstructor
+    if control is not None and not control.usable:
+        return f"{Advice.MEASURE_MORE}: the reconstructor is not stable: {control.reason}"
+    # a model that holds every loop of the measured matrix is good enough, whatever sigma
+    if edge > ENOUGH_SUBAP and not (control is not None and control.holds):
+        return f"{Advice.MEASURE_MORE}: {_uncertain(fit, edge, radius)}"
     if grounds.n_sets < FEWEST_SETS:
         return (
             f"{Advice.MEASURE_MORE}: too few modes ({len(fit.modes)}) to check each other; push "
@@ -101,10 +96,31 @@ def recommendation(fit: Fit, grounds: Grounds) -> str:
     if grounds.columns:
         return f"{Advice.USE} for the registration alone: {'; '.join(grounds.columns)}"
     known = f"the mirror is known to {edge:.2g} subapertures at the pupil's edge (1 sigma)"
+    if control is not None and not control.holds:
+        known = f"{known}; the reconstructor is {control.reason}"
     corrections = ", ".join(_corrections(fit))
     if corrections:
         return f"{Advice.USE}, and correct the instrument file ({corrections}): {known}"
     return f"{Advice.USE}: {known}"
+
+
+def _uncertain(fit: Fit, edge: float, radius: float) -> str:
+    """Return how uncertain the registration is, and what would make it less so."""
+    known = (
+        f"at the pupil's edge the mirror is known to {edge:.3f} subapertures (1 sigma), "
+        f"{ENOUGH_SUBAP:g} is enough"
+    )
+    found = fit.registration
+    if found is None or _at_edge(found.sigma_statistical, radius) > 0.7 * edge:
+        return f"{known}; average more, or push more modes"
+    counted = [one for one in fit.alternatives if one.sigma_share > 0.0]
+    most = max(counted, key=lambda one: _at_edge(one.moved, radius), default=None)
+    if most is None or _at_edge(most.moved, radius) < 0.5 * edge:
+        return f"{known}; the model differs from the bench, and more averaging does not help"
+    return (
+        f"{known}; the matrix cannot tell {most.words} from what the file says, which would move "
+        f"it by {moved_words(most.moved)}"
+    )
 
 
 def _of_refused(fit: Fit, grounds: Grounds) -> str:
@@ -116,7 +132,7 @@ def _of_refused(fit: Fit, grounds: Grounds) -> str:
                 f"{Advice.MEASURE_MORE}: two registrations explain the matrix nearly as well; push "
                 "more modes, or say where the mirror is (--start)"
             )
-        case Refusal.UNEXPLAINED if grounds.structure <= MOST_STRUCTURE:
+        case Refusal.UNEXPLAINED if grounds.structure < 0.5 * fit.residual_fraction:
             return (
                 f"{Advice.MEASURE_MORE}: {fit.residual_fraction:.0%} of the signal is noise; "
                 "average more, or push further"
@@ -130,8 +146,8 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
         return grounds.gains[0]
     if grounds.columns and grounds.refusal is not Refusal.AXES:
         return "; ".join(grounds.columns)
-    best = next((one for one in fit.alternatives if one.preferred and one.share is not None), None)
-    if best is not None and grounds.refusal in {Refusal.ANOTHER_INSTRUMENT, Refusal.NO_CAUSE}:
+    best = _best_to_correct(fit)
+    if best is not None and grounds.refusal is Refusal.ANOTHER_INSTRUMENT:
         if CANNOT_TELL in fit.verdict:
             return fit.verdict.rpartition("better: ")[2]
         return (
@@ -139,8 +155,6 @@ def _cause(fit: Fit, grounds: Grounds) -> str:
             "again"
         )
     left = fit.left_over
-    if grounds.refusal is Refusal.NO_CAUSE and left is not None and left.subapertures:
-        return left.words
     if grounds.refusal is Refusal.DIVIDED and left is not None and left.modes:
         return f"{left.words}; measure these again, or leave them out (--modes)"
     return fit.verdict.removeprefix("refused: ").partition(";")[0]
@@ -151,6 +165,19 @@ def _corrections(fit: Fit) -> Iterator[str]:
     for one in fit.origins:
         if one.correct:
             yield f"{one.key} = {one.found}"
+    best = _best_to_correct(fit)
+    if best is not None:
+        yield best.key
+
+
+def _best_to_correct(fit: Fit) -> Alternative | None:
+    """Return the preferred alternative that leaves least and has a key, or None."""
+    found = [
+        one
+        for one in fit.alternatives
+        if one.preferred and one.key and one.share is not None and one.share < 1.0
+    ]
+    return min(found, key=lambda one: one.share or 0.0, default=None)
 
 
 def _radius(fit: Fit) -> float:

@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.disjoint_sets import SIGNIFICANT
 from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
 from pyrcal.offline.methods import Settled
 from pyrcal.offline.models import BETTER, FAR_BETTER, Optic
-from pyrcal.offline.pupil_checks import Few, TriedPupil, gain_maps
+from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil, gain_maps
+from pyrcal.offline.uncertainty import OTHER_SHARE
 from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import BOUNDARY_SCALE
 
@@ -34,6 +36,9 @@ telescope, a tenth of the shift looks like an offset."""
 
 LEAST_OFFSET = 0.01
 """RMS share of the signal that an offset of the pupil has to explain."""
+
+EXCLUDED = 3.0
+"""An explanation is excluded where it is worse by this many σ of the difference."""
 
 NOTABLE_AXES = 0.02
 """Of the gain of Sx over that of Sy, less 1."""
@@ -67,6 +72,20 @@ class Alternative:
 
     undecided: bool = False
     """Whether the matrix cannot tell the two apart."""
+
+    key: str = ""
+    """What to write into the instrument file, or the option that tries it; empty: it has none."""
+
+    counts: bool = False
+    """Whether it is another explanation, whose move is an error of the registration until it is
+    excluded; other weights and sets of modes are none."""
+
+    @property
+    def sigma_share(self) -> float:
+        """Part of the square of its move that is in the systematic part of σ: 0 to 1."""
+        if not self.counts:
+            return 0.0
+        return 1.0 if self.preferred else OTHER_SHARE if self.undecided else 0.0
 
 
 def alternatives(
@@ -150,9 +169,11 @@ def _of_rival(rival: Rival) -> Alternative:
     return Alternative(
         words=rival.change.words,
         share=rival.share,
-        moved=rival.estimate,
+        moved=rival.moved,
         preferred=rival.believed,
-        undecided=not rival.believed and rival.share < 1.0 / BETTER,
+        undecided=not rival.believed and is_open(rival.lead),
+        key=rival.change.words,
+        counts=True,
     )
 
 
@@ -160,7 +181,19 @@ def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
     """Return another pupil, unless it is among the rivals already."""
     if any(one.words == rival.change.words for rival in others):
         return None
-    return Alternative(words=one.words, share=one.share, moved=one.moved)
+    return Alternative(
+        words=one.words,
+        share=one.lead.share,
+        moved=one.moved,
+        undecided=is_open(one.lead),
+        key=one.words,
+        counts=True,
+    )
+
+
+def is_open(lead: Lead) -> bool:
+    """Return whether the data do not exclude an explanation: it is not significantly worse."""
+    return lead.significance > -EXCLUDED
 
 
 def _off_centre(few: Few) -> Iterator[Alternative]:
@@ -175,17 +208,25 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
         rates.append((few.matrix(few.of(beside)) - few.own) / OFFSET_STEP_SUBAP)
     if not all(few.tells(few.own, rate) for rate in rates):
         return
-    (x, y), share, moved = _fitted_as_well(few, *rates)
-    explained = few.residual_fraction * float(np.sqrt(max(1.0 - share, 0.0)))
+    (x, y), lead, moved = _fitted_as_well(few, *rates)
+    explained = few.residual_fraction * float(np.sqrt(max(1.0 - lead.share, 0.0)))
     off = float(np.hypot(x, y))
     shift = float(np.hypot(*alpha.vector[:2])) if about.stop is Stop.MIRROR else 0.0
     notable = max(NOTABLE_OFFSET_SUBAP, NOTABLE_OFFSET_SHARE * shift)
     middle = "mirror's" if about.stop is Stop.MIRROR else "sensor's"
     yield Alternative(
         words=f"the pupil {x:+.2f}, {y:+.2f} subapertures off the {middle} middle",
-        share=share,
+        share=lead.share,
         moved=moved,
-        preferred=share < FAR_BETTER and off > notable and explained > LEAST_OFFSET,
+        preferred=bool(
+            lead.share < FAR_BETTER
+            and lead.significance > SIGNIFICANT
+            and off > notable
+            and explained > LEAST_OFFSET
+        ),
+        undecided=is_open(lead),
+        key="pupil, or valid_subapertures, centred",
+        counts=True,
     )
 
 
@@ -195,22 +236,33 @@ def _axes_apart(few: Few) -> Iterator[Alternative]:
         return
     half = len(few.own) // 2
     rate = np.concatenate([few.own[:half], -few.own[half:]])
-    (value,), share, moved = _fitted_as_well(few, rate)
+    (value,), lead, moved = _fitted_as_well(few, rate)
     apart = float((1.0 + value) / (1.0 - value)) - 1.0
     side = "stronger" if apart > 0.0 else "weaker"
     yield Alternative(
         words=f"Sx {abs(apart):.1%} {side} than Sy",
-        share=share,
+        share=lead.share,
         moved=moved,
-        preferred=share < BETTER and abs(apart) > NOTABLE_AXES,
+        preferred=bool(
+            lead.share < BETTER and lead.significance > SIGNIFICANT and abs(apart) > NOTABLE_AXES
+        ),
+        undecided=is_open(lead),
+        counts=True,
     )
 
 
 def _uneven_light(few: Few) -> Iterator[Alternative]:
     """Yield that a smooth gain over the pupil is common to all modes."""
     maps = [pattern[:, None] * few.own for pattern in gain_maps(few)]
-    _, share, moved = _fitted_as_well(few, *maps)
-    yield Alternative(words="uneven light (--gain-map)", share=share, moved=moved)
+    _, lead, moved = _fitted_as_well(few, *maps)
+    yield Alternative(
+        words="uneven light (--gain-map)",
+        share=lead.share,
+        moved=moved,
+        undecided=is_open(lead),
+        key="--gain-map",
+        counts=True,
+    )
 
 
 def _wavelength(few: Few) -> Iterator[Alternative]:
@@ -228,11 +280,10 @@ def _wavelength(few: Few) -> Iterator[Alternative]:
     )
 
 
-def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, float, Array]:
-    """Return the values of more unknowns, χ² over what is without them, and α's move."""
-    seen = few.seen(few.own, *rates)
-    step, share = seen.best_step, _ratio(seen.chi_at_best, few.left(few.own))
-    return step[-len(rates) :], share, step[:4] - few.step(few.own)[:4]
+def _fitted_as_well(few: Few, *rates: Array) -> tuple[Array, Lead, Array]:
+    """Return the values of more unknowns, their lead over the fit without, and α's move."""
+    step = few.step(few.own, *rates)
+    return step[-len(rates) :], few.lead(few.own, *rates), step[:4] - few.step(few.own)[:4]
 
 
 def _ratio(chi: float, own: float) -> float:

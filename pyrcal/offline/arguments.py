@@ -209,6 +209,12 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     add(
         fit,
         words("--gain-map", "also fit a smooth gain over the pupil"),
+        words(
+            "--gain G",
+            "integrator gain of the loop that the reconstructor is checked in",
+            type=float,
+            default=0.5,
+        ),
         words("--no-anamorphosis", "take the image for as stretched as the instrument file says"),
         words("--anamorphosis", "as without it: the stretch is always fitted"),
         words("--memory-gb GB", _MEMORY, type=_memory_gb, default=6.0),

@@ -42,6 +42,7 @@ def main(options: argparse.Namespace) -> int:
         modes=options.modes,
         start=options.start,
         gain_map=options.gain_map,
+        gain=options.gain,
         anamorphosis=not options.no_anamorphosis,
         illumination=None if light is None else light.illumination,
     )

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.alternatives import moved_words
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport, orientation_words, verdict_line
@@ -27,6 +28,9 @@ _FAR_GAIN = 0.2
 
 _NAMED = 8
 
+_TERMS = 3
+"""Explanations in the systematic part of σ that are listed."""
+
 
 def table(report: FitReport) -> str:
     """Return what to do, the verdict, the registration and what it rests on, as text."""
@@ -34,6 +38,7 @@ def table(report: FitReport) -> str:
     lines = [
         *([fit.recommendation] if fit.recommendation else []),
         verdict_line(fit),
+        *_two_verdicts(fit),
         "",
         *_registration(fit),
         "",
@@ -42,6 +47,13 @@ def table(report: FitReport) -> str:
         *(f"note: {note}" for note in report.notes if not _said_before(note, fit)),
     ]
     return "\n".join(shown(line) for line in lines)
+
+
+def _two_verdicts(fit: Fit) -> Iterator[str]:
+    if fit.registration is not None:
+        yield f"registration: {'' if fit.registration.determined else 'not '}determined"
+    if fit.reconstructor is not None:
+        yield f"reconstructor: {fit.reconstructor.reason}"
 
 
 def _said_before(note: str, fit: Fit) -> bool:
@@ -55,14 +67,16 @@ def _said_before(note: str, fit: Fit) -> bool:
 
 
 def _registration(fit: Fit) -> Iterator[str]:
-    yield f"{'':15s}{'value':>11s}{'1 sigma':>11s}{'subsets':>11s}"
+    found = fit.registration
+    parts = () if found is None else (found.sigma_statistical, found.sigma_systematic)
+    columns = ("value", "1 sigma", *(("statistical", "systematic") if parts else ()), "subsets")
+    yield f"{'':15s}" + "".join(f"{name:>12s}" for name in columns)
     values = fit.alpha.vector * BOUNDARY_SCALE
     sigma = fit.sigma * BOUNDARY_SCALE
     scatter = fit.subset_scatter * BOUNDARY_SCALE
-    for (name, unit, decimals), value, one, spread in zip(
-        _ROWS, values, sigma, scatter, strict=True
-    ):
-        numbers = "".join(_number(number, decimals) for number in (value, one, spread))
+    listed = (values, sigma, *(part * BOUNDARY_SCALE for part in parts), scatter)
+    for (name, unit, decimals), *row in zip(_ROWS, *listed, strict=True):
+        numbers = "".join(_number(number, decimals) for number in row)
         yield f"{name:15s}{numbers}  {unit}"
 
 
@@ -72,7 +86,7 @@ def _anamorphosis(found: NDArray[np.float64], sigma: NDArray[np.float64]) -> str
 
 
 def _number(value: float, decimals: int) -> str:
-    return f"{value:11.{decimals}f}" if np.isfinite(value) else f"{'-':>11s}"
+    return f"{value:12.{decimals}f}" if np.isfinite(value) else f"{'-':>12s}"
 
 
 def _basis(report: FitReport) -> Iterator[str]:
@@ -121,6 +135,9 @@ def _alternatives(fit: Fit) -> Iterator[str]:
     yield f"{'rivals':20s}{len(tried)} tried, {named}"
     open_ = [one for one in tried if one.undecided]
     weights = [one for one in tried if one.share is None]
+    counted = [one for one in tried if one.sigma_share > 0.0]
+    for one in sorted(counted, key=lambda one: -float(np.max(np.abs(one.moved / sigma))))[:_TERMS]:
+        yield f"{'  in systematic':20s}{one.words}: {moved_words(one.moved)}"
     for words, group in (
         ("as likely: would move it by up to", open_),
         ("other weights and modes: by up to", weights),

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative
+from pyrcal.offline.control_check import ReconstructorVerdict
+from pyrcal.offline.disjoint_sets import DisjointSets
 from pyrcal.offline.instrument_checks import FoundOptic
 from pyrcal.offline.left_over import LeftOver
 from pyrcal.offline.methods import ScanStep
@@ -20,6 +22,26 @@ from service.model.slopes import Orientation
 
 TOLD = 0.5
 """1 σ of an anamorphosis over what is expected of any, below which modes tell of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration:
+    """Whether the registration is determined, and the two parts of its σ."""
+
+    determined: bool
+    """Whether the data determine it; the same as ``Fit.accepted``."""
+
+    reason: str
+    """Why, or why not, in one sentence."""
+
+    sigma_statistical: NDArray[np.float64]
+    """``(4,)`` 1 σ from noise and the scatter of disjoint sets, numeric units."""
+
+    sigma_systematic: NDArray[np.float64]
+    """``(4,)`` 1 σ from errors of the model and explanations that the data do not exclude."""
+
+    sets: tuple[DisjointSets, ...] = ()
+    """Disjoint sets of modes, actuators and subapertures, each fitted alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,7 +116,13 @@ class Fit(Determination):
     """What of the instrument was fitted, too: coupling or width, modulation."""
 
     alternatives: tuple[Alternative, ...] = ()
-    """What else might explain the matrix, and how far it would move α; empty: not asked for."""
+    """What else might explain the matrix, and how far it would move α."""
+
+    registration: Registration | None = None
+    """Whether the registration is determined, and how well; None of a fit made by hand."""
+
+    reconstructor: ReconstructorVerdict | None = None
+    """Whether a reconstructor of the model holds the loop of the measured matrix; None as above."""
 
     origins: tuple[Origin, ...] = ()
     """What of the instrument was found rather than told."""

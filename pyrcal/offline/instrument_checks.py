@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.disjoint_sets import SIGNIFICANT
 from pyrcal.offline.methods import Settled
-from pyrcal.offline.models import BETTER, FAR_BETTER, FitModels, Optic, Other
-from pyrcal.offline.pupil_checks import Few, TriedPupil
+from pyrcal.offline.models import FAR_BETTER, FitModels, Optic, Other
+from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil
 from pyrcal.offline.solver import refine
 from pyrcal.offline.uncertainty import Uncertainty
 
@@ -25,6 +26,11 @@ COUPLING_KEY = "coupling"
 
 NOTABLE = 0.03
 """A logarithm of the instrument's that differs by less from the file's is not worth a word."""
+
+MIN_EXPLAINED = 0.005
+"""RMS share of the signal that another instrument has to explain to be believed. What models of the
+same instrument differ by is of that size: with OOPAO's own Shack-Hartmann 0.2 % is left over, and
+another stop, by chance of the model's errors, explains 0.12 %."""
 
 NOTABLE_SIGMA = 3.0
 """... nor one that differs by less than this many of its own σ."""
@@ -37,20 +43,31 @@ class Rival:
     change: Other
     """What to write into the file."""
 
-    share: float
-    """χ² that it leaves, over what this one leaves."""
+    lead: Lead
+    """How much better it explains the matrix than this one."""
 
     moved: Array
-    """``(4,)`` by how much the registration would be another, where the matrix cannot tell the two
-    instruments apart, numeric units; 0 where it can."""
+    """``(4,)`` by how much the registration would be another, numeric units."""
 
-    estimate: Array
-    """``(4,)`` the same, to first order, whether it can or not."""
+    explained: float
+    """RMS share of the signal that it explains and this one does not."""
+
+    @property
+    def share(self) -> float:
+        """χ² that it leaves, over what this one leaves."""
+        return self.lead.share
 
     @property
     def believed(self) -> bool:
-        """Whether it is the instrument, rather than the one of the file."""
-        return self.share < self.change.believed
+        """Whether it is the instrument, rather than the one of the file.
+
+        It leaves clearly less, by more than chance, and by more than models differ anyway.
+        """
+        return (
+            self.share < self.change.believed
+            and self.lead.significance > SIGNIFICANT
+            and self.explained > MIN_EXPLAINED
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,29 +138,27 @@ class AsTold:
 def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[Rival, ...]:
     """Return other instruments, the one that explains the matrix best first.
 
-    Each is allowed its own registration, coupling and sensor, to first order about those found;
-    where the matrix cannot tell, it is fitted as well.
+    Each is allowed its own registration, coupling and sensor, to first order about those found.
     """
-    solution, own = settled.solution, few.left(few.own)
+
+    def explained(lead: Lead) -> float:
+        return float(settled.share * np.sqrt(max(1.0 - lead.share, 0.0)))
+
     found = [
         Rival(
             change=Other(words=one.words, believed=FAR_BETTER),
-            share=one.share,
+            lead=one.lead,
             moved=one.moved,
-            estimate=one.moved,
+            explained=explained(one.lead),
         )
         for one in pupils
         if one.explains
     ]
     for change, other in settled.models.other_instruments.items():
-        seen = few.seen(few.matrix(other))
-        share, moved = seen.chi_at_best / own, np.zeros(4)
-        estimate = seen.best_step[:4] - few.step(few.own)[:4]
-        if change.believed <= share < 1.0 / BETTER:
-            there = refine(other, settled.target, solution.alpha, settled.nuisances)
-            moved = there.vector - solution.vector if there.converged else moved
-            estimate = moved if there.converged else estimate
-        found.append(Rival(change=change, share=share, moved=moved, estimate=estimate))
+        matrix = few.matrix(other)
+        lead = few.lead(matrix)
+        moved = few.step(matrix)[:4] - few.step(few.own)[:4]
+        found.append(Rival(change=change, lead=lead, moved=moved, explained=explained(lead)))
     return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
 
 

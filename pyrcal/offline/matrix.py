@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,12 @@ from numpy.typing import NDArray
 from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
 from pyrcal.offline.alternatives import alternatives, off_centre
 from pyrcal.offline.columns import displaced_columns, strange_columns
-from pyrcal.offline.fitted import Fit
+from pyrcal.offline.control_check import GAIN, check_control
+from pyrcal.offline.disjoint_sets import mode_partitions, pupil_partitions
+from pyrcal.offline.fitted import Fit, Registration
 from pyrcal.offline.gain_causes import gain_causes
 from pyrcal.offline.instrument_checks import (
+    MIN_EXPLAINED,
     as_told,
     doubt_of_width,
     found_optics,
@@ -33,7 +37,7 @@ from pyrcal.offline.methods import (
 from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
 from pyrcal.offline.origins import origins
-from pyrcal.offline.pupil_checks import LEAST_EXPLAINED, Few, left_by_light, tried_pupils
+from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
 from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
@@ -41,13 +45,21 @@ from pyrcal.offline.solver import IMAGE_SIGMA_PX, image_patterns, nuisances_of
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
+    OTHER_SHARE,
     pupil_regions,
     uncertainty,
 )
 from pyrcal.offline.verdict import FitFindings, judged
 from service.errors import ModelError
-from service.estimation.orientation import DOUBTFUL, MIN_CORRELATION, find_orientation, overruled
-from service.estimation.reference import Reference, Target, target_of
+from service.estimation.orientation import (
+    DOUBTFUL,
+    MIN_CORRELATION,
+    MIN_LEAD,
+    Search,
+    find_orientation,
+    overruled,
+)
+from service.estimation.reference import Reference, Target, is_by_actuator, target_of
 from service.model.instrument import Instrument
 from service.model.kinds import Method, Normalisation
 from service.model.misregistration import Misregistration
@@ -87,7 +99,10 @@ class FitOptions:
     """Measured light of the beam, in the axes of conventions.md; None: even."""
 
     explain: bool = False
-    """Whether rival explanations are tried, and causes of gains that are far from 1 looked for."""
+    """Whether causes of gains that are far from 1, and of columns out of place, are looked for."""
+
+    gain: float = GAIN
+    """Integrator gain of the loop that the reconstructor is checked in."""
 
 
 def fit_matrix(
@@ -158,7 +173,7 @@ def _fitted(
     reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
     )
-    slopes, rotation_rad, untold = _axes(instrument, usable, used, options, mapper)
+    slopes, pose, untold = _axes(instrument, usable, used, options, mapper)
     instrument = replace(instrument, slopes=slopes)
     target = target_of(usable, instrument)
     models = FitModels(
@@ -168,12 +183,10 @@ def _fitted(
     if options.start is not None:
         start = options.start
     else:
-        start = instrument.start
-        if rotation_rad is not None:
-            start = replace(start, rotation_rad=rotation_rad)
+        start = pose if pose is not None else instrument.start
     found = _found(models, target, instrument.with_anamorphosis(start), options)
     tell("verdict")
-    fit = _answer(models, found, usable, untold, reported, explain=options.explain)
+    fit = _answer(models, found, usable, untold, reported, options)
     if options.explain and not fit.accepted:
         columns = displaced_columns(
             replace(instrument, slopes=reported), usable, used, mapper=mapper
@@ -219,28 +232,54 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
     )
 
 
+FAR_SUBAP = 2.0
+"""Shift at which the orientation is looked for again where none explains the lowest orders."""
+
+
+EQUIVALENT = 0.02
+"""Difference of two correlations that rounding of the angles makes."""
+
+
 def _axes(
     instrument: Instrument, usable: Reference, basis: Basis, options: FitOptions, mapper: Mapper
-) -> tuple[SlopeRecipe, float | None, str]:
-    """Return how slopes are listed, as stated or found, the rotation found, why it is not sure.
+) -> tuple[SlopeRecipe, Misregistration | None, str]:
+    """Return how slopes are listed, as stated or found, where to begin, why it is not sure.
 
-    The search also tells the rotation, so it is spared only when a start is given too.
+    The search also tells the rotation, so it is spared only when a start is given too. It is made
+    about the start, for a mirror that is subapertures away shows other lowest orders.
     """
     stated = options.orientation or instrument.slopes.orientation
     slopes = replace(instrument.slopes, orientation=stated)
     if stated is not None and options.start is not None:
         return slopes, None, ""
-    search = find_orientation(replace(instrument, slopes=slopes), usable, basis, mapper=mapper)
+    about = options.start or instrument.start
+
+    def search_about(place: Misregistration, setting: Orientation | None) -> Search:
+        seen = replace(instrument, slopes=replace(slopes, orientation=setting))
+        return find_orientation(seen, usable, basis, mapper=mapper, about=place)
+
+    search = search_about(about, stated)
+    if options.start is None and search.best.correlation < DOUBTFUL:
+        corners = [
+            about.moved_to(about.vector + FAR_SUBAP * np.array([x, y, 0.0, 0.0]))
+            for x, y in product((-1.0, 0.0, 1.0), repeat=2)
+            if x or y
+        ]
+        far = {place: search_about(place, stated) for place in corners}
+        most = max(one.best.correlation for one in far.values())
+        # turned by half, axes and all, the same mirror lies at the opposite shift
+        alike = [one for one in far if far[one].best.correlation > most - EQUIVALENT]
+        place = min(alike, key=lambda one: far[one].best.effort)
+        if far[place].best.correlation > search.best.correlation + 2.0 * MIN_LEAD:
+            about, search = place, far[place]
     best = search.best
     sure = best.correlation >= MIN_CORRELATION
-    rotation_rad = best.rotation_rad if sure else None
+    pose = replace(about, rotation_rad=best.rotation_rad) if sure else None
     if stated is None:
-        return best.slopes, rotation_rad, search.refusal
+        return best.slopes, pose, search.refusal
     if best.correlation >= DOUBTFUL:
-        return best.slopes, rotation_rad, ""
-    free = replace(instrument, slopes=replace(slopes, orientation=None))
-    other = find_orientation(free, usable, basis, mapper=mapper).best
-    return best.slopes, rotation_rad, overruled(best, other)
+        return best.slopes, pose, ""
+    return best.slopes, pose, overruled(best, search_about(about, None).best)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -292,8 +331,7 @@ def _answer(
     usable: Reference,
     untold: str,
     reported: SlopeRecipe,
-    *,
-    explain: bool,
+    options: FitOptions,
 ) -> Fit:
     settled = found.settled
     solution, target, models = settled.solution, settled.target, settled.models
@@ -303,14 +341,14 @@ def _answer(
     regions = pupil_regions(target.valid, slopes.kind.n_planes)[target.rows]
     residual_fraction = settled.share
     few = Few(settled)
-    # less than a pupil would have to explain is of interest to whoever wants to see all that is not
-    pupils = tried_pupils(few) if explain or residual_fraction >= LEAST_EXPLAINED else ()
+    pupils = tried_pupils(few)
     others = rivals(settled, few, pupils)
     power = np.sum(target.matrix[target.rows] ** 2, axis=0)
     noise = None if usable.noise is None else usable.noise / usable.passes
     structured = structure(seen.residual, power, noise)
     by_light = residual_fraction**2 * (1.0 - left_by_light(few))
-    sure = uncertainty(
+    n_planes = slopes.kind.n_planes
+    before = uncertainty(
         seen,
         values,
         nuisances.prior,
@@ -321,17 +359,26 @@ def _answer(
         if slopes.normalisation is Normalisation.LOCAL
         else MAGNIFICATION_FLOOR,
         residual_fraction=residual_fraction,
-        doubt=np.array([doubt_of_width(settled, few), *(rival.moved for rival in others)]),
+        mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
+        pupil_sets=pupil_partitions(target.valid, n_planes, target.rows),
     )
-    optics = found_optics(as_in_file, settled, sure)
+    optics = found_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)
     without = as_told(as_in_file, settled) if any(one.notable for one in optics) else None
+    tried = alternatives(settled, few, others, pupils, optics, without)
+    sure = before.with_moves(
+        np.array([doubt_of_width(settled, few), *(one.moved for one in tried)]),
+        np.array([OTHER_SHARE, *(one.sigma_share for one in tried)])
+        * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2,
+    )
     findings = FitFindings(
         solution=solution,
         residual_fraction=residual_fraction,
         structure=structured,
         after_light=float(np.sqrt(max(structured**2 - by_light, 0.0))),
         uncertainty=sure,
+        before=before,
+        alternatives=tried,
         landing=found.landing,
         rivals=others,
         off_centre=off_centre(few, others),
@@ -375,14 +422,30 @@ def _answer(
         origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains)
         if findings.explained
         else (),
+        alternatives=tried,
+        registration=Registration(
+            determined=refusal is None,
+            reason=verdict.partition(": ")[2],
+            sigma_statistical=sure.sigma_statistical,
+            sigma_systematic=sure.sigma_systematic,
+            sets=sure.sets,
+        ),
+        reconstructor=check_control(
+            target.matrix,
+            solution.matrix,
+            seen.gains,
+            target.modes,
+            target.rows,
+            gain=options.gain,
+            noise=noise,
+        ),
         paper_table=found.table,
     )
     grounds = Grounds(
         refusal=refusal, structure=structured, n_sets=len(sure.subset_steps), columns=columns
     )
-    if not explain:
+    if not options.explain:
         return replace(fit, recommendation=recommendation(fit, grounds))
-    tried = alternatives(settled, few, others, pupils, optics, without)
     causes = gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
     return explained(fit, tried, replace(grounds, gains=tuple(causes)))
 

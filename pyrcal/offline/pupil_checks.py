@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pyrcal.offline.methods import Settled, spread
 from pyrcal.offline.models import BETTER, CHEAP, FitModels
 from pyrcal.offline.solver import nuisances_of
+from pyrcal.offline.uncertainty import pupil_regions
 from service.estimation.solver import Projection
 from service.model.instrument import Instrument
 from service.model.interaction import InteractionModel
@@ -57,26 +58,22 @@ class PupilNumber:
             return replace(about, obscuration_ratio=value)
         return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
 
-    def near(self, few: Few) -> tuple[float, float, Array]:
-        """Return the value that explains most, χ² over the file's, α's move; to first order."""
+    def near(self, few: Few) -> tuple[float, Lead, Array]:
+        """Return the value that explains most, its lead, α's move; to first order."""
         light = self.reported**self.power
         there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
         rate = (there - few.own) / self.step
         if not few.tells(few.own, rate):
-            return self.reported, 1.0, np.zeros(4)
-        seen = few.seen(few.own, rate)
-        step = seen.best_step
+            return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
+        step = few.step(few.own, rate)
         low, high = (limit**self.power for limit in self.range)
         value = float(np.clip(light + step[-1], low, high)) ** (1.0 / self.power)
-        share = seen.chi_at_best / few.left(few.own)
-        return value, share, step[:4] - few.step(few.own)[:4]
+        return value, few.lead(few.own, rate), step[:4] - few.step(few.own)[:4]
 
-    def far(self, few: Few) -> tuple[float, float, Array]:
+    def far(self, few: Few) -> tuple[float, Lead, Array]:
         """Return the same with D of the value itself."""
         value, matrix = self.found(few)
-        seen = few.seen(matrix)
-        share = seen.chi_at_best / few.left(few.own)
-        return value, share, seen.best_step[:4] - few.step(few.own)[:4]
+        return value, few.lead(matrix), few.step(matrix)[:4] - few.step(few.own)[:4]
 
     def found(self, few: Few) -> tuple[float, Array]:
         """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
@@ -116,6 +113,25 @@ def _numbers(about: Instrument) -> tuple[PupilNumber, ...]:
     return inner, width
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lead:
+    """How much better or worse another explanation is than the fit."""
+
+    share: float
+    """χ² that it leaves over what the fit leaves."""
+
+    sigma: float
+    """1 σ of that share, from how it differs between modes and between regions of the pupil."""
+
+    @property
+    def significance(self) -> float:
+        """Number of σ by which the other explanation is better; negative where it is worse."""
+        gained = 1.0 - self.share
+        if self.sigma > 0.0:
+            return gained / self.sigma
+        return float(np.copysign(np.inf, gained)) if gained else 0.0
+
+
 class Few:
     """Some of the modes of a fit at its solution, on the cheap grid."""
 
@@ -153,6 +169,45 @@ class Few:
         """Return χ² at the best unknowns, those given by a derivative included."""
         return float(self.seen(matrix, *more).chi_at_best)
 
+    def lead(self, matrix: Array, *more: Array) -> Lead:
+        """Return by how much another matrix explains more than the instrument as it is.
+
+        Squares of both residuals are compared mode by mode and region by region: noise and errors
+        that both have in common cancel, and what is left scatters as much as it scatters between
+        modes and between regions.
+        """
+        own, other = self._own_left, self._left_at_best(self.seen(matrix, *more))
+        gained = own - other
+        by_mode = gained.sum(axis=0)
+        by_region = np.bincount(self._regions, gained.sum(axis=1))
+        return Lead(
+            share=float(other.sum() / own.sum()) if own.any() else 1.0,
+            sigma=float(
+                max(
+                    np.std(parts, ddof=1) * np.sqrt(len(parts)) if len(parts) > 1 else 0.0
+                    for parts in (by_mode, by_region)
+                )
+                / own.sum()
+            )
+            if own.any()
+            else 0.0,
+        )
+
+    @cached_property
+    def _own_left(self) -> Array:
+        return self._left_at_best(self.seen(self.own))
+
+    @cached_property
+    def _regions(self) -> NDArray[np.intp]:
+        n_planes = self.models.instrument.slopes.kind.n_planes
+        return pupil_regions(self.target.valid, n_planes)[self.target.rows]
+
+    @staticmethod
+    def _left_at_best(seen: Projection) -> Array:
+        """Return the weighted squares that the best step leaves, ``(n_rows, n_few)``."""
+        left = seen.residual - np.tensordot(seen.best_step, seen.jacobian, axes=1)
+        return np.asarray(left**2 * seen.weights)
+
     def tells(self, matrix: Array, rate: Array) -> bool:
         """Return whether what was measured depends on a number: it may cut no subaperture."""
         return bool(self.target.project(matrix, rate[None]).normal[0, 0] > 0.0)
@@ -186,8 +241,8 @@ class TriedPupil:
     words: str
     """What to write into the file."""
 
-    share: float
-    """χ² that it leaves, over what the file's pupil leaves."""
+    lead: Lead
+    """How much better it explains the matrix than the file's pupil."""
 
     moved: Array
     """``(4,)`` by how much α would be another, numeric units."""
@@ -204,15 +259,15 @@ def tried_pupils(few: Few) -> tuple[TriedPupil, ...]:
     found = []
     little = few.residual_fraction < LEAST_EXPLAINED
     for number in _numbers(few.models.instrument):
-        value, share, moved = number.near(few) if little else number.far(few)
-        explained = few.residual_fraction * np.sqrt(max(1.0 - share, 0.0))
+        value, lead, moved = number.near(few) if little else number.far(few)
+        explained = few.residual_fraction * np.sqrt(max(1.0 - lead.share, 0.0))
         notable = abs(value - number.reported) >= number.notable and explained >= LEAST_EXPLAINED
         found.append(
             TriedPupil(
                 words=f"{number.key} = {value:.3g}",
-                share=share,
+                lead=lead,
                 moved=moved,
-                explains=notable and share < BETTER,
+                explains=notable and lead.share < BETTER,
             )
         )
     return tuple(found)

@@ -124,16 +124,12 @@ def _fit_of(options: argparse.Namespace) -> KnownFit:
     Raises
     ------
     MatrixError
-        If the file is of a refused fit, or its reference another one.
+        If the model does not hold the measured loop with these modes, or the reference is another.
     """
     path = Path(options.alpha)
     if path.is_file():
         fit = read_fit(path)
-        if not fit.accepted:
-            raise MatrixError(
-                f"{path}: found a fit that was refused, expected an accepted one; whoever knows "
-                "better gives the registration itself: X,Y,ROT,MAG"
-            )
+        _check_control(path, fit, options.modes)
     else:
         fit = KnownFit(alpha=parse_alpha(options.alpha))
     if options.reference is not None:
@@ -145,6 +141,42 @@ def _fit_of(options: argparse.Namespace) -> KnownFit:
             )
         fit = replace(fit, reference_sha256=found)
     return fit
+
+
+def _check_control(path: Path, fit: KnownFit, n_modes: int) -> None:
+    """Refuse a model whose reconstructor would not hold the loop that was measured.
+
+    Raises
+    ------
+    MatrixError
+        If the loop of the measured matrix is unstable with so many modes, or nothing is known of
+        it and the registration is not determined.
+    """
+    way_round = "give the registration itself (X,Y,ROT,MAG) to make the reconstructor regardless"
+    if fit.stable_gain is None:
+        if not fit.accepted:
+            raise MatrixError(
+                f"{path}: the registration was not determined, and the file does not say whether "
+                f"its reconstructor is stable; fit again with this version, or {way_round}"
+            )
+        return
+    fitted = n_modes if fit.modes is None else int((fit.modes < n_modes).sum())
+    if fit.stable_modes is not None and fitted > fit.stable_modes:
+        fewer = (
+            f"use --modes {fit.stable_modes}, fit with a lower --gain"
+            if fit.stable_modes
+            else "fit with a lower --gain, correct the instrument file"
+        )
+        raise MatrixError(
+            f"{path}: a reconstructor of {n_modes} modes makes the loop of the measured matrix "
+            f"unstable at gain {fit.stable_gain:g}; it is stable up to {fit.stable_modes} modes; "
+            f"{fewer}, or {way_round}"
+        )
+    if not fit.accepted:
+        say(
+            f"note: the registration of {path} was not determined; its reconstructor holds the "
+            f"loop of the measured matrix at gain {fit.stable_gain:g} all the same"
+        )
 
 
 def _oriented(instrument: Instrument, fit: KnownFit) -> Instrument:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pyrcal.offline.verdict import MOST_STRUCTURE, FitFindings, factor_of_passes
+from pyrcal.offline.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import BOUNDARY_SCALE
@@ -103,7 +103,7 @@ def _optics(findings: FitFindings) -> Iterator[str]:
 
 def _light(findings: FitFindings) -> Iterator[str]:
     """Yield that uneven light explains the residual."""
-    if findings.structure > MOST_STRUCTURE >= findings.after_light:
+    if findings.structure > NOTABLE_STRUCTURE >= findings.after_light:
         yield (
             f"{findings.structure:.0%} of the signal is left over and no noise; a smooth gain over "
             "the pupil explains it: uneven light, which sigma allows for; give the light "

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative
-from pyrcal.offline.fitted import Fit
+from pyrcal.offline.control_check import ReconstructorVerdict
+from pyrcal.offline.fitted import Fit, Registration
 from pyrcal.offline.instrument_checks import NOTABLE, NOTABLE_SIGMA
 from pyrcal.offline.left_over import LeftOver
 from service import __version__
@@ -80,6 +81,8 @@ def document(report: FitReport) -> dict[str, Any]:
         "subset_scatter": _parameters(fit.subset_scatter),
         "converged": bool(fit.converged),
         "verdict": verdict_line(fit),
+        "registration": None if fit.registration is None else _registration(fit.registration),
+        "reconstructor": None if fit.reconstructor is None else _reconstructor(fit.reconstructor),
         "anamorphosis": None if fit.anamorphosis is None else _plain(fit.anamorphosis),
         "anamorphosis_sigma": None
         if fit.anamorphosis_sigma is None
@@ -110,14 +113,50 @@ def document(report: FitReport) -> dict[str, Any]:
     }
 
 
+def _registration(found: Registration) -> dict[str, Any]:
+    return {
+        "determined": bool(found.determined),
+        "reason": found.reason,
+        "sigma_statistical": _parameters(found.sigma_statistical),
+        "sigma_systematic": _parameters(found.sigma_systematic),
+        "disjoint_sets": [
+            {
+                "of": one.words,
+                "steps": [_parameters(step) for step in one.steps],
+                "sigma": [_parameters(sigma) for sigma in one.sigma],
+                "tension": dict(zip(PARAMETERS, _plain(one.tension), strict=True)),
+                "in_sigma": one.even,
+            }
+            for one in found.sets
+        ],
+    }
+
+
+def _reconstructor(found: ReconstructorVerdict) -> dict[str, Any]:
+    return {
+        "stable_modes": found.stable_modes,
+        "n_modes": found.n_modes,
+        "gain": found.gain,
+        "pole_radius": _plain(found.pole_radius),
+        "pole_radius_all": _plain(found.pole_radius_all),
+        "aligned_pole_radius": _plain(found.aligned_pole_radius),
+        "wavefront_ratio": None if found.loss_ratio is None else _plain(found.loss_ratio),
+        "noise_limited": bool(found.noise_limited),
+        "weakest_modes": list(found.weakest_modes),
+        "reason": found.reason,
+    }
+
+
 def _alternative(one: Alternative, sigma: NDArray[np.float64]) -> dict[str, Any]:
     return {
         "words": one.words,
         "misfit": None if one.share is None else _plain(one.share),
         "moved": _parameters(one.moved),
         "moved_sigma": dict(zip(PARAMETERS, _plain(one.moved / sigma), strict=True)),
-        "preferred": one.preferred,
-        "undecided": one.undecided,
+        "preferred": bool(one.preferred),
+        "undecided": bool(one.undecided),
+        "key": one.key or None,
+        "in_sigma": one.sigma_share,
     }
 
 
@@ -258,7 +297,14 @@ class KnownFit:
     """Whether light met the mirror twice in the measured matrix; None: not in the file."""
 
     accepted: bool | None = None
-    """The verdict; None: α was given by hand."""
+    """Whether the registration is determined; None: α was given by hand."""
+
+    stable_modes: int | None = None
+    """Modes up to which a reconstructor of the model holds the loop of the measured matrix; None:
+    not in the file."""
+
+    stable_gain: float | None = None
+    """Integrator gain of that loop."""
 
     origin: str = "given by hand"
     """Where this comes from."""
@@ -355,9 +401,23 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
         ),
         order=SlopeOrder(words["order"]),
         accepted=str(values["verdict"]).startswith("accepted"),
+        **_control(values.get("reconstructor")),
         instrument_found=_otherwise(values.get("instrument_found", {})),
         origin=str(path),
     )
+
+
+def _control(found: dict[str, Any] | None) -> dict[str, Any]:
+    """Return what a file says of the loop; nothing where it says nothing."""
+    if found is None:
+        return {}
+    return {
+        # all modes that were fitted: more may be stable as well
+        "stable_modes": None
+        if found["stable_modes"] >= found["n_modes"]
+        else int(found["stable_modes"]),
+        "stable_gain": float(found["gain"]),
+    }
 
 
 def _otherwise(found: dict[str, dict[str, float | None]]) -> dict[str, float]:

@@ -73,6 +73,7 @@ IMAGE_SIGMA_PX = 0.15
 pyramids have 0.05 to 0.3 px: the faces are polished to some 0.1 % of their angle, and the windows
 that cut the images begin at whole pixels."""
 
+
 def image_patterns(stop: Stop) -> Array:
     """Return orthonormal displacements of the four images ``(n_patterns, 8)``.
 

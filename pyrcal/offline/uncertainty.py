@@ -1,17 +1,23 @@
-"""σ of a registration: noise, disagreement of modes, model error.
+"""σ of a registration: a statistical and a systematic part.
 
-Noise and everything else that differs from mode to mode shows in how the modes disagree: each is a
-cluster of a sandwich estimate. Errors of the model (uneven light, another mirror) are common to
-all modes and would pass unseen; they show in how parts of the pupil disagree.
+The statistical part comes from noise and from the disagreement of disjoint sets. Each mode is a
+cluster of a sandwich estimate, and sets of modes, of actuators and of subapertures give a block
+jackknife (:mod:`pyrcal.offline.disjoint_sets`), which replaces the estimate where it is larger.
+
+The systematic part comes from errors of the model, which are common to all modes: what regions of
+the pupil disagree by, a floor that no model is free of, and how far other explanations of the
+matrix that the data do not exclude would move the registration.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.disjoint_sets import DisjointSets, Normals, jackknife_sigma
 from service.estimation.solver import Projection
 
 Array = NDArray[np.float64]
@@ -52,7 +58,7 @@ FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
 """By parameter: the magnification feels it less."""
 
 OTHER_SHARE = 0.5
-"""How likely an instrument is that explains a matrix as well as the file's."""
+"""Probability of an instrument that explains a matrix as well as the file's."""
 
 N_SECTORS, N_RINGS = 12, 3
 MAX_SETS = 8
@@ -74,6 +80,42 @@ class Uncertainty:
 
     subset_covariance: Array
     """``(n_sets, 4, 4)`` of these steps by the disagreement of the modes within each set."""
+
+    statistical: Array
+    """``(4, 4)`` the part of the covariance that is from noise and the disagreement of sets."""
+
+    sets: tuple[DisjointSets, ...] = ()
+    """Disjoint sets of modes, actuators and subapertures, each fitted alone."""
+
+    @property
+    def sigma_statistical(self) -> Array:
+        """``(4,)`` 1 σ from noise and the disagreement of disjoint sets."""
+        return np.asarray(np.sqrt(np.diag(self.statistical)))
+
+    @property
+    def sigma_systematic(self) -> Array:
+        """``(4,)`` 1 σ from errors of the model and explanations that are not excluded."""
+        rest = np.diag(self.covariance) - np.diag(self.statistical)
+        return np.asarray(np.sqrt(np.maximum(rest, 0.0)))
+
+    def with_moves(self, moves: Array, shares: Array) -> Uncertainty:
+        """Return the uncertainty with other explanations of the matrix in its systematic part.
+
+        Parameters
+        ----------
+        moves
+            ``(n, 4)`` how far each explanation moves the registration, numeric units.
+        shares
+            ``(n,)`` how much of its square counts: 1 for one that the matrix prefers.
+        """
+        if not len(moves):
+            return self
+        added = np.diag(shares @ moves**2)
+        return replace(
+            self,
+            covariance=self.covariance + added,
+            subset_covariance=self.subset_covariance + added,
+        )
 
     @property
     def subset_scatter(self) -> Array:
@@ -101,7 +143,8 @@ def uncertainty(
     radius_subap: float,
     magnification_floor: float,
     residual_fraction: float,
-    doubt: Array,
+    mode_sets: Mapping[str, NDArray[np.intp]],
+    pupil_sets: Mapping[str, NDArray[np.intp]],
 ) -> Uncertainty:
     """Return the uncertainty of the first four unknowns of a projection at its solution.
 
@@ -124,14 +167,17 @@ def uncertainty(
         What no magnification is surer than.
     residual_fraction
         RMS of what is left over RMS of the measurement: so far the mirror may be another.
+    mode_sets, pupil_sets
+        Partitions into disjoint sets: the set of each mode ``(n_modes,)``, of each slope
+        ``(n_rows,)``.
     """
     n_modes = len(projection.gains)
     n_sets = min(MAX_SETS, n_modes // MIN_PER_SET)
-    normals = projection.normals
+    by_mode = Normals.of_modes(projection)
+    normals, scores = by_mode.normals, by_mode.scores
     noise = projection.chi / max(projection.residual.size - len(prior) - n_modes, 1)
     held = np.diag(prior * noise)
     spread = np.linalg.inv(normals.sum(axis=0) + held)
-    scores = projection.scores
     every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
     from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
     by_region = _sandwich(spread, _regional_scores(projection, regions))
@@ -141,14 +187,25 @@ def uncertainty(
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = strange * FAR_SHARE * shift_subap
     floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
-    from_model = np.diag(share**2 + floor**2 + far**2 + OTHER_SHARE * np.sum(doubt**2, axis=0))
+    from_model = np.diag(share**2 + floor**2 + far**2)
     pull = prior * noise * values
+    by_row = Normals.of_rows(projection, regions)
+    sets = (
+        *by_mode.compare(mode_sets, held, pull, noise),
+        *by_row.compare(pupil_sets, held, pull, noise),
+    )
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     scatter = np.zeros((4, 4))
     if n_sets > 1:
         scatter = np.diag(steps.var(axis=0, ddof=1) / n_sets)
+    statistical = _at_least(from_modes, scatter)
+    for kind in (mode_sets, pupil_sets):
+        found = jackknife_sigma([one for one in sets if one.words in kind])
+        statistical = _at_least(statistical, np.diag(found**2))
     return Uncertainty(
-        covariance=_at_least(from_modes, scatter) + from_model,
+        covariance=statistical + from_model,
+        statistical=statistical,
+        sets=sets,
         nuisance_sigma=np.sqrt(np.diag(every + by_region + spread * noise))[4:],
         subset_steps=steps,
         subset_covariance=covariances + from_model,

@@ -1,10 +1,12 @@
-"""Decide whether to believe a fit, and say what to do if not.
+"""Decide whether a fit determines the registration.
 
-The residual alone does not decide. Uneven light leaves a third of the signal although the
-registration is right, and a wrong stop leaves a tenth although it is wrong. So sets of modes must
-agree, no other minimum may be nearly as good, no other instrument may explain the matrix better,
-the gains must be those of one basis, and what is left over must be noise or have a cause that is
-named. Remarks say what was overruled, and what looks odd.
+What moves the registration decides, never a share of residual: uneven light leaves a third of the
+signal although the registration is right, and a wrong stop leaves a tenth although it is wrong.
+The registration is determined if disjoint sets of modes agree, if no other minimum is nearly as
+good, if one orientation is clearly the best, if no other instrument explains the matrix better and
+moves the registration by more than σ, if the gains are those of one basis, and if σ is small enough
+to be useful. Whether the model is good enough to control with is another question:
+:mod:`pyrcal.offline.control_check`.
 """
 
 from __future__ import annotations
@@ -25,13 +27,16 @@ from service.model.misregistration import BOUNDARY_SCALE
 
 Array = NDArray[np.float64]
 
-MAX_RESIDUAL = 0.55
-"""RMS share of the signal left over, by which even strongly uneven light is exceeded."""
+MAX_UNEXPLAINED_RATIO = 2.0
+"""What is left over and is no noise, over what the model explains, both as powers. With the modes
+of another basis or in a false minimum the model explains a quarter of the signal or less."""
 
-MOST_STRUCTURE = 0.09
-"""RMS share of the signal left over that is no noise, for which a cause must be named. Where the
-file is right it was at most 0.02 on matrices of other codes, 0.05 under noise of 30 % and on the
-diffractive telescopes; told an obscuration of 0.14 instead of 0.25 it was 0.13 to 0.16."""
+MIN_CHANCE_RATIO = 4.0
+"""Power that the model explains over what it explains of pure noise, where one gain is fitted for
+each mode."""
+
+NOTABLE_STRUCTURE = 0.09
+"""RMS share of the signal left over that is no noise, for which a cause is named in a note."""
 
 MAX_TENSION = 5.0
 """Distance of a set of modes from the others, in its own σ."""
@@ -50,6 +55,10 @@ STRANGEST = 3.0
 
 ALIKE = 2.0
 """Misfits of two rivals within this factor leave open which is right: to first order each."""
+
+MAX_DISPLACEMENT = 1.0
+"""An instrument that explains the matrix better and moves the registration by less than so many σ
+does not make it undetermined: its move is in σ, and the advice is to correct the file."""
 
 CANNOT_TELL = "the matrix cannot tell which"
 
@@ -70,6 +79,9 @@ class FitFindings:
     """The same if a smooth gain over the pupil, as uneven light makes, were fitted too."""
 
     uncertainty: Uncertainty
+    before: Uncertainty
+    """The same without the explanations that the data do not exclude."""
+
     landing: Landing | None
     """Where the starts led; None for methods that do not search."""
 
@@ -78,6 +90,9 @@ class FitFindings:
 
     off_centre: Alternative | None
     """A pupil off the subapertures' middle, where a rival is believed that moves the pupil, too."""
+
+    alternatives: tuple[Alternative, ...]
+    """Every other explanation that was tried."""
 
     optics: tuple[FoundOptic, ...]
     """What was found of the instrument itself."""
@@ -97,9 +112,18 @@ class FitFindings:
     stroke_known: bool
 
     @property
+    def sigma_of_sets(self) -> Array:
+        """``(4,)`` 1 σ without other explanations: noise, disjoint sets, floor of the model."""
+        return np.asarray(np.sqrt(np.diag(self.before.covariance)))
+
+    @property
     def explained(self) -> bool:
         """Whether the model explains enough for anything that was fitted to be a finding."""
-        return self.residual_fraction <= MAX_RESIDUAL
+        power = 1.0 - self.residual_fraction**2
+        n_rows = len(self.solution.projection.residual)
+        return (
+            MAX_UNEXPLAINED_RATIO * power > self.structure**2 and power * n_rows > MIN_CHANCE_RATIO
+        )
 
 
 class Refusal(StrEnum):
@@ -115,7 +139,6 @@ class Refusal(StrEnum):
     ANOTHER_BASIS = "another basis"
     ANOTHER_UNIT = "another unit"
     DIVIDED = "divided"
-    NO_CAUSE = "no cause"
 
 
 def judged(findings: FitFindings) -> tuple[Refusal | None, str]:
@@ -131,7 +154,6 @@ def judged(findings: FitFindings) -> tuple[Refusal | None, str]:
         (Refusal.ANOTHER_BASIS, _another_basis(findings)),
         (Refusal.ANOTHER_UNIT, _another_unit(findings)),
         (Refusal.DIVIDED, _divided(findings)),
-        (Refusal.NO_CAUSE, _without_a_cause(findings)),
     ):
         if refusal:
             return reason, f"refused: {refusal}"
@@ -173,9 +195,9 @@ def _unexplained(findings: FitFindings) -> str:
     if findings.explained:
         return ""
     return (
-        f"the model leaves {findings.residual_fraction:.0%} of the signal unexplained, expected at "
-        f"most {MAX_RESIDUAL:.0%}: too much noise, a false minimum (start closer), or another "
-        "basis or instrument than the file's"
+        f"the model explains {1.0 - findings.residual_fraction**2:.0%} of the signal's power, and "
+        f"what it leaves is not noise alone ({findings.structure:.0%} of the signal): a false "
+        "minimum (start closer), or another basis or instrument than the file's"
     )
 
 
@@ -201,7 +223,7 @@ def _another_pupil(findings: FitFindings) -> str:
 
 def _another_instrument(findings: FitFindings) -> str:
     for rival in findings.rivals:
-        if rival.believed:
+        if rival.believed and _displaces(findings, rival.moved):
             return f"another instrument explains the matrix better: {_which(findings, rival)}"
     for optic in findings.optics:
         usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
@@ -211,6 +233,11 @@ def _another_instrument(findings: FitFindings) -> str:
                 "mirror, the sensor or the modes are not those of the instrument file"
             )
     return ""
+
+
+def _displaces(findings: FitFindings, moved: Array) -> bool:
+    """Return whether another explanation moves the registration by more than σ has room for."""
+    return bool(np.any(np.abs(moved) > MAX_DISPLACEMENT * findings.sigma_of_sets))
 
 
 def _which(findings: FitFindings, rival: Rival) -> str:
@@ -284,18 +311,6 @@ def factor_of_passes(findings: FitFindings) -> float | None:
         if abs(middle / factor - 1.0) < _PASSES:
             return factor
     return None
-
-
-def _without_a_cause(findings: FitFindings) -> str:
-    if min(findings.structure, findings.after_light) <= MOST_STRUCTURE:
-        return ""
-    nearest = f"with {findings.rivals[0].change.words} {findings.rivals[0].share:.0%} of the misfit"
-    return (
-        f"the model leaves {findings.structure:.0%} of the signal that is no noise, expected at "
-        f"most {MOST_STRUCTURE:.0%}, and nothing tried explains it ({nearest} is left): check the "
-        "mask of valid subapertures, what shades the pupil, the light on it (--flux-map, "
-        "--gain-map), and that columns and modes are the same"
-    )
 
 
 def _divided(findings: FitFindings) -> str:

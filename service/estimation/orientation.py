@@ -41,6 +41,8 @@ Array = NDArray[np.float64]
 ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
 """Rotations tried; shapes of degree 5 have lost a tenth half-way between two of them."""
 
+NOMINAL = Misregistration()
+
 MIN_LEAD = 0.08
 """Another class of orientations must correlate worse by this much to be told apart."""
 
@@ -76,6 +78,11 @@ class Pose:
     def n_changes(self) -> int:
         """Flips and swaps of the axes."""
         return sum(getattr(self.slopes.assumed_orientation, name) for name in FLIPS)
+
+    @property
+    def effort(self) -> tuple[int, float]:
+        """Changes of the axes, then turn of the mirror: the least is the likeliest."""
+        return self.n_changes, abs(self.rotation_rad)
 
     def reported(self) -> str:
         """Return it in the words of the instrument file."""
@@ -140,16 +147,21 @@ def overruled(stated: Pose, found: Pose) -> str:
 
 
 def find_orientation(
-    instrument: Instrument, reference: Reference, basis: Basis, *, mapper: Mapper = map
+    instrument: Instrument,
+    reference: Reference,
+    basis: Basis,
+    *,
+    mapper: Mapper = map,
+    about: Misregistration = NOMINAL,
 ) -> Search:
     """Return the orientation and rough rotation that explain the lowest orders best.
 
-    ``basis`` holds the columns of ``reference``. Shift and magnification are taken as nominal:
-    the lowest orders hardly feel them.
+    ``basis`` holds the columns of ``reference``. Shift and magnification are those of ``about``:
+    the lowest orders hardly feel less than a subaperture.
     """
     stated = instrument.slopes
     settings = [stated] if stated.orientation is not None else list(_settings(stated))
-    poses = poses_of(instrument, reference, basis, settings, mapper=mapper)
+    poses = poses_of(instrument, reference, basis, settings, mapper=mapper, about=about)
     return _judged(poses, instrument.mirror.nominal_rotation_rad)
 
 
@@ -160,9 +172,10 @@ def poses_of(
     settings: Sequence[SlopeRecipe],
     *,
     mapper: Mapper = map,
+    about: Misregistration = NOMINAL,
 ) -> list[Pose]:
     """Return how well each of these orders and orientations explains the lowest orders."""
-    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper)
+    turned = _Turned.of(_any_way_round(instrument, basis, mapper), mapper, about)
     low = replace(
         reference,
         matrix=turned.lowest.measured(reference.matrix),
@@ -219,7 +232,7 @@ def _judged(poses: list[Pose], nominal_rad: float | None) -> Search:
     def preference(pose: Pose) -> tuple[float, float]:
         if nominal_rad is not None:
             return abs(wrapped(pose.rotation_rad - nominal_rad)), pose.n_changes
-        return pose.n_changes, abs(pose.rotation_rad)
+        return pose.effort
 
     classes: dict[object, list[Pose]] = {}
     for pose in near:
@@ -241,10 +254,10 @@ class _Turned:
     """``(n, n)`` [y, x] subapertures of these slopes."""
 
     @classmethod
-    def of(cls, model: InteractionModel, mapper: Mapper) -> _Turned:
+    def of(cls, model: InteractionModel, mapper: Mapper, about: Misregistration) -> _Turned:
         """Turn the smoothest shapes of a model's modes round."""
         lowest = low_order_of(model)
-        points = model.pupil.points
+        points = (model.pupil.points - about.vector[:2]) / about.magnification
 
         def at(angle_rad: float) -> Array:
             return lowest.shapes.render(points @ rotation(angle_rad))

@@ -110,7 +110,7 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
     if reference.noise is not None:
         # a noise-free column would otherwise count alone
         power = power * 1e-4 + rows.sum() * (reference.noise / reference.passes) ** 2
-    elif _by_actuator(instrument):
+    elif is_by_actuator(instrument):
         # an actuator behind the edge is seen by the border alone, where models are least true:
         # weighed by its share it pulls a far shift by 0.0015 subapertures
         power = np.maximum(power, np.median(power))
@@ -124,7 +124,7 @@ def target_of(reference: Reference, instrument: Instrument) -> Target:
     )
 
 
-def _by_actuator(instrument: Instrument) -> bool:
+def is_by_actuator(instrument: Instrument) -> bool:
     """Return whether every column is one actuator of a drawn mirror."""
     mirror = instrument.mirror
     return (

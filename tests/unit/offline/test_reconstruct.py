@@ -7,6 +7,7 @@ import pytest
 
 from pyrcal.arguments import command_line, with_negative_numbers
 from pyrcal.offline.arguments import check_files
+from pyrcal.offline.control_check import ReconstructorVerdict
 from pyrcal.offline.reconstruct import SAMPLING, main
 from pyrcal.offline.report import document, fill_fit
 from service.config import load_instrument
@@ -155,14 +156,55 @@ def test_an_instrument_that_has_changed_since_is_said(capsys):
     assert "has changed since" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("source", ["fit.h5", "fit.json"])
-def test_a_refused_fit_makes_no_reconstructor(source):
-    report = a_tiny_report(accepted=False, verdict="refused: sets of modes disagree")
+def checked(**changes):
+    """The loop of the measured matrix as a fit found it."""
+    values = {
+        "stable_modes": 30,
+        "n_modes": 40,
+        "gain": 0.5,
+        "pole_radius": 0.8,
+        "pole_radius_all": 1.1,
+        "aligned_pole_radius": 0.707,
+        "loss_ratio": 1.1,
+        "noise_limited": False,
+        "weakest_modes": (31,),
+        "reason": "stable up to 30 of 40 modes at gain 0.5",
+    }
+    return ReconstructorVerdict(**values | changes)
+
+
+def refused(source, **changes):
+    report = a_tiny_report(accepted=False, verdict="refused: sets of modes disagree", **changes)
     kept(report)
     Path("fit.json").write_text(json.dumps(document(report)), encoding="utf-8")
-    with pytest.raises(MatrixError, match="found a fit that was refused"):
-        made(source)
+    return source
+
+
+SOURCES = pytest.mark.parametrize("source", ["fit.h5", "fit.json"])
+
+
+@SOURCES
+def test_a_refused_fit_that_says_nothing_of_the_loop_makes_no_reconstructor(source):
+    with pytest.raises(MatrixError, match="was not determined"):
+        made(refused(source))
     assert not Path("cm.h5").exists()
+
+
+@SOURCES
+def test_more_modes_than_hold_the_measured_loop_are_refused_with_the_way_round(source):
+    with pytest.raises(MatrixError, match=r"stable up to 30 modes; use --modes 30"):
+        made(refused(source, reconstructor=checked()))
+    assert not Path("cm.h5").exists()
+
+
+@SOURCES
+def test_modes_that_hold_the_measured_loop_are_made_whatever_the_registration(source, capsys):
+    made(refused(source, reconstructor=checked()), modes="30")
+    assert "was not determined" in capsys.readouterr().err
+
+
+def test_where_all_fitted_modes_hold_more_may_be_asked_for():
+    made(refused("fit.h5", reconstructor=checked(stable_modes=40)), modes="50")
 
 
 def test_the_measured_file_is_checked_against_the_fits():

@@ -28,6 +28,8 @@ KEYS = {
     "subset_scatter",
     "converged",
     "verdict",
+    "registration",
+    "reconstructor",
     "notes",
     "recommendation",
     "found_not_told",

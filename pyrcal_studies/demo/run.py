@@ -19,7 +19,12 @@ from pyrcal_studies.demo.children import children, interrupted_by_any_end
 from pyrcal_studies.demo.report import table
 from pyrcal_studies.demo.truth import TruthFile
 from pyrcal_studies.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, TelemetryObserver
-from service.config.instrument_schema import InstrumentFile, SlopesTable, read_instrument_file
+from service.config.instrument_schema import (
+    AboutTable,
+    InstrumentFile,
+    SlopesTable,
+    read_instrument_file,
+)
 from service.errors import ConfigurationError, shown
 from service.model.kinds import KarhunenLoeve, LoopFacts
 from sim_rtc.rehearsal import write_live_instrument
@@ -27,6 +32,9 @@ from sim_rtc.rehearsal import write_live_instrument
 LOG = "service.log"
 LIVE_INSTRUMENT = "instrument.toml"
 """Instrument file of the service where the plant is a measured matrix, in the demo's folder."""
+
+USUAL_MAGNITUDE, USUAL_DIAMETER_M = 8.0, 8.22
+"""Star of the simulator, and telescope that it is meant for."""
 
 OWN = "flao-lbt"
 """The instrument of the demo unless another is asked for."""
@@ -38,6 +46,13 @@ other telescope, whose modes leave what they leave."""
 FEW_MODES, FEW_RATIO = 170, 1.05
 """Of a telescope with fewer modes, which begins with seven tenths of them: all of them leave 1.17
 times less than that (variance by N^(-√3/2), Noll 1976), and a third of it in decibels is asked."""
+
+SMALL_M = 2.0
+"""Diameter below which the demo makes the star brighter and begins with a third of the modes.
+
+PAPYRUS (1.6 m) at magnitude 8 has 1.5 electrons on a pixel and frame: 120 modes leave as much as
+195. With the light of an 8 m telescope the delay of the loop leaves most of the error: 87 nm with
+65 modes, 80 with 120, 79 with 195."""
 
 MEASURED_RATIO = 1 / 1.1
 """Of a measured plant, which begins with the reconstructor of the measurement itself: the service's
@@ -53,6 +68,11 @@ OTHER_FAR = f"""\
 {PLACE} The RTC begins
 with 120 modes, or with seven tenths of them all where that is fewer. WFE is what the simulator
 knows to be left.
+"""
+SMALL_FAR = f"""\
+{PLACE} The RTC begins
+with a third of its modes, on a star that gives this small telescope the light of an 8 m telescope
+at magnitude 8. WFE is what the simulator knows to be left.
 """
 LARGE = """\
 This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
@@ -128,7 +148,36 @@ def _is_far(options: argparse.Namespace) -> bool:
 
 def _beginning(options: argparse.Namespace) -> str:
     """Return what a night that begins far away begins with; 400 modes are FLAO's."""
-    return FAR if options.instrument == OWN else OTHER_FAR
+    if options.instrument == OWN:
+        return FAR
+    return OTHER_FAR if _small_m(options) is None else SMALL_FAR
+
+
+def _small_m(options: argparse.Namespace) -> float | None:
+    """Return the diameter of a small telescope, metres; None if it is none."""
+    if _is_measured(options):
+        return None
+    said = read_instrument_file(options.instrument)
+    diameter_m = float(said.section(AboutTable).said.diameter_m)
+    return diameter_m if diameter_m < SMALL_M else None
+
+
+def _words_of_small(options: argparse.Namespace) -> list[str]:
+    """Return what the simulator of a small telescope is told of its star and its loop."""
+    diameter_m = _small_m(options)
+    if diameter_m is None:
+        return []
+    words = []
+    if options.mag is None:
+        words.append(f"--mag={USUAL_MAGNITUDE + 5 * math.log10(diameter_m / USUAL_DIAMETER_M):.2f}")
+    if _is_far(options):
+        words.append(f"--n-controlled={max(_n_modes(options) // 3, 2)}")
+    return words
+
+
+def _n_modes(options: argparse.Namespace) -> int:
+    said = read_instrument_file(options.instrument)
+    return int(said.section(KarhunenLoeve).said.n_modes)
 
 
 class _Large(NamedTuple):
@@ -188,8 +237,8 @@ def _wanted_ratio(options: argparse.Namespace) -> float:
         return 1.0
     if options.instrument == OWN:
         return WANTED_RATIO
-    n_modes = read_instrument_file(options.instrument).section(KarhunenLoeve).said.n_modes
-    return OTHER_RATIO if n_modes > FEW_MODES else FEW_RATIO
+    few = _n_modes(options) <= FEW_MODES or _small_m(options) is not None
+    return FEW_RATIO if few else OTHER_RATIO
 
 
 def _check(options: argparse.Namespace, sim_words: list[str]) -> None:
@@ -260,6 +309,7 @@ def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
         simulator.append(f"--rate={large.rate_hz:g}")
     if _is_far(options):
         simulator.append("--far")
+    simulator += _words_of_small(options)
     for name in FORWARDED:
         value = getattr(options, name)
         if value is not None:

@@ -333,3 +333,40 @@ def test_the_table_tells_preparing_from_doing():
     assert "ready 7.5 s after the start" in text
     assert "first applied 9.2 s after it was ready" in text
     assert "never ready" in table(Report())
+
+
+MEASURED = replace(WELL, measured_plant=True, wanted_ratio=1 / 1.1)
+
+
+def without_truth(truth):
+    truth.lines = [
+        line | dict.fromkeys(TRUE) if line["kind"] == "truth" else line for line in truth.lines
+    ]
+    return truth
+
+
+def test_on_a_measured_plant_a_tenth_more_wavefront_error_is_good(truth):
+    truth.read()
+    report = make_report(service_state(), shelf(), without_truth(truth), MEASURED)
+    assert report.good
+    assert (report.true_alpha, report.error) == (None, None)
+    assert report.estimated_alpha == TRUE
+    assert report.wavefront_ratio == pytest.approx(120 / 105)
+    assert "not known" in table(report)
+
+
+def test_on_a_measured_plant_the_first_matrix_counts_where_no_modes_are_added(truth):
+    truth.read()
+    for line in truth.lines:
+        if line.get("cm_id") == "cm-400":
+            line["wavefront_error_nm"] = 133.0
+    report = make_report(service_state(), shelf()[:2], without_truth(truth), MEASURED)
+    assert not report.good
+    assert report.wavefront_ratio == pytest.approx(120 / 133)
+
+
+def test_on_a_measured_plant_without_an_estimate_nothing_is_good(truth):
+    truth.read()
+    state = service_state() | {"registration": None}
+    report = make_report(state, shelf()[:1], without_truth(truth), MEASURED)
+    assert len(report.failures) == 2

@@ -163,3 +163,27 @@ def test_the_demo_refuses_an_argument_in_one_line_before_it_starts_anything(
     assert len(lines) == 1
     assert option in lines[0]
     assert not (tmp_path / "demo").exists()
+
+
+def test_a_small_telescope_begins_with_fewer_modes_on_a_brighter_star():
+    """1.6056 m gather 3.55 magnitudes less than 8.22 m: the star is as much brighter."""
+    found = parse_options(_commands(options("--instrument", "papyrus"))[1])
+    assert found.magnitude == pytest.approx(8.0 - 3.55, abs=0.01)
+    assert found.given_n_controlled == 65
+    assert (
+        parse_options(_commands(options("--instrument", "papyrus", "--mag", "7"))[1]).magnitude == 7
+    )
+    other = parse_options(_commands(options("--instrument", "canary"))[1])
+    assert (other.magnitude, other.given_n_controlled) == (8.0, None)
+
+
+def test_on_a_measured_plant_the_service_has_an_instrument_file_of_its_own(tmp_path):
+    words = ["--plant", "measured", "--matrix", "m.h5", "--instrument", "papyrus"]
+    asked = options(*words, "--dir", str(tmp_path))
+    service, simulator = _commands(asked)
+    assert service[service.index("--instrument") + 1] == str(tmp_path / "instrument.toml")
+    found = parse_options(simulator)
+    assert (found.instrument, found.matrix, found.far) == ("papyrus", Path("m.h5"), False)
+    promise = _promise(asked)
+    assert promise.measured_plant
+    assert promise.wanted_ratio == pytest.approx(1 / 1.1)

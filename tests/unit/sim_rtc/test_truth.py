@@ -107,3 +107,18 @@ def test_the_setup_comes_first_and_the_seeing_of_the_moment_with_every_line(tmp_
     seeing = [line["seeing_arcsec"] for line in truth]
     assert seeing[0] < seeing[1] < seeing[2] < seeing[3]
     assert seeing[3:] == pytest.approx([3.0, 3.0], abs=0.01)
+
+
+@pytest.mark.parametrize(("more", "known"), [([], False), (["--alpha=0.1,0,0,1"], True)])
+def test_nobody_knows_the_true_registration_of_a_measured_plant(tmp_path, more, known):
+    path = tmp_path / "truth.jsonl"
+    options = parse_options(["--plant", "measured", "--matrix", "m.h5", *more])
+    offsets = np.arange(8.0).reshape(4, 2)
+    with TruthRecorder(
+        path, weights=WEIGHTS, clock=CLOCK, options=options, image_offsets_px=offsets
+    ) as recorder:
+        recorder.offer(frames(0, ripple(1e-8)), overrun_frames=0)
+    setup, truth = [json.loads(line) for line in path.read_text().splitlines()]
+    assert (setup["matrix"], setup["image_offsets_px"]) == ("m.h5", offsets.tolist())
+    assert truth["shift_x_subap"] == (0.1 if known else None)
+    assert truth["wavefront_error_nm"] == pytest.approx(10.0, abs=0.01)

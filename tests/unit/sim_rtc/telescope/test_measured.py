@@ -1,14 +1,19 @@
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from pyrcal.__main__ import main
+from service.config import load_instrument
 from service.errors import ConfigurationError
 from service.model.interaction import RtcInteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import analytic_basis
+from service.model.sensors.pyramid.description import FrameWindows
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Fineness
 from service.model.slopes import Orientation
@@ -262,3 +267,49 @@ def test_the_loop_closes_on_a_measured_matrix(written, measured, bench):
     left = np.mean([rms(batch.phase_m + modes @ batch.commands_m[0]) for batch in last])
     assert left < 0.5 * incoming
     assert not any(batch.n_clipped for batch in batches)
+
+
+def test_detector_frames_become_slopes_as_a_fit_makes_them(written, bench, small_basis):
+    centres = np.array([[8.0, 8.5], [8.2, 28.5], [28.0, 8.3], [28.0, 28.5]])
+    recipe = replace(bench.slopes, order=SlopeOrder.XY)
+    of_frames = replace(
+        bench,
+        slopes=recipe,
+        frames=FrameWindows(pixels_per_subaperture=1, centres_px=centres),
+    )
+    rng = np.random.default_rng(1)
+    frames, light = rng.standard_normal((40, 40, 40)), 5.0 + rng.random((40, 40))
+    slopes = kind_of(of_frames).signals_of_frames(of_frames, frames, light)
+    path = written(frames, flux_frame=light)
+    np.testing.assert_array_equal(read_measured_matrix(path, of_frames, small_basis).matrix, slopes)
+    with pytest.raises(ConfigurationError, match="flux_frame"):
+        read_measured_matrix(written(frames), of_frames, small_basis)
+    with pytest.raises(ConfigurationError, match="frames"):
+        read_measured_matrix(written(slopes), of_frames, small_basis)
+
+
+BENCHES = Path(os.environ.get("PYRCAL_BENCH_DATA", "../shared/data"))
+
+
+@pytest.mark.skipif(not (BENCHES / "ao188").is_dir(), reason="the measured data are not here")
+def test_a_loop_closes_on_the_measured_matrix_of_ao188(tmp_path):
+    """188 actuators as camera frames, strokes unknown: the import is taken as it is."""
+    command = ["import", "cacao", str(BENCHES / "ao188"), "--diameter-m", "7.92"]
+    assert main([*command, "--output", str(tmp_path)]) == 0
+    plant = ["--plant", "measured", "--matrix", str(tmp_path / "matrix.h5"), "--seed", "1"]
+    telescope = build_telescope(
+        parse_options([*plant, "--seeing", "0.6"]), load_instrument(tmp_path / "instrument.toml")
+    )
+    assert telescope.plant.measured.matrix.shape[1] == 94
+    computer = telescope.computer(iter(telescope.feed.blocks()))
+    batches = [computer.next_batch() for _ in range(80)]
+    modes = batches[-1].optics.opd_per_command
+    weights = telescope.weights
+
+    def rms(opd_m):
+        return np.sqrt(weights @ (opd_m - weights @ opd_m) ** 2)
+
+    last = batches[-40:]
+    incoming = np.mean([rms(batch.phase_m) for batch in last])
+    left = np.mean([rms(batch.phase_m + modes @ batch.commands_m[0]) for batch in last])
+    assert left < 0.6 * incoming

@@ -32,10 +32,41 @@ SURE = 0.7
 CLEARER = 1.3
 """... where it is so many times what it is as they stand."""
 
+CHANCE_SIGMA = 4.0
+"""Correlation with the model, in 1 σ of that of noise, below which a column may be noise only."""
+
+WHITE = 11.8
+"""Sum of squares of two correlations of neighbours, in their σ, that noise exceeds in 0.3 %."""
+
 _FEWEST = 9
 """Modes below which some other order always looks alike."""
 
 _NAMED = 12
+
+
+def noise_columns(solution: Solution, target: Target, n_planes: int) -> NDArray[np.bool_]:
+    """Return which columns hold noise only, ``(n_modes,)``.
+
+    Such a column has nothing in common with its model, and its neighbouring subapertures nothing in
+    common with each other. A column of another mode, or of another basis, is smooth.
+    """
+    measured = np.where(target.rows[:, None], target.matrix, 0.0)
+    alike = np.sum(_unit(measured) * _unit(np.asarray(solution.matrix, np.float64)), axis=0)
+    unlike = np.abs(alike) < CHANCE_SIGMA / np.sqrt(target.rows.sum())
+    found = np.zeros(len(unlike), dtype=np.bool_)
+    for column in np.flatnonzero(unlike):
+        maps = np.zeros((n_planes, *target.valid.shape))
+        maps[:, target.valid] = measured[:, column].reshape(n_planes, -1)
+        counted = np.zeros_like(maps)
+        counted[:, target.valid] = target.rows.reshape(n_planes, -1)
+        squares = float(np.sum(maps**2)) / max(float(counted.sum()), 1.0)
+        strength = 0.0
+        for axis in (1, 2):
+            pairs = np.sum(counted * np.roll(counted, 1, axis=axis))
+            product = np.sum(maps * np.roll(maps, 1, axis=axis))
+            strength += float(product**2 / (max(float(pairs), 1.0) * squares**2))
+        found[column] = strength < WHITE
+    return found
 
 
 def strange_columns(solution: Solution, target: Target) -> Iterator[str]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
 from pyrcal.offline.alternatives import alternatives, off_centre
-from pyrcal.offline.columns import displaced_columns, strange_columns
+from pyrcal.offline.columns import displaced_columns, noise_columns, strange_columns
 from pyrcal.offline.control_check import GAIN, check_control
 from pyrcal.offline.disjoint_sets import mode_partitions, pupil_partitions
 from pyrcal.offline.fitted import Fit, Registration
@@ -68,6 +68,11 @@ from service.model.pupil import Illumination, rtc_valid_subapertures
 from service.model.sensors.registry import kind_of
 from service.model.sensors.sensor import Mapper
 from service.model.slopes import Orientation, SlopeRecipe
+
+MIN_COLUMNS = 3
+"""Columns that must be left where those that hold noise only are left out."""
+
+_NAMED = 12
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -185,6 +190,16 @@ def _fitted(
     else:
         start = pose if pose is not None else instrument.start
     found = _found(models, target, instrument.with_anamorphosis(start), options)
+    noisy = noise_columns(
+        found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
+    )
+    if noisy.any() and np.sum(~noisy) >= MIN_COLUMNS:
+        tell("fit")
+        usable = _without_noise(usable, noisy)
+        used = basis.subset(usable.columns)
+        target, models = target_of(usable, instrument), replace(models, basis=used)
+        begin = instrument.with_anamorphosis(found.settled.solution.alpha)
+        found = _found(models, target, begin, options)
     tell("verdict")
     fit = _answer(models, found, usable, untold, reported, options)
     if options.explain and not fit.accepted:
@@ -193,6 +208,20 @@ def _fitted(
         )
         fit = with_displaced(fit, tuple(columns))
     return fit
+
+
+def _without_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
+    """Return the columns that hold more than noise; the others are named."""
+    named = ", ".join(str(mode) for mode in usable.columns[noisy][:_NAMED])
+    more = f" and {int(noisy.sum()) - _NAMED} more" if noisy.sum() > _NAMED else ""
+    left_out = f"{int(noisy.sum())} of {len(noisy)} columns hold noise only: modes {named}{more}"
+    return replace(
+        usable,
+        matrix=usable.matrix[:, ~noisy],
+        modes=usable.columns[~noisy],
+        noise=None if usable.noise is None else usable.noise[~noisy],
+        left_out=(*usable.left_out, left_out),
+    )
 
 
 def _stroke_known(instrument: Instrument) -> bool:
@@ -359,6 +388,7 @@ def _answer(
         if slopes.normalisation is Normalisation.LOCAL
         else MAGNIFICATION_FLOOR,
         residual_fraction=residual_fraction,
+        noise_share=_noise_share(residual_fraction, structured),
         mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
         pupil_sets=pupil_partitions(target.valid, n_planes, target.rows),
     )
@@ -448,6 +478,11 @@ def _answer(
         return replace(fit, recommendation=recommendation(fit, grounds))
     causes = gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
     return explained(fit, tried, replace(grounds, gains=tuple(causes)))
+
+
+def _noise_share(residual: float, structured: float) -> float:
+    """Return the share of the residual's power that is noise."""
+    return max(1.0 - (structured / residual) ** 2, 0.0) if residual > 0.0 else 0.0
 
 
 def _narrow(settled: Settled) -> SeenPupil | None:

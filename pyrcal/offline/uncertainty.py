@@ -143,6 +143,7 @@ def uncertainty(
     radius_subap: float,
     magnification_floor: float,
     residual_fraction: float,
+    noise_share: float,
     mode_sets: Mapping[str, NDArray[np.intp]],
     pupil_sets: Mapping[str, NDArray[np.intp]],
 ) -> Uncertainty:
@@ -167,6 +168,8 @@ def uncertainty(
         What no magnification is surer than.
     residual_fraction
         RMS of what is left over RMS of the measurement: so far the mirror may be another.
+    noise_share
+        Share of the power of what is left over that is noise, 0 to 1.
     mode_sets, pupil_sets
         Partitions into disjoint sets: the set of each mode ``(n_modes,)``, of each slope
         ``(n_rows,)``.
@@ -181,7 +184,9 @@ def uncertainty(
     every = _sandwich(spread, scores) * n_modes / max(n_modes - 1, 1)
     from_modes = _at_least(every[:4, :4], (spread * noise)[:4, :4])
     by_region = _sandwich(spread, _regional_scores(projection, regions))
-    regional = by_region[:4, :4]
+    # noise scatters between regions, too, and is in the statistical part already
+    white = np.diag(spread)[:4] * noise * noise_share
+    regional = np.diag(np.maximum(np.diag(by_region)[:4] - white, 0.0))
     few = (1.0 + FEW_MODES_EXCESS * np.exp(-n_modes / FEW_MODES)) ** FEW_MODES_POWER
     share = few * REGIONAL_SHARE * np.sqrt(np.diag(regional))
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)

@@ -148,6 +148,10 @@ def _alternatives(fit: Fit) -> Iterator[str]:
             yield f"{'':20s}{words} {far:.1f} sigma ({most.words})"
 
 
+_DISPLACED_PX = 0.03
+"""Displacements of the pupil images that are worth a line; less is found on exact matrices."""
+
+
 def _as_written(fit: Fit) -> str:
     """Return order and orientation as ``[slopes]`` of the instrument file has them."""
     words = orientation_words(fit.orientation, fit.order)
@@ -167,6 +171,9 @@ def _extras(fit: Fit) -> Iterator[str]:
         words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
         told = "" if fit.anamorphosis is not None else "not observable with these modes: "
         yield f"{'anamorphosis':20s}{told}{words}"
+    if fit.image_offsets_px is not None and np.abs(fit.image_offsets_px).max() > _DISPLACED_PX:
+        places = ", ".join(f"[{x:.2f}, {y:.2f}]" for x, y in fit.image_offsets_px)
+        yield f"{'pupil images':20s}image_offsets_px = [{places}] (fitted; the file does not say)"
     if fit.gain_map is not None:
         gains = fit.gain_map[fit.valid]
         yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"

@@ -112,6 +112,12 @@ class Fit(Determination):
     anamorphosis_sigma: NDArray[np.float64] | None = None
     """``(2,)`` 1 σ of the anamorphosis of ``alpha``; None: it was not fitted."""
 
+    image_offsets_px: NDArray[np.float64] | None = None
+    """``(4, 2)`` [x, y] where the pupil images were found beside their places on the pixel grid, as
+    the instrument file's key has it. A matrix cannot tell which of two opposite images is
+    displaced, nor does α depend on it. None if the file says where they lie, or the sensor has
+    one image."""
+
     optics: tuple[FoundOptic, ...] = ()
     """What of the instrument was fitted, too: coupling or width, modulation."""
 

@@ -32,6 +32,13 @@ MIN_EXPLAINED = 0.005
 same instrument differ by is of that size: with OOPAO's own Shack-Hartmann 0.2 % is left over, and
 another stop, by chance of the model's errors, explains 0.12 %."""
 
+LITTLE_EXPLAINED = 0.3
+"""Share of χ² left by another coupling or modulation above which it may stand for something else.
+Files told a wrong modulation left less than 0.05; pushes alone of 200 nm left 0.6."""
+
+NO_SENSOR_NUMBER_LIMIT = 0.1
+"""A modulation, λ/D, found below this is none: to the matrix they are the same to 1e-3."""
+
 NOTABLE_SIGMA = 3.0
 """... nor one that differs by less than this many of its own σ."""
 
@@ -134,6 +141,14 @@ class AsTold:
     moved: Array
     """``(4,)`` by how much its registration is another, numeric units."""
 
+    @property
+    def as_likely(self) -> bool:
+        """Whether what was found of the instrument explains too little to be a finding.
+
+        Pokes of a tenth of a wavelength, or pushed only, look like another modulation.
+        """
+        return self.share > LITTLE_EXPLAINED
+
 
 def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[Rival, ...]:
     """Return other instruments, the one that explains the matrix best first.
@@ -187,6 +202,8 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
         stated, value = number, number * float(np.exp(change))
         if optic is Optic.WIDTH and models.coupling is not None:
             stated, value = models.coupling, float(models.coupling ** np.exp(-2.0 * change))
+        elif optic is Optic.SENSOR and value < NO_SENSOR_NUMBER_LIMIT:
+            value = 0.0
         known = models.exact(optic)
         found.append(
             FoundOptic(

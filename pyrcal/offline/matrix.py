@@ -41,7 +41,7 @@ from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
 from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
 from pyrcal.offline.reference import checked
 from pyrcal.offline.remarks import remarks
-from pyrcal.offline.solver import IMAGE_SIGMA_PX, image_patterns, nuisances_of
+from pyrcal.offline.solver import Nuisances, Solution, image_patterns, nuisances_of
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
@@ -347,11 +347,10 @@ def _found(
 
 def _unknown_images(models: FitModels) -> dict[str, Any]:
     """Return what is unknown of the places of the sensor's pupil images, where anything is."""
-    pixel = kind_of(models.instrument).pixel_subap(models.instrument)
-    if pixel is None:
+    sigma = kind_of(models.instrument).image_sigma_subap(models.instrument)
+    if sigma is None:
         return {}
-    patterns = image_patterns(models.instrument.stop)
-    return {"images": patterns, "image_sigma": IMAGE_SIGMA_PX * pixel}
+    return {"images": image_patterns(models.instrument.stop), "image_sigma": sigma}
 
 
 def _answer(
@@ -396,10 +395,14 @@ def _answer(
     stroke_known = _stroke_known(models.instrument)
     without = as_told(as_in_file, settled) if any(one.notable for one in optics) else None
     tried = alternatives(settled, few, others, pupils, optics, without)
+    moves = [doubt_of_width(settled, few), *(one.moved for one in tried)]
+    shares = [OTHER_SHARE, *(one.sigma_share for one in tried)]
+    if without is not None and without.as_likely:
+        moves.append(without.moved)
+        shares.append(OTHER_SHARE)
     sure = before.with_moves(
-        np.array([doubt_of_width(settled, few), *(one.moved for one in tried)]),
-        np.array([OTHER_SHARE, *(one.sigma_share for one in tried)])
-        * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2,
+        np.array(moves),
+        np.array(shares) * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2,
     )
     findings = FitFindings(
         solution=solution,
@@ -447,6 +450,7 @@ def _answer(
         valid=target.valid,
         gain_map=nuisances.gain_map(solution.nuisances, target.valid),
         anamorphosis_sigma=nuisances.stretch_sigma(sure.nuisance_sigma),
+        image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
         # what noise determines is no finding
         optics=optics if findings.explained else (),
         origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains)
@@ -483,6 +487,16 @@ def _answer(
 def _noise_share(residual: float, structured: float) -> float:
     """Return the share of the residual's power that is noise."""
     return max(1.0 - (structured / residual) ** 2, 0.0) if residual > 0.0 else 0.0
+
+
+def _image_offsets(
+    instrument: Instrument, nuisances: Nuisances, solution: Solution
+) -> Array | None:
+    """Return where the pupil images were found beside their places, as an instrument file says."""
+    if not len(nuisances.images):
+        return None
+    found = nuisances.image_offsets(solution.nuisances)
+    return kind_of(instrument).offsets_px(instrument, found)
 
 
 def _narrow(settled: Settled) -> SeenPupil | None:

@@ -107,6 +107,9 @@ MAX_MODES = 60
 CHANGES = np.arange(-4, 5) * 0.3
 """Logarithms of the factors that the sensor's number is looked for at, from a third to three."""
 
+NO_SENSOR_NUMBER = 0.02
+"""A modulation, λ/D, that stands for none: a logarithm never comes to 0."""
+
 STRANGE = 0.05
 """RMS share of the signal left over beyond which the sensor is looked for from afar, ..."""
 
@@ -258,7 +261,10 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     found = [left(change) for change in CHANGES]
     best = int(np.argmin(found))
     change = CHANGES[best]
-    if 0 < best < len(found) - 1:
+    nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
+    if best == 0 and left(nothing) < found[0]:
+        change = nothing
+    elif 0 < best < len(found) - 1:
         change += vertex(*found[best - 1 : best + 2]) * (CHANGES[1] - CHANGES[0])
     if abs(change) < LINEAR:
         return models, nuisances

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pyrcal.offline.instrument_checks import AsTold
 from pyrcal.offline.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
@@ -97,7 +98,17 @@ def _optics(findings: FitFindings) -> Iterator[str]:
     yield (
         f"with {found} the misfit is {findings.as_told.share:.0%} of what it would be: the "
         f"registration allows for it, which moved it by {moved[0]:.2g}, {moved[1]:.2g} "
-        f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; correct the instrument file"
+        f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; {_advice(findings.as_told)}"
+    )
+
+
+def _advice(without: AsTold) -> str:
+    """Return what to do about an instrument that was found unlike its file."""
+    if not without.as_likely:
+        return "correct the instrument file"
+    return (
+        "large pokes, or pushes without pulls, do the same, so sigma allows for both: measure "
+        "again with smaller pokes, both ways, or make sure of these numbers"
     )
 
 

@@ -87,6 +87,7 @@ def document(report: FitReport) -> dict[str, Any]:
         "anamorphosis_sigma": None
         if fit.anamorphosis_sigma is None
         else _plain(fit.anamorphosis_sigma),
+        "image_offsets_px": None if fit.image_offsets_px is None else _plain(fit.image_offsets_px),
         "instrument_found": {
             one.key if one.found is not None else _WIDTH: {
                 "found": _plain(one.found if one.found is not None else np.exp(one.change)),

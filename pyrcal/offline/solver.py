@@ -68,12 +68,6 @@ LONGEST_OPTIC_STEP = 0.4
 """A step of such a logarithm beyond this trusts the derivatives too far."""
 
 
-IMAGE_SIGMA_PX = 0.15
-"""1 σ of a coordinate of a pupil image beside its place on the pixel grid, detector pixels. Real
-pyramids have 0.05 to 0.3 px: the faces are polished to some 0.1 % of their angle, and the windows
-that cut the images begin at whole pixels."""
-
-
 def image_patterns(stop: Stop) -> Array:
     """Return orthonormal displacements of the four images ``(n_patterns, 8)``.
 
@@ -83,7 +77,7 @@ def image_patterns(stop: Stop) -> Array:
     and the pupil may lie elsewhere.
     """
     along = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1], [1, -1, -1, 1], [1, 1, 1, 1]]) / 2.0
-    both = np.kron(np.eye(2), along)  # those of x, then those of y
+    both: Array = np.kron(np.eye(2), along).astype(np.float64)  # those of x, then those of y
     return both if stop is Stop.TELESCOPE else both[[0, 1, 2, 4, 5, 6]]
 
 

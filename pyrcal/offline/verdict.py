@@ -227,7 +227,8 @@ def _another_instrument(findings: FitFindings) -> str:
             return f"another instrument explains the matrix better: {_which(findings, rival)}"
     for optic in findings.optics:
         usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
-        if abs(optic.change) > STRANGEST * usual:
+        # a logarithm has no value for a modulation that is found to be none
+        if abs(optic.change) > STRANGEST * usual and optic.found != 0.0:
             return (
                 f"only {optic.found_words} would explain the matrix, {optic.told_words}: the "
                 "mirror, the sensor or the modes are not those of the instrument file"

@@ -169,12 +169,14 @@ def _assumed(
     wfs = said.section(said.kind.table)
     for key, text in said.kind.assumed(wfs.said, wfs.given):
         yield f"{wfs.where(key)}: {text}"
-    values = {f"wfs.{key}": getattr(sensor, key) for key in said.kind.unknown}
+    values = {f"wfs.{key}": getattr(sensor, key, None) for key in said.kind.unknown}
     values["mirror.coupling"] = mirror.shape.coupling if isinstance(mirror, Mirror) else None
     for key in sorted(said.unknown):
+        taken = values.get(key)
+        words = "allows for it in its uncertainty" if taken is None else f"takes {taken:g}"
         yield (
             f"{wfs.path}: {key}: unknown; a fit of a measured matrix finds it, everything else "
-            f"takes {values[key]:g}"
+            f"{words}"
         )
 
 

@@ -179,7 +179,7 @@ def whole_of(kind: SensorKind) -> type[Table]:
     return create_model("InstrumentFile", __base__=Table, **tables)
 
 
-def unknown_values(kind: SensorKind) -> dict[str, float]:
+def unknown_values(kind: SensorKind) -> dict[str, float | None]:
     """Return keys that may be "unknown", and what is taken until a measured matrix tells."""
     of_sensor = {f"wfs.{key}": value for key, value in kind.unknown.items()}
     return {**of_sensor, "mirror.coupling": 0.35}

@@ -13,6 +13,7 @@ from service.control.reconstructor import InversionMethod
 from service.files.disk_cache import usual_folder
 from service.model.instrument import Instrument, TabulatedModes
 from service.model.misregistration import BOUNDARY_SCALE
+from service.model.sensors.registry import kind_of
 from service.runtime.worker import Compute, Sampling
 from service.tracking.alarms import Interlock, Severity
 from service.tracking.policy import Offloading, Policy, Rule, SensorModePolicy
@@ -61,7 +62,11 @@ def floor_of(settings: Settings, instrument: Instrument | None = None) -> NDArra
         found if asked is None else asked
         for found, asked in zip((shift, rotation, magnification), given, strict=True)
     )
-    return np.array([shift, shift, rotation, magnification])
+    floor = np.array([shift, shift, rotation, magnification])
+    if instrument is None:
+        return floor
+    # places of the pupil images that the file calls unknown displace every estimate alike
+    return np.asarray(np.hypot(floor, kind_of(instrument).image_floor(instrument) * BOUNDARY_SCALE))
 
 
 def _coarser(instrument: Instrument | None) -> float:

@@ -9,6 +9,7 @@ arrays are ``[y, x]``, lengths in subapertures, frequencies in cycles per subape
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -145,3 +146,22 @@ class FftPyramid:
         start = self.coordinates[0]  # the transform takes the first pupil point for the origin
         transform = np.exp(2j * np.pi * np.outer(x - start, nu)) / len(nu)
         return transform.astype(np.complex128)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DisplacedPyramid(FftPyramid):
+    """The same, each of its four images seen at a place of its own beside the pixel grid."""
+
+    offsets: NDArray[np.float64]
+    """``(2, 2, 2)`` displacement of the images, subapertures: side along y, along x, (x, y)."""
+
+    def _paths(self, shift: tuple[float, float]) -> Any:
+        moved = self.offsets + shift
+        return [[FftPyramid._paths(self, tuple(at)) for at in row] for row in moved]
+
+    def _images(self, opd_m: NDArray[np.float64], paths: Any) -> NDArray[np.float64]:
+        n = self.n_subapertures
+        images = np.empty((2, n, 2, n))
+        for y, x in np.ndindex(2, 2):
+            images[y, :, x] = FftPyramid._images(self, opd_m, paths[y][x])[y, :, x]
+        return images

@@ -70,8 +70,9 @@ class SensorKind(ABC):
     table: ClassVar[type[Any]]
     """What ``[wfs]`` is read into, a ``SensorTable``."""
 
-    unknown: ClassVar[Mapping[str, float]] = {}
-    """Keys of it that may be "unknown", and what is taken until a measured matrix tells."""
+    unknown: ClassVar[Mapping[str, float | None]] = {}
+    """Keys of it that may be "unknown", and what is taken until a measured matrix tells; None where
+    a key that is not given means the same."""
 
     signals: ClassVar[tuple[SignalKind, ...]]
     """What its subapertures give."""
@@ -273,12 +274,21 @@ class SensorKind(ABC):
     def aot(self, recipe: SlopeRecipe) -> tuple[str, dict[str, int]]:
         """Return its class in AOT files, and the fields that only this class is given."""
 
-    def pixel_subap(self, instrument: Instrument) -> float | None:
-        """Return a detector pixel's width in subapertures, where images may lie off the pixel grid.
+    def image_sigma_subap(self, instrument: Instrument) -> float | None:
+        """Return how far each of several pupil images may lie beside its place, 1 σ, subapertures.
 
         None if the sensor has one image of the pupil, or the file says where each of several lies.
         """
         return None
+
+    def image_floor(self, instrument: Instrument) -> NDArray[np.float64]:
+        """Return 1 σ of α ``(4,)`` by places of pupil images that the file calls unknown.
+
+        Numeric units (subapertures, radians, ratio); 0 where nothing is unknown.
+        """
+        import numpy as np
+
+        return np.zeros(4)
 
     def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> SensorDescription:
         """Return the sensor with its pupil images beside their places ``(2 n_images,)``.
@@ -299,6 +309,18 @@ class SensorKind(ABC):
         less their mean. None if it does not say.
         """
         return None
+
+    def offsets_px(
+        self, instrument: Instrument, offsets: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return displacements ``(n_images, 2)`` in pixels, as an instrument file has them.
+
+        Raises
+        ------
+        ModelError
+            If it has only one image.
+        """
+        raise ModelError(f"a {self.name}: found several images, expected a pyramid's")
 
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         """Return where the instrument file places the pupil's image on the grid, (x, y).

@@ -16,6 +16,18 @@ from service.model.slopes import Orientation
 
 _SEPARATION_TOLERANCE = 0.1
 
+IMAGE_SIGMA_PX = 0.15
+"""1 σ of a coordinate of a pupil image beside its place on the pixel grid, detector pixels. Real
+pyramids have 0.05 to 0.3 px: faces differ by some 0.1 % of their angle, and the windows that cut
+the images begin at whole pixels."""
+
+SHIFT_BY_IMAGES = 0.25
+"""Error of a shift that takes no account of displaced images, over their RMS displacement along an
+axis. Of 12 and 24 subapertures, modulated by 0 and 3 λ/D, low and high modes: 0.15 to 0.27."""
+
+EDGE_BY_IMAGES = 0.03
+"""The same of rotation and magnification, at the pupil's edge: 0.001 to 0.032."""
+
 _FRAME_KEYS = ("pupil_centres_px", "pixels_per_subaperture")
 
 
@@ -62,9 +74,9 @@ def pyramid_of(table: PyramidTable, given: frozenset[str]) -> Pyramid:
         )
     optics = {field.name: getattr(table, field.name) for field in fields(PyramidNumbers)}
     pixels = table.pixels_per_subaperture
-    offsets = table.image_offsets_px
-    if offsets is not None:
-        offsets = tuple((x / pixels, y / pixels) for x, y in offsets)
+    offsets: tuple[tuple[float, float], ...] | None = None
+    if table.image_offsets_px is not None:
+        offsets = tuple((x / pixels, y / pixels) for x, y in table.image_offsets_px)
     return Pyramid(
         **optics | {"pupil_separation_subap": separation},
         image_offsets_subap=offsets,
@@ -143,7 +155,7 @@ def image_offsets(instrument: Instrument) -> NDArray[np.float64] | None:
     if told is None:
         return None
     turned = turned_offsets(np.array(told).reshape(2, 2, 2), instrument.slopes.assumed_orientation)
-    return turned - turned.mean(axis=(0, 1))
+    return np.asarray(turned - turned.mean(axis=(0, 1)))
 
 
 def pupil_offset(instrument: Instrument) -> tuple[float, float] | None:
@@ -156,19 +168,54 @@ def pupil_offset(instrument: Instrument) -> tuple[float, float] | None:
     return float(x), float(y)
 
 
+def image_sigma_subap(instrument: Instrument) -> float | None:
+    """Return how far each image may lie beside its place, 1 σ along an axis, subapertures.
+
+    None if the instrument file says where the images lie.
+    """
+    if pyramid_in(instrument).image_offsets_subap is not None:
+        return None
+    return IMAGE_SIGMA_PX / _pixels(instrument)
+
+
+def image_floor(instrument: Instrument) -> NDArray[np.float64]:
+    """Return 1 σ of α ``(4,)`` by images that lie anywhere within ``image_sigma_subap``.
+
+    Numeric units. Rotation and magnification are moved at the pupil's edge.
+    """
+    sigma, radius = image_sigma_subap(instrument) or 0.0, instrument.wfs.pupil_diameter / 2.0
+    shift, edge = SHIFT_BY_IMAGES * sigma, EDGE_BY_IMAGES * sigma / radius
+    return np.array([shift, shift, edge, edge])
+
+
 def displaced(instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
     """Return the pyramid with its images beside their places ``(8,)``.
 
     Subapertures, axes of conventions.md: along x of the images at -x -y, +x -y, -x +y, +x +y, then
     along y.
     """
+    places = tuple((float(x), float(y)) for x, y in _in_rtc_axes(instrument, offsets))
+    return replace(pyramid_in(instrument), image_offsets_subap=places)
+
+
+def offsets_px(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return displacements ``(8,)`` of ``displaced`` as the file's key has them, ``(4, 2)``."""
+    return _in_rtc_axes(instrument, offsets) * _pixels(instrument)
+
+
+def _in_rtc_axes(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
     turned = turned_offsets(
         offsets.reshape(2, 2, 2).transpose(1, 2, 0),
         instrument.slopes.assumed_orientation,
         back=True,
     )
-    places = tuple((float(x), float(y)) for x, y in turned.reshape(4, 2))
-    return replace(pyramid_in(instrument), image_offsets_subap=places)
+    return turned.reshape(4, 2)
+
+
+def _pixels(instrument: Instrument) -> int:
+    """Return the detector pixels along a side of a subaperture."""
+    frames = instrument.frames
+    return frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1
 
 
 def turned_offsets(

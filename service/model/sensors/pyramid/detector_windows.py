@@ -19,6 +19,7 @@ from service.model.instrument import Instrument
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
 from service.model.sensors.pyramid.signals import signals_of
+from service.model.sensors.sensor import CannotTell
 from service.model.slopes import SlopeRecipe
 
 Array = NDArray[np.float64]
@@ -28,6 +29,9 @@ _REACH_PX = 16
 
 _AT_ONCE = 32
 """Frames that are cut together: more only need memory."""
+
+_FARTHEST_SUBAP = 0.5
+"""Distance from the middle of what is lit at which a place is not believed."""
 
 _DARK, _LIT = 0.25, 0.75
 """Shares of the typical light between which a pixel counts in part when images are looked for."""
@@ -95,9 +99,38 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
         raise ModelError(f"{instrument.name}: found wfs.input = slopes, expected frames")
     pixels = told.pixels_per_subaperture
     if told.centres_px is None:
-        centres = found_centres(flux_frame, instrument.wfs.pupil_diameter * pixels)
+        centres = _refined(instrument, flux_frame, pixels)
     else:
         centres = by_quadrant(told.centres_px)
+    return _windows_at(instrument, centres, flux_frame, pixels)
+
+
+def _refined(instrument: Instrument, flux_frame: Array, pixels: int) -> Array:
+    """Return the centres of the pupil images ``(2, 2, 2)`` in a mean frame, to 0.01 pixel.
+
+    The middle of what is lit is good to 0.1 pixel: light is diffracted between the images, and a
+    rim of grey pixels is lopsided. So the images are cut out there along whole pixels, and each is
+    compared with what the model shows. Where the light is another pupil's, or the frame ends too
+    near, the middle of what is lit stays.
+    """
+    from service.model.sensors.pyramid.light import image_places
+
+    centres = found_centres(flux_frame, instrument.wfs.pupil_diameter * pixels)
+    n = instrument.wfs.n_subapertures
+    between = (n * pixels / 2 - 0.5) % 1.0
+    whole = np.round(centres - between) + between
+    try:
+        images = _windows_at(instrument, whole, flux_frame, pixels).cut(flux_frame)
+    except ModelError:
+        return centres
+    places = image_places(images.transpose(0, 2, 1, 3).reshape(4, n, n), instrument)
+    if isinstance(places, CannotTell):
+        return centres
+    found = whole + pixels * places[:, ::-1].reshape(2, 2, 2)  # (x, y) to (row, column)
+    return found if np.abs(found - centres).max() < _FARTHEST_SUBAP * pixels else centres
+
+
+def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixels: int) -> Windows:
     n = instrument.wfs.n_subapertures
     shape = (flux_frame.shape[0], flux_frame.shape[1])
     windows = []

@@ -28,14 +28,18 @@ if TYPE_CHECKING:
     from service.model.slopes import SlopeRecipe
 
 
+_IMAGES = "image_offsets_px"
+
+
 class PyramidKind(SensorKind):
     """The modulated pyramid."""
 
     name = "pyramid"
     table = PyramidTable
-    unknown: ClassVar[Mapping[str, float]] = {
+    unknown: ClassVar[Mapping[str, float | None]] = {
         "wavelength_m": 750e-9,
         "modulation_lambda_over_d": 3.0,
+        _IMAGES: None,
     }
     signals = (SignalKind.XY, SignalKind.INTENSITY)
     normalised = True
@@ -155,7 +159,7 @@ class PyramidKind(SensorKind):
     @override
     def coarsest_sampling(self, sensor: Pyramid) -> int:
         # the phase of a modulation wide for its subapertures turns too fast for one point
-        wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.n_subapertures
+        wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.pupil_diameter
         return 2 if wide else 1
 
     @override
@@ -173,13 +177,18 @@ class PyramidKind(SensorKind):
         return "Pyramid", {"n_sides": 4, "dimensions": recipe.kind.n_planes}
 
     @override
-    def pixel_subap(self, instrument: Instrument) -> float | None:
-        from service.model.sensors.pyramid.description import FrameWindows, pyramid_in
+    def image_sigma_subap(self, instrument: Instrument) -> float | None:
+        from service.model.sensors.pyramid.description import image_sigma_subap
 
-        if pyramid_in(instrument).image_offsets_subap is not None:
-            return None
-        frames = instrument.frames
-        return 1.0 / frames.pixels_per_subaperture if isinstance(frames, FrameWindows) else 1.0
+        return image_sigma_subap(instrument)
+
+    @override
+    def image_floor(self, instrument: Instrument) -> NDArray[np.float64]:
+        from service.model.sensors.pyramid.description import image_floor
+
+        if f"wfs.{_IMAGES}" not in instrument.unknown:
+            return super().image_floor(instrument)
+        return image_floor(instrument)
 
     @override
     def displaced(self, instrument: Instrument, offsets: NDArray[np.float64]) -> Pyramid:
@@ -193,6 +202,14 @@ class PyramidKind(SensorKind):
 
         offsets = image_offsets(instrument)
         return None if offsets is None else offsets.reshape(4, 2)
+
+    @override
+    def offsets_px(
+        self, instrument: Instrument, offsets: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        from service.model.sensors.pyramid.description import offsets_px
+
+        return offsets_px(instrument, offsets)
 
     @override
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:

@@ -56,6 +56,12 @@ _LARGEST_RESIDUAL = 0.25
 
 _LARGEST_SIGMA_SUBAP = 1.0
 
+_PLACES_SAMPLING = 3
+"""Pupil points along a subaperture, and nodes, of the model that places are read with."""
+
+_PLACES_STEPS = 6
+_PLACES_SETTLED_SUBAP = 1e-3
+
 _FLOOR_SUBAP = 0.02
 """1 σ of what smooth light of any shape moves an edge."""
 
@@ -184,6 +190,37 @@ def find_image_offsets(counts: NDArray[Any], instrument: Instrument) -> ImageOff
         places = places + np.array([found[k][0][k] for k in each])
     sigma = np.hypot([found[k][1][k] for k in each], _OFFSET_FLOOR_SUBAP)
     return ImageOffsets(subap=places - places.mean(axis=0), sigma_subap=sigma)
+
+
+def image_places(counts: NDArray[Any], instrument: Instrument) -> Array | CannotTell:
+    """Return where each image lies ``(4, 2)``: x and y from its place on the grid, subapertures.
+
+    ``counts`` ``(4, n, n)`` are the mean light, cut out so that the images lie within half a
+    subaperture of their places. Every image is compared with that of an even beam, diffraction
+    between the images included, under smooth light of its own.
+
+    Raises
+    ------
+    ModelError
+        If the counts are not four images of the instrument's size.
+    """
+    images, _ = repaired(counts, instrument)
+    light = float(images.mean())
+    if not light > 0.0:
+        return CannotTell(reason=f"no light: the mean count is {light:g}; open the shutter")
+    optics, places, residual = even_optics(instrument, _PLACES_SAMPLING), np.zeros((4, 2)), 1.0
+    try:
+        for _ in range(_PLACES_STEPS):
+            there = replace(optics, offsets=places.reshape(2, 2, 2))
+            steps, _, residual = _departures(images / light, there, np.zeros(2))
+            places = places + np.clip(steps, -_LARGEST_STEP_SUBAP, _LARGEST_STEP_SUBAP)
+            if np.abs(steps).max() < _PLACES_SETTLED_SUBAP:
+                break
+    except np.linalg.LinAlgError:
+        return CannotTell(reason="the light has no edge the places could be read from")
+    if residual > _LARGEST_RESIDUAL:
+        return CannotTell(reason=f"the light is not that of the pupil: {residual:.0%} remain")
+    return places
 
 
 def even_optics(instrument: Instrument, sampling: int = 2) -> PyramidOptics:

@@ -88,7 +88,7 @@ def from_described(
         slopes.pop("order", None)
     slopes.setdefault("orientation", "auto")
     kept = {key: table for key, table in tables.items() if key not in {"wfs", "mirror", "slopes"}}
-    if "modes" in kept:
+    if "modes" in kept and "mode_to_actuator" in mirror.arrays:
         kept["modes"] = {k: v for k, v in kept["modes"].items() if k != "n_modes"}
     if kept.get("loop", {}).get("n_controlled", 0) > mirror.n_modes:
         kept["loop"] = {k: v for k, v in kept["loop"].items() if k != "n_controlled"}

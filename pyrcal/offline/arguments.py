@@ -349,6 +349,11 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
         "--instrument NAME|FILE",
         "telescope, sensor and mirror as a packaged instrument or a file describes them",
     )
+    basis = words(
+        "--basis BASIS",
+        "of positions alone: zonal, a column for each actuator, or KL, pyrcal's own modes",
+        choices=("zonal", "KL"),
+    )
     unit = words("--unit UNIT", "of the commands, OPD; default: unknown", choices=("m", "um", "nm"))
     sources = bring.add_subparsers(dest="source", required=True)
     for source, purpose, more in (
@@ -367,7 +372,7 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
         (
             "pyrtc",
             "from calibrations of pyRTC 2, or bare arrays",
-            (named, unit, described, *_REPORTED),
+            (named, unit, described, basis, *_REPORTED),
         ),
         (
             "aot",
@@ -380,8 +385,8 @@ def _describe_import(bring: argparse.ArgumentParser) -> None:
                 *_REPORTED,
             ),
         ),
-        ("files", "from NumPy, FITS or HDF5 files", (named, unit, described, *_REPORTED)),
-        ("npz", "the same as files", (named, unit, described, *_REPORTED)),
+        ("files", "from NumPy, FITS or HDF5 files", (named, unit, described, basis, *_REPORTED)),
+        ("npz", "the same as files", (named, unit, described, basis, *_REPORTED)),
     ):
         add(sources.add_parser(source, help=purpose), *more, folder)
 

@@ -35,6 +35,11 @@ class Mirror:
         """Whether a mode is one actuator."""
         return self.table.get("basis") == "zonal"
 
+    def become_modal(self, n_modes: int) -> None:
+        """Take modes that pyrcal makes of the actuators instead of the actuators themselves."""
+        del self.table["basis"]
+        self.n_modes, self.per_mode, self.defects = n_modes, (), {}
+
     def keep(self, modes: Array) -> None:
         """Leave out all but these modes of the basis."""
         for name in self.per_mode:

@@ -18,6 +18,7 @@ import numpy as np
 from pyrcal.offline.importers.files import Reported, from_arrays
 from pyrcal.offline.importers.imported import Array, Imported
 from pyrcal.offline.importers.layouts import check_binary
+from pyrcal.offline.recorded import file_sha256
 from service.errors import MatrixError
 from service.files.container import opened
 
@@ -59,7 +60,7 @@ RESPONSES = (
 
 PICTURES = {
     "valid": r"wfsmask",
-    "actuators": r"dmmask(?:ctrl)?",
+    "actuators": r"dmmask|dmmaskctrl",
     "light": r"wfsref",
 }
 """Other files that are used, and their roles."""
@@ -86,6 +87,8 @@ class _Folder:
     variables: dict[str, str]
     taken: list[str] = field(default_factory=list)
     used: set[Path] = field(default_factory=set)
+    copies: dict[Path, Path] = field(default_factory=dict)
+    """Files with the same bytes as another, and that other."""
 
     def find(self, pattern: str) -> list[Path]:
         """Return files whose name is the pattern, or ends in it after a separator."""
@@ -102,14 +105,30 @@ class _Folder:
         MatrixError
             If there are several that differ.
         """
-        found = {path.resolve(): path for path in self.find(pattern)}
+        found: list[Path] = []
+        for name in pattern.split("|"):
+            found = self._distinct(self.find(name))
+            if found:
+                break
         if len(found) > 1:
-            names = ", ".join(self.name(path) for path in sorted(found.values()))
+            names = ", ".join(self.name(path) for path in sorted(found))
             raise MatrixError(
                 f"{self.root}: found {len(found)} files for {purpose}: {names}; expected one: give "
                 "a folder that holds one, or --response NAME"
             )
-        return next(iter(found.values()), None)
+        return found[0] if found else None
+
+    def _distinct(self, paths: Sequence[Path]) -> list[Path]:
+        """Return the files without links to and copies of the others: ``conf`` has many."""
+        real = {path.resolve(): path for path in paths}
+        if len(real) < 2:
+            return list(real.values())
+        copies: dict[str, Path] = {}
+        for path in real:
+            first = copies.setdefault(file_sha256(path), path)
+            if first != path:
+                self.copies[path] = first
+        return [real[path] for path in copies.values()]
 
     def read(self, path: Path, purpose: str) -> Array:
         """Return the one array of a FITS file, and note what it is taken for."""
@@ -130,7 +149,8 @@ class _Folder:
         """Return a note for each file that was not used."""
         notes = []
         for path, name in sorted(self.files.items()):
-            if path.resolve() in self.used:
+            real = self.copies.get(path.resolve(), path.resolve())
+            if real in self.used:
                 continue
             reasons = (why for what, why in NOT_USED.items() if re.fullmatch(what, name))
             notes.append(f"ignored {self.name(path)}: {next(reasons, 'not needed')}")

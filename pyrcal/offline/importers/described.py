@@ -27,7 +27,6 @@ from service.config import instrument_path, load_instrument
 from service.config.sources import read_toml
 from service.errors import MatrixError
 from service.model.instrument import Instrument
-from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
 
 OFF_CENTRE_SUBAP = 0.25
 """Distance between the centres of the file and those of the light that is mentioned."""
@@ -73,7 +72,7 @@ def from_described(
         raise MatrixError(f"{source}: found no matrix, expected one beside the instrument file")
     notes = [f"telescope, sensor and mirror as {path.name} describes them"]
     mirror = _mirror(instrument, tables["mirror"], path.parent, arrays, notes)
-    signals = _signals(source, instrument, arrays, mirror, notes)
+    signals = _signals(source, instrument, tables["wfs"], arrays, mirror, notes)
     modes = usable_modes(signals, mirror, columns, notes)
     table = {**mirror.table}
     if unit is None:
@@ -89,7 +88,7 @@ def from_described(
         slopes.pop("order", None)
     slopes.setdefault("orientation", "auto")
     kept = {key: table for key, table in tables.items() if key not in {"wfs", "mirror", "slopes"}}
-    if "modes" in kept:
+    if "modes" in kept and "mode_to_actuator" in mirror.arrays:
         kept["modes"] = {k: v for k, v in kept["modes"].items() if k != "n_modes"}
     if kept.get("loop", {}).get("n_controlled", 0) > mirror.n_modes:
         kept["loop"] = {k: v for k, v in kept["loop"].items() if k != "n_controlled"}
@@ -135,13 +134,13 @@ def _mirror(
 def _signals(
     source: str,
     instrument: Instrument,
+    wfs: Mapping[str, Any],
     arrays: Mapping[str, Array],
     mirror: Mirror,
     notes: list[str],
 ) -> Signals:
-    windows = instrument.frames
     frames = read_frames(source, arrays, instrument.wfs.kind)
-    if isinstance(windows, FrameWindows) and frames is None:
+    if instrument.frames is not None and frames is None:
         raise MatrixError(
             f"{source}: matrix: found shape {np.shape(arrays['matrix'])}, expected camera frames: "
             'wfs.input = "frames"; give the mask of lit pixels or the mean frame beside them'
@@ -157,8 +156,8 @@ def _signals(
         signals.table = {"valid_subapertures": Dataset("valid_subapertures")}
         return signals
     table: dict[str, Any] = {}
-    if isinstance(windows, FrameWindows):
-        notes += _beside_the_light(windows, frames.light, frames.light_name)
+    if instrument.frames is not None:
+        notes += _beside_the_light(wfs, frames.light, frames.light_name)
     else:
         table = _windows(source, instrument, frames, notes)
     return Signals(
@@ -190,21 +189,21 @@ def _windows(
     }
 
 
-def _beside_the_light(windows: FrameWindows, light: Array, name: str) -> list[str]:
+def _beside_the_light(wfs: Mapping[str, Any], light: Array, name: str) -> list[str]:
     """Return a note if the centres of the file do not lie where the light is."""
-    if windows.centres_px is None:
+    centres = wfs.get("pupil_centres_px", "auto")
+    if centres == "auto":
         return []
     try:
-        images = find_pupil_images(light, name)
-        found = by_quadrant(images.centres_px).reshape(4, 2)
+        found = find_pupil_images(light, name).centres_px
     except MatrixError:
         return []
-    expected = by_quadrant(windows.centres_px).reshape(4, 2)
-    away = np.hypot(*(found - expected).T) / windows.pixels_per_subaperture
-    if away.max() <= OFF_CENTRE_SUBAP:
+    apart = np.hypot(*np.moveaxis(found[:, None] - np.asarray(centres, float), -1, 0))
+    away = float(apart.min(axis=1).max()) / wfs.get("pixels_per_subaperture", 1)
+    if away <= OFF_CENTRE_SUBAP:
         return []
     words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in found)
     return [
-        f"wfs.pupil_centres_px lie up to {away.max():.2f} subapertures beside the pupil images in "
+        f"wfs.pupil_centres_px lie up to {away:.2f} subapertures beside the pupil images in "
         f"{name}, which are centred at {words}: change the key if the light is right"
     ]

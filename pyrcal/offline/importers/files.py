@@ -78,6 +78,10 @@ class Reported:
     columns: Array | None = None
     """``(n_columns,)`` basis index of each column; None: the first ones."""
 
+    basis: str | None = None
+    """What columns of positions without ``mode_to_actuator`` are: ``zonal``, one for each actuator;
+    ``KL``, the modes that pyrcal makes of them; None: zonal if there are as many."""
+
     @property
     def kind(self) -> str:
         """Kind of the sensor."""
@@ -147,6 +151,7 @@ def from_arrays(
             frames, mirror.n_actuators, reported.pixels_per_subaperture, source, notes
         )
         signals = Signals(table=table, arrays=kept, obscuration_ratio=ratio, columns=0)
+    turbulence = _own_modes(source, signals, mirror, reported)
     modes = usable_modes(signals, mirror, reported.columns, notes, column_numbers)
     if reported.unit is None:
         mirror.table["stroke"] = UNKNOWN
@@ -173,6 +178,7 @@ def from_arrays(
             },
             "wfs": sensor,
             "mirror": mirror.table,
+            **turbulence,
             "slopes": {
                 # slopes made of frames have the order of the program itself
                 **({} if frames else {"order": reported.order}),
@@ -182,6 +188,37 @@ def from_arrays(
         arrays={**signals.arrays, **modes, **mirror.arrays},
         notes=(*notes, *(f"{key} is unknown" for key, v in sensor.items() if v == UNKNOWN)),
     )
+
+
+def _own_modes(
+    source: str, signals: Signals, mirror: Mirror, reported: Reported
+) -> dict[str, dict[str, int]]:
+    """Return ``[modes]`` if the columns are Karhunen-Loeve modes of pyrcal's own; else nothing.
+
+    Raises
+    ------
+    MatrixError
+        If there are fewer columns than actuators and nothing says what they are.
+    """
+    n_columns, columns = signals.n_columns, reported.columns
+    if not mirror.is_zonal:
+        if reported.basis is not None:
+            raise MatrixError(
+                f"{source}: --basis: found it beside modes of the mirror, expected it beside "
+                "positions of actuators alone"
+            )
+        return {}
+    if reported.basis == "KL":
+        n_modes = n_columns if columns is None else int(max(columns)) + 1
+        mirror.become_modal(n_modes)
+        return {"modes": {"n_modes": n_modes}}
+    if reported.basis is None and columns is None and n_columns < mirror.n_actuators:
+        raise MatrixError(
+            f"{source}: matrix: found {n_columns} columns of {mirror.n_actuators} actuators, "
+            "expected one for each; give mode_to_actuator=FILE for modes of your own, --basis KL "
+            "for pyrcal's Karhunen-Loeve modes, or --basis zonal --modes LIST for some actuators"
+        )
+    return {}
 
 
 def read_frames(source: str, arrays: Mapping[str, Array], kind: str) -> Frames | None:

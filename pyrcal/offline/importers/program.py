@@ -155,6 +155,7 @@ def _reported(options: argparse.Namespace) -> Reported:
         pupil_diameter_subap=options.pupil_subap,
         pixels_per_subaperture=options.pixels_per_subap,
         columns=options.modes,
+        basis=getattr(options, "basis", None),
         centroid="gradient" if options.source == "synim" else None,
         unit=getattr(options, "unit", UNIT if options.source in {"specula", "synim"} else None),
     )

@@ -146,6 +146,34 @@ def test_links_to_one_file_are_one_file_and_another_response_can_be_asked_for(tm
         from_cacao(tmp_path, REPORTED, "other")
 
 
+def test_a_conf_folder_with_its_copies_and_hadamard_pokes_is_imported_as_it_is(tmp_path):
+    """As cacao-aorun-030, 031 and 039 leave it: each result is linked or copied once more."""
+    maps, _ = a_grid(tmp_path)
+    modes = np.random.default_rng(5).normal(size=(16, 4, 4)).astype(np.float32)
+    measured = np.tensordot(modes.reshape(16, 16), maps, axes=1).astype(np.float32)
+    (tmp_path / "loop.zrespM.fits").unlink()
+    for folder, name, values in (
+        ("RMmodesDM", "HpokeC", modes),
+        ("RMmodesWFS", "HpokeC.WFSresp", measured),
+        ("CMmodesDM", "CMmodesDM", modes[:5]),
+        ("CMmodesWFS", "CMmodesWFS", measured[:5]),
+    ):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        fits.writeto(tmp_path / folder / f"{name}.fits", values)
+        plain = f"{folder}.fits"
+        if folder.startswith("RM"):
+            (tmp_path / folder / plain).symlink_to(tmp_path / folder / f"{name}.fits")
+            fits.writeto(tmp_path / f"RMmeas_{folder[2:]}.fits", values)
+        else:
+            fits.writeto(tmp_path / plain, values)
+    found = from_cacao(tmp_path, REPORTED)
+    assert found.arrays["mode_to_actuator"].shape == (16, 16)
+    low = from_cacao(tmp_path, REPORTED, "CMmodesWFS")
+    assert low.arrays["mode_to_actuator"].shape == (16, 5)
+    fits.writeto(tmp_path / "RMzrec_modesWFS.fits", maps.astype(np.float32))
+    assert "mode_to_actuator" not in from_cacao(tmp_path, REPORTED).arrays
+
+
 def test_two_responses_of_one_kind_are_refused_by_name(tmp_path):
     maps, _ = a_grid(tmp_path)
     fits.writeto(tmp_path / "second.zrespM.fits", 2 * maps)

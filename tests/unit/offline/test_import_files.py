@@ -532,3 +532,20 @@ def test_the_kind_of_sensor_is_that_of_its_subapertures():
     assert found.tables["wfs"]["kind"] == "shack-hartmann"
     with pytest.raises(MatrixError, match="subapertures of a shack-hartmann"):
         from_specula(synim, replace(REPORTED, sensor="pyramid"))
+
+
+def test_fewer_columns_than_actuators_must_be_explained(tmp_path):
+    """Forty KL modes of 140 actuators are not the first forty actuators."""
+    places = np.random.default_rng(10).normal(size=(9, 2))
+    given = {"matrix": MATRIX, "valid": VALID, "positions": places}
+    with pytest.raises(MatrixError, match="found 5 columns of 9 actuators"):
+        from_arrays("it", given, REPORTED)
+    modal = from_arrays("it", given, replace(REPORTED, basis="KL"))
+    assert "basis" not in modal.tables["mirror"]
+    assert modal.tables["modes"] == {"n_modes": 5}
+    assert pyrcal.load_instrument(modal.save(tmp_path / "kl").instrument).modes.n_modes == 5
+    some = np.array([0, 2, 3, 5, 8])
+    zonal = from_arrays("it", given, replace(REPORTED, basis="zonal", columns=some))
+    np.testing.assert_array_equal(zonal.arrays["modes"], some)
+    with pytest.raises(MatrixError, match="--basis: found it beside modes"):
+        from_arrays("it", arrays(), replace(REPORTED, basis="KL"))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.instrument import Instrument
+from service.model.kinds import Stop
 from service.model.pupil import rtc_valid_subapertures
 from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
 from service.model.sensors.pyramid.signals import signals_of
@@ -32,6 +33,9 @@ _AT_ONCE = 32
 
 _FARTHEST_SUBAP = 0.5
 """Distance from the middle of what is lit at which a place is not believed."""
+
+_BESIDE_SUBAP = 0.25
+"""Distance of the centres of the file from the light that is mentioned."""
 
 _DARK, _LIT = 0.25, 0.75
 """Shares of the typical light between which a pixel counts in part when images are looked for."""
@@ -142,12 +146,39 @@ def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixel
 
 
 def remarks_on_windows(instrument: Instrument, flux_frame: NDArray[np.floating]) -> Iterator[str]:
-    """Yield where the pupil images were found, where the instrument does not tell."""
-    told = instrument.frames
-    if isinstance(told, FrameWindows) and told.centres_px is None:
-        centres = frame_windows(instrument, flux_frame.astype(np.float64)).centres_px.reshape(4, 2)
-        words = ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
-        yield f"shifts count from the pupil images as found: pupil_centres_px = [{words}]"
+    """Yield where the pupil images were found, or how far they are from where they should be."""
+    windows = instrument.frames
+    if not isinstance(windows, FrameWindows):
+        return
+    light = flux_frame.astype(np.float64)
+    if windows.centres_px is None:
+        centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
+        found = f"pupil_centres_px = [{_listed(centres)}]"
+        yield f"shifts count from the pupil images as found: {found}"
+    elif instrument.stop is not Stop.MIRROR:  # with it the images move
+        yield from _beside_the_light(instrument, windows, light)
+
+
+def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Array) -> Iterator[str]:
+    """Yield that the centres of the file lie beside the pupil images of the flux frame."""
+    if windows.centres_px is None:
+        return
+    pixels = windows.pixels_per_subaperture
+    try:
+        found = found_centres(light, instrument.wfs.pupil_diameter * pixels).reshape(4, 2)
+    except ModelError:
+        return
+    expected = by_quadrant(windows.centres_px).reshape(4, 2)
+    away = float(np.hypot(*(found - expected).T).max()) / pixels
+    if away > _BESIDE_SUBAP:
+        yield (
+            f"wfs.pupil_centres_px lie up to {away:.2f} subapertures beside the pupil images of "
+            f"the flux frame, which are centred at [{_listed(found)}]: correct the key"
+        )
+
+
+def _listed(centres: Array) -> str:
+    return ", ".join(f"[{row:.2f}, {column:.2f}]" for row, column in centres)
 
 
 def slopes_from_frames(

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from service.errors import ModelError
-from service.model.kinds import Normalisation
+from service.model.kinds import Normalisation, Stop
 from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
 from service.model.sensors.pyramid.detector_windows import (
     found_centres,
     frame_windows,
+    remarks_on_windows,
     slopes_from_frames,
     slopes_per_unit,
 )
 from service.model.slopes import SlopeRecipe
 from tests.numerics import small_instrument
+from tests.unit.offline.discs import four_discs
 
 RECTANGLE = np.array([[14.0, 15.0], [14.0, 45.0], [44.0, 15.0], [44.0, 45.0]])
 
@@ -162,3 +164,15 @@ def test_pupils_of_74_pixels_34_pixels_off_a_rectangle_are_found(fringes):
 def test_pupils_of_another_size_are_refused():
     with pytest.raises(ModelError, match=r"as large as a disc of 7\d.*; expected four pupil .* 60"):
         found_centres(discs(RECTANGLE * 3.3, 74.0), 60.0)
+
+
+def test_centres_half_a_subaperture_beside_the_light_are_said():
+    """Slopes of such windows look like another instrument's."""
+    about = bench(RECTANGLE)
+    light = four_discs(60, RECTANGLE, about.wfs.pupil_diameter * 2)
+    assert list(remarks_on_windows(about, light)) == []
+    moved = replace(bench(RECTANGLE + np.array([1.0, 0.0])), stop=Stop.TELESCOPE)
+    (remark,) = remarks_on_windows(moved, light)
+    assert "up to 0.5" in remark
+    assert "[14.0" in remark
+    assert list(remarks_on_windows(replace(moved, stop=Stop.MIRROR), light)) == []

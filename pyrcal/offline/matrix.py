@@ -23,6 +23,7 @@ from pyrcal.offline.instrument_checks import (
     found_optics,
     rivals,
 )
+from pyrcal.offline.left_over import arms_of
 from pyrcal.offline.methods import (
     Landing,
     ScanStep,
@@ -384,7 +385,9 @@ def _answer(
     optics = found_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)
     without = as_told(as_in_file, settled) if any(one.notable for one in optics) else None
-    tried = alternatives(settled, few, others, pupils, optics, without)
+    left_map = _residual_map(found)
+    arms_deg = tuple(arm.angle_deg for arm in arms_of(left_map))
+    tried = alternatives(settled, few, others, pupils, optics, without, arms_deg)
     sure = before.with_moves(
         np.array([doubt_of_width(settled, few), *(one.moved for one in tried)]),
         np.array([OTHER_SHARE, *(one.sigma_share for one in tried)])
@@ -415,7 +418,7 @@ def _answer(
         covariance=sure.covariance,
         gains=seen.gains,
         residual_fraction=residual_fraction,
-        residual_map=_residual_map(found),
+        residual_map=left_map,
         residual_by_mode=settled.by_mode,
         condition_number=_condition_number(solution.matrix),
         modes=target.modes,

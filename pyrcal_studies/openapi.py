@@ -309,6 +309,14 @@ class FitDocument(BaseModel):
     verdict: str
     """Begins with "accepted" or "refused"; names what was left out."""
 
+    registration: dict[str, Any] | None = None
+    """Whether the registration is determined: determined, reason, sigma_statistical,
+    sigma_systematic (by name), disjoint_sets."""
+
+    reconstructor: dict[str, Any] | None = None
+    """Whether the model's reconstructor holds the loop of the measured matrix: stable_modes of
+    n_modes, gain, pole_radius, pole_radius_all, wavefront_ratio, noise_limited, reason."""
+
     anamorphosis: list[float] | None = None
     """Stretch of the mirror's image along x over the mean of both axes, less 1, and along 45 deg;
     null: the modes do not tell, or it was not to be fitted."""

@@ -43,6 +43,9 @@ EXCLUDED = 3.0
 NOTABLE_AXES = 0.02
 """Of the gain of Sx over that of Sy, less 1."""
 
+ARM_SUBAP = 0.5
+"""Width of the arms that are tried, subapertures; that which explains most is found from it."""
+
 MODULATION_STEP = 0.1
 """Share by which a modulation is taken for another, to see what it moves."""
 
@@ -95,6 +98,7 @@ def alternatives(
     pupils: tuple[TriedPupil, ...],
     optics: tuple[FoundOptic, ...],
     without: AsTold | None,
+    arms_deg: tuple[float, ...] = (),
 ) -> tuple[Alternative, ...]:
     """Return every alternative that was tried, those that the matrix prefers first.
 
@@ -108,6 +112,8 @@ def alternatives(
         Other obscurations and diameters.
     optics, without
         What was fitted of the instrument, and the fit without where they differ.
+    arms_deg
+        Directions of lines in what is left over.
     """
     beside = (_of_pupil(one, others) for one in pupils)
     found = [
@@ -116,6 +122,7 @@ def alternatives(
         *_that_can(_off_centre(few)),
         *_that_can(_axes_apart(few)),
         *_that_can(_uneven_light(few)),
+        *_that_can(_spiders(few, arms_deg)),
         *_that_can(_optics(settled, optics, without)),
         *_that_can(_held(settled)),
         *_that_can(_wavelength(few)),
@@ -261,6 +268,32 @@ def _uneven_light(few: Few) -> Iterator[Alternative]:
         moved=moved,
         undecided=is_open(lead),
         key="--gain-map",
+        counts=True,
+    )
+
+
+def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
+    """Yield arms of a spider where lines in what is left over look like them."""
+    about = few.models.instrument
+    if not arms_deg or about.spiders_deg or about.pupil is not None:
+        return
+    width_m = ARM_SUBAP * about.subaperture_m
+    shaded = few.matrix(few.of(replace(about, spiders_m=width_m, spiders_deg=arms_deg)))
+    rate = shaded - few.own
+    if not few.tells(few.own, rate):
+        return
+    (width,), lead, moved = _fitted_as_well(few, rate)
+    if width <= 0.0:
+        return  # brighter, not darker: no shadow
+    angles = ", ".join(f"{angle:.0f}" for angle in arms_deg)
+    words = f"spiders_m = {width * width_m:.2g}, spiders_deg = [{angles}]"
+    yield Alternative(
+        words=words,
+        share=lead.share,
+        moved=moved,
+        preferred=bool(lead.share < BETTER and lead.significance > SIGNIFICANT),
+        undecided=is_open(lead),
+        key=words,
         counts=True,
     )
 

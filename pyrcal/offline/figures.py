@@ -176,8 +176,22 @@ def residual(axes: Axes, fit: Fit) -> None:
         n, planes = len(fit.valid), np.arange(len(fit.residual_map))
         places = x + n * (planes % 2), y + n * (planes // 2)
         axes.plot(*places, "o", color="tab:red", fillstyle="none", markersize=9.0)
+    _draw_arms(axes, fit)
     axes.set(title=f"left over: {_shown(fit)}, % of the measured RMS", xticks=[], yticks=[])
     axes.figure.colorbar(image, ax=axes, shrink=0.7)
+
+
+def _draw_arms(axes: Axes, fit: Fit) -> None:
+    """Draw the lines along which more is left over, in the first plane."""
+    if fit.left_over is None:
+        return
+    middle, half = (len(fit.valid) - 1) / 2, len(fit.valid) / 2
+    for arm in fit.left_over.arms:
+        angle = np.deg2rad(arm.angle_deg)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        foot = middle + arm.offset_subap * np.array([-along[1], along[0]])
+        ends = foot + np.outer([0.35 * half, 0.95 * half], along)
+        axes.plot(ends[:, 0], ends[:, 1], "-", color="white", linewidth=1.0)
 
 
 def residual_by_mode(axes: Axes, fit: Fit) -> None:

@@ -24,6 +24,49 @@ NAMED = 8
 """At most so many are named."""
 
 
+RIM = 1.8
+"""The border over the inside from which on a rim is named."""
+
+UNEVEN_PLANES = 1.25
+"""One component over the mean of both from which on it is named."""
+
+GRADIENT = 0.6
+"""Change across the pupil over the mean from which on a gradient is named."""
+
+ARM_EXCESS = 1.35
+"""Along an arm so many times what is left over elsewhere at the same radius, ..."""
+
+ARM_SIGMA = 6.0
+"""... by this many σ of the mean along it."""
+
+MIN_ARMS, MAX_ARMS = 2, 4
+
+_ARM_ANGLES = np.arange(0.0, 360.0, 3.0)
+
+_ARM_OFFSETS = np.arange(-0.25, 0.2501, 0.0625)
+"""Distances of the line of an arm from the middle, pupil radii: not all arms are radial."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Arm:
+    """A line from the middle of the pupil outwards along which more is left over."""
+
+    angle_deg: float
+    """Its direction, from +x towards +y, in the axes found."""
+
+    offset_subap: float
+    """Distance of the line from the middle, to its left; 0 is radial."""
+
+    excess: float
+    """What is left over along it over that elsewhere at the same radius."""
+
+    @property
+    def words(self) -> str:
+        """Place and size in a few words."""
+        off = f", {self.offset_subap:+.1f} subapertures off" if self.offset_subap else ""
+        return f"{self.angle_deg:.0f} deg{off} ({self.excess:.1f} times as much)"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LeftOver:
     """Where the residual of a fit is."""
@@ -38,10 +81,42 @@ class LeftOver:
     modes: tuple[tuple[int, float], ...]
     """Basis index and RMS share left over of modes that stand out, largest first."""
 
+    arms: tuple[Arm, ...] = ()
+    """Lines from the middle outwards along which more is left over, the clearest first."""
+
+    planes: tuple[float, ...] = ()
+    """RMS left over in each plane of signals (Sx and Sy, or the four images) over the mean."""
+
+    gradient: tuple[float, float] = (0.0, 0.0)
+    """Change of what is left over across the pupil along x and along y, over its mean."""
+
     @property
     def words(self) -> str:
         """Where something stands out; empty: nowhere."""
         parts = []
+        if self.arms:
+            named = ", ".join(arm.words for arm in self.arms)
+            parts.append(
+                f"lines from the middle outwards, as the arms of a secondary make: {named} "
+                "(spiders_m, spiders_deg)"
+            )
+        if self.border is not None and self.border > RIM:
+            parts.append(
+                f"the rim leaves {self.border:.1f} times as much as the inside "
+                "(pupil_diameter_subap, valid_subapertures)"
+            )
+        if len(self.planes) == 2 and max(self.planes) > UNEVEN_PLANES:
+            worse = "x" if self.planes[0] > self.planes[1] else "y"
+            parts.append(
+                f"S{worse} leaves {max(self.planes) / min(self.planes):.1f} times as much as the "
+                "other component"
+            )
+        if np.hypot(*self.gradient) > GRADIENT:
+            angle = np.rad2deg(np.arctan2(self.gradient[1], self.gradient[0]))
+            parts.append(
+                f"it grows by {np.hypot(*self.gradient):.0%} of its mean across the pupil towards "
+                f"{angle:.0f} deg: light that is uneven (--flux-map, --gain-map)"
+            )
         if self.subapertures:
             named = ", ".join(f"row {y} column {x}" for y, x, _ in self.subapertures)
             parts.append(
@@ -82,7 +157,97 @@ def left_over(
         border=float(_rms(at_border) / _rms(inside)) if inside.any() and at_border.any() else None,
         subapertures=tuple(_strange_places(by_place, border)),
         modes=tuple(_strange_modes(by_mode, size, modes)),
+        arms=tuple(_arms(by_place)),
+        planes=_by_plane(planes),
+        gradient=_gradient(by_place),
     )
+
+
+def _by_plane(planes: Array) -> tuple[float, ...]:
+    """Return the RMS of each plane over the mean of all; equal where nothing is left."""
+    each = np.sqrt(np.nanmean(planes**2, axis=(1, 2)))
+    mean = float(np.mean(each))
+    return tuple(float(one / mean) if mean > 0.0 else 1.0 for one in each)
+
+
+def _gradient(by_place: Array) -> tuple[float, float]:
+    """Return the change across the pupil along x and y over the mean."""
+    rows, columns = np.nonzero(np.isfinite(by_place))
+    values = by_place[rows, columns]
+    if len(values) < _FEWEST_PLACES or not values.mean() > 0.0:
+        return 0.0, 0.0
+    half = max(np.ptp(rows), np.ptp(columns)) / 2.0
+    plane = np.column_stack([np.ones(len(values)), columns - columns.mean(), rows - rows.mean()])
+    _, x, y = np.linalg.lstsq(plane, values, rcond=None)[0] * 2.0 * half / values.mean()
+    return float(x), float(y)
+
+
+def arms_of(planes: Array) -> tuple[Arm, ...]:
+    """Return the arms in a residual map ``(n_planes, n, n)``, the clearest first."""
+    known = np.isfinite(planes).any(axis=0)
+    by_place = np.full(known.shape, np.nan)
+    squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
+    by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
+    return tuple(_arms(by_place))
+
+
+def _arms(by_place: Array) -> list[Arm]:
+    """Return lines along which more is left over, the clearest first."""
+    rows, columns = np.nonzero(np.isfinite(by_place))
+    if len(rows) < _FEWEST_PLACES:
+        return []
+    middle = (np.array(by_place.shape) - 1) / 2
+    x, y = columns - middle[1], rows - middle[0]
+    radius = float(np.hypot(x, y).max())
+    excess = _excess(by_place[rows, columns], np.hypot(x, y) / radius)
+    scatter = 1.4826 * float(np.median(np.abs(excess - np.median(excess))))
+    found: list[tuple[float, Arm]] = []
+    for angle in _ARM_ANGLES:
+        along, across = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+        forward, left = along * x + across * y, along * y - across * x
+        for offset in _ARM_OFFSETS * radius:
+            on = (np.abs(left - offset) < _ARM_WIDTH) & (forward > 0.35 * radius)
+            if on.sum() < _FEWEST_ALONG:
+                continue
+            # the median, so that one bad subaperture makes no arm
+            mean = float(np.median(excess[on]))
+            beside = (np.abs(np.abs(left - offset) - 3.0 * _ARM_WIDTH) < _ARM_WIDTH) & (
+                forward > 0.35 * radius
+            )
+            if not beside.any() or mean < ARM_EXCESS * float(np.quantile(excess[beside], 0.7)):
+                continue  # broad: no arm
+            significance = (mean - 1.0) / max(scatter * 1.25 / np.sqrt(on.sum()), 1e-9)
+            if mean > ARM_EXCESS and significance > ARM_SIGMA:
+                arm = Arm(angle_deg=float(angle), offset_subap=round(float(offset), 1), excess=mean)
+                found.append((significance, arm))
+    return _apart(found)
+
+
+def _excess(values: Array, away: Array) -> Array:
+    """Return values over the median of their ring; ``away`` is 1 at the edge."""
+    ring = np.minimum((away * _RINGS).astype(int), _RINGS - 1)
+    typical = np.ones(_RINGS)
+    for k in np.unique(ring):
+        typical[k] = np.median(values[ring == k])
+    return np.asarray(values / np.where(typical > 0.0, typical, 1.0)[ring])
+
+
+def _apart(found: list[tuple[float, Arm]]) -> list[Arm]:
+    """Return the clearest of lines in about the same direction; one alone is no spider."""
+    chosen: list[Arm] = []
+    for _, arm in sorted(found, key=lambda one: -one[0]):
+        apart = [abs((arm.angle_deg - other.angle_deg + 180.0) % 360.0 - 180.0) for other in chosen]
+        if all(one > _ARMS_APART_DEG for one in apart):
+            chosen.append(arm)
+    return chosen[:MAX_ARMS] if len(chosen) >= MIN_ARMS else []
+
+
+_FEWEST_PLACES, _FEWEST_ALONG, _RINGS = 100, 5, 6
+
+_ARM_WIDTH = 0.75
+"""Half of the width of a line, subapertures."""
+
+_ARMS_APART_DEG = 35.0
 
 
 def _rms(values: Array) -> float:

@@ -24,6 +24,7 @@ from pyrcal.offline.instrument_checks import (
     found_optics,
     rivals,
 )
+from pyrcal.offline.left_over import arms_of
 from pyrcal.offline.methods import (
     Landing,
     ScanStep,
@@ -394,7 +395,9 @@ def _answer(
     optics = found_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)
     without = as_told(as_in_file, settled) if any(one.notable for one in optics) else None
-    tried = alternatives(settled, few, others, pupils, optics, without)
+    left_map = _residual_map(found)
+    arms_deg = tuple(arm.angle_deg for arm in arms_of(left_map))
+    tried = alternatives(settled, few, others, pupils, optics, without, arms_deg)
     moves = [doubt_of_width(settled, few), *(one.moved for one in tried)]
     shares = [OTHER_SHARE, *(one.sigma_share for one in tried)]
     if without is not None and without.as_likely:
@@ -429,7 +432,7 @@ def _answer(
         covariance=sure.covariance,
         gains=seen.gains,
         residual_fraction=residual_fraction,
-        residual_map=_residual_map(found),
+        residual_map=left_map,
         residual_by_mode=settled.by_mode,
         condition_number=_condition_number(solution.matrix),
         modes=target.modes,

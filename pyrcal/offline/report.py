@@ -168,6 +168,12 @@ def _left_over(left: LeftOver) -> dict[str, Any]:
             {"row": y, "column": x, "share": share} for y, x, share in left.subapertures
         ],
         "modes": [{"mode": mode, "share": share} for mode, share in left.modes],
+        "arms": [
+            {"angle_deg": arm.angle_deg, "offset_subap": arm.offset_subap, "excess": arm.excess}
+            for arm in left.arms
+        ],
+        "planes": list(left.planes),
+        "gradient": list(left.gradient),
     }
 
 

@@ -239,6 +239,8 @@ export class Measurements {
     const { orientation: o } = found;
     const facts = [
       ...(found.recommendation ? [found.recommendation] : []),
+      ...(found.registration ? [`Registration ${found.registration.determined ? "" : "not "}determined`] : []),
+      ...(found.reconstructor ? [`Reconstructor ${found.reconstructor.reason}`] : []),
       `${found.n_modes_used} modes, ${number(100 * found.residual_fraction, 1)} % left over, condition ${number(found.condition_number, 1)}, ${number(found.seconds, 1)} s`,
       `slopes ${o.order}${o.swap_xy ? ", x and y swapped" : ""}${o.flip_x ? ", x flipped" : ""}${o.flip_y ? ", y flipped" : ""}, sign ${o.sign}`,
       ...found.notes,

@@ -102,7 +102,7 @@ def test_whatever_coupling_is_told_the_registration_is_right_and_the_coupling_fo
     found = fitted(about, zonal() @ MODES if modal else zonal())
     assert found.accepted
     assert np.all(sigmas_off(found) < 3.0)
-    assert np.all(found.sigma < [2e-3, 2e-3, np.deg2rad(0.01), 5e-4])
+    assert np.all(found.sigma < [2e-3, 2e-3, np.deg2rad(0.01), 1e-3])
     width = {one.optic: one for one in found.optics}[Optic.WIDTH]
     assert width.found == pytest.approx(COUPLING, abs=0.01)
     named = any(f"coupling = {width.found:.3g}" in remark for remark in found.remarks)
@@ -213,11 +213,13 @@ def noisy(share: float) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.0, 0.15])
 @pytest.mark.parametrize("told", [0.25, 0.3])
-def test_an_obscuration_told_wrong_is_refused_and_the_right_one_named(told, noise):
-    found = fitted(masked(replace(bench(), obscuration_ratio=told)), noisy(noise))
-    assert not found.accepted
-    named = re.search(r"obscuration_ratio = (0\.\d+)", found.verdict)
-    assert named is not None, found.verdict
+def test_an_obscuration_told_wrong_is_in_sigma_and_the_right_one_advised(told, noise):
+    about = masked(replace(bench(), obscuration_ratio=told))
+    found = fitted(about, noisy(noise), explain=True)
+    assert not found.accepted or np.all(sigmas_off(found) < 3.0)
+    said = found.recommendation + found.verdict
+    named = re.search(r"obscuration_ratio = (0\.\d+)", said)
+    assert named is not None, said
     assert float(named[1]) == pytest.approx(OBSCURATION, abs=0.04)
 
 
@@ -229,16 +231,15 @@ def test_noise_that_nobody_has_told_of_is_no_cause_to_refuse(noise):
     assert np.all(sigmas_off(found) < 3.0)
 
 
-def test_what_no_cause_explains_is_refused_and_says_how_much_it_is():
-    """An arm across the pupil of which the file has no key, and which is not smooth."""
+def test_a_shade_that_nothing_explains_moves_the_registration_by_less_than_sigma_allows():
+    """An arm across the pupil that is not smooth: 10 % of the signal are left over."""
     rows, columns = np.nonzero(lit_subapertures(bench()))
     shaded = np.where(np.abs(rows - columns) < 2, 0.6, 1.0)
     shaded *= np.where((rows + columns) % 5 == 0, 1.3, 1.0)
     found = fitted(bench(), zonal() * np.tile(shaded, 2)[:, None])
-    assert not found.accepted
-    assert re.search(
-        r"leaves 1\d% of the signal that is no noise, expected at most 9%", found.verdict
-    )
+    assert found.residual_fraction > 0.1
+    assert found.accepted
+    assert np.all(sigmas_off(found) < 3.0)
 
 
 @pytest.mark.parametrize("factor", [0.98, 1.02])
@@ -249,8 +250,11 @@ def test_a_diameter_told_wrong_is_a_magnification_and_is_told_to_be_one_or_the_o
     assert any("diameter_m" in remark for remark in found.remarks)
 
 
-def test_a_pupil_told_two_percent_small_is_refused_and_the_right_one_named():
+def test_a_pupil_told_two_percent_small_is_a_magnification_and_the_right_one_advised():
     wfs = replace(bench().wfs, pupil_diameter_subap=N * 0.98)
-    found = fitted(masked(replace(bench(), wfs=wfs)))
-    assert not found.accepted
-    assert re.search(r"pupil_diameter_subap = 12(\.1)? ", found.verdict), found.verdict
+    found = fitted(masked(replace(bench(), wfs=wfs)), explain=True)
+    as_told = TRUTH.vector * [1.0, 1.0, 1.0, 1.0 / 0.98]
+    off = np.abs(found.alpha.vector - as_told) / found.sigma
+    assert not found.accepted or np.all(off < 3.0)
+    said = found.recommendation + found.verdict
+    assert re.search(r"pupil_diameter_subap = 12(\.1)?\b", said), said

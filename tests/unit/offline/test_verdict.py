@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal.offline.matrix import FitOptions
 from service.model.kinds import SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.pupil import Illumination
@@ -21,6 +22,7 @@ from tests.unit.estimation.bench import (
 STRAIGHT = replace(ELSEWHERE, magnification=1.006)
 """So near to 1 that neither pitch nor diameter is doubted."""
 
+EXPLAIN = FitOptions(explain=True)
 RNG = np.random.default_rng(3)
 
 
@@ -30,9 +32,10 @@ def changed(**wfs):
 
 @pytest.mark.parametrize(("true", "assumed"), [tuple(Stop), tuple(Stop)[::-1]])
 def test_a_wrong_stop_is_recognised_and_the_right_one_named(true, assumed):
-    found = fit(matrix(about=replace(instrument(), stop=true)), replace(instrument(), stop=assumed))
-    assert not found.accepted
-    assert f'stop = "{true}"' in found.verdict
+    about = replace(instrument(), stop=assumed)
+    found = fit(matrix(about=replace(instrument(), stop=true)), about, options=EXPLAIN)
+    assert not found.accepted or np.all(np.abs(error(found)) < 3.0 * found.sigma)
+    assert f'stop = "{true}"' in found.verdict + found.recommendation
 
 
 @pytest.mark.parametrize(("factor", "named"), [(0.5, "1.5 "), (2.0, "5.99 ")])
@@ -165,9 +168,19 @@ def test_noise_alone_is_refused():
     assert not found.accepted
 
 
-def test_as_much_noise_as_signal_is_refused_with_the_share_left_over():
+def test_as_much_noise_as_signal_determines_the_registration_as_far_as_sigma_says():
     found = fit(matrix(noise=1.0))
-    assert "of the signal unexplained" in found.verdict
+    assert found.accepted, found.verdict
+    assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
+
+
+def test_columns_of_noise_alone_are_named_and_left_out():
+    dead = matrix()
+    dead[:, [3, 20, 30]] = 0.3 * dead.std() * RNG.normal(size=(len(dead), 3))
+    found = fit(dead)
+    assert found.accepted, found.verdict
+    assert any("3 of 40 columns hold noise only: modes 3, 20, 30" in one for one in found.left_out)
+    assert np.all(np.abs(error(found)) < 3.0 * found.sigma)
 
 
 def test_sets_of_modes_that_were_measured_at_two_registrations_disagree():

@@ -1,0 +1,317 @@
+"""Fit the measured matrices of two real benches, and write the page with their pictures.
+
+PAPYRUS (Observatoire de Haute-Provence) and AO188 (Subaru) publish interaction matrices as frames
+of a pyramid's camera, under licences that do not allow them here: they are read from a folder that
+holds ``papyrus/`` and ``ao188/`` as those projects name their files.
+Run: ``python -m pyrcal_studies.benches --data PATH``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pyrcal.offline.figures import shown_modes
+from pyrcal.offline.fit_file import fit_file
+from pyrcal.offline.fitted import Fit
+from pyrcal.offline.matrix import FitOptions
+from pyrcal_studies.peers import ROOT
+from service.config import load_instrument
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
+from service.model.slopes import as_maps, side_by_side
+
+Array = NDArray[np.float64]
+
+PAGE = ROOT / "docs" / "results" / "real_benches.md"
+
+PAPYRUS_MODES = (1, 5, 10, 20, 30, 50, 80, 100, 150)
+"""Columns of the M2C that were pushed."""
+
+PAPYRUS = """
+[instrument]
+name = "papyrus"
+diameter_m = 0.0375
+stop = "telescope"
+[wfs]
+kind = "pyramid"
+n_subapertures = 38
+pupil_diameter_subap = 37.0
+pixels_per_subaperture = 2
+input = "frames"
+pupil_centres_px = [[50.35, 183.12], [53.65, 53.01], [182.60, 187.30], [186.03, 55.68]]
+pupil_separation_subap = 65
+wavelength_m = 640e-9
+modulation_lambda_over_d = 5.0
+[mirror]
+layout = "positions"
+positions = "matrix.h5:/positions"
+pitch_m = 0.0025
+mode_to_actuator = "matrix.h5:/m2c"
+influence = "gaussian"
+coupling = "unknown"
+stroke = "unknown"
+"""
+
+AO188 = """
+[instrument]
+name = "ao188"
+diameter_m = 7.92
+obscuration_ratio = 0.30
+stop = "telescope"
+[wfs]
+kind = "pyramid"
+n_subapertures = 36
+pupil_diameter_subap = 35.5
+pixels_per_subaperture = 2
+input = "frames"
+pupil_centres_px = "auto"
+pupil_separation_subap = 40
+wavelength_m = 1.2e-6
+modulation_lambda_over_d = "unknown"
+[mirror]
+layout = "positions"
+positions = "matrix.h5:/positions"
+influence = "gaussian"
+coupling = "unknown"
+stroke = "unknown"
+basis = "zonal"
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """A bench whose matrix was measured."""
+
+    name: str
+    """Of its folder."""
+
+    words: str
+    """What it is, in a sentence."""
+
+    instrument: str
+    """Its instrument file."""
+
+    write: Callable[[Path, h5py.File], None]
+    """Write what was measured in a folder as pyrcal reads it."""
+
+
+def write_papyrus(folder: Path, file: h5py.File) -> None:
+    """Write PAPYRUS' frames, its mask as the flux, its actuators and modes."""
+    frames = np.load(folder / "int_mat.npy").T.reshape(-1, 240, 240)
+    lit = np.load(folder / "valid_pixel.npy").astype(np.float64)
+    line = (np.arange(17) - 8) * 2.5e-3
+    y, x = np.meshgrid(line, line, indexing="ij")
+    grid = np.column_stack([x.ravel(), y.ravel()])
+    nearest = np.sort(np.argsort(np.hypot(*grid.T), kind="stable")[:241])
+    file["interaction_matrix"] = frames
+    file["flux_frame"] = lit / lit.sum()
+    file["positions"] = grid[nearest]
+    file["m2c"] = np.load(folder / "M2C.npy").astype(np.float64)
+    file["modes"] = np.array(PAPYRUS_MODES)
+
+
+def write_ao188(folder: Path, file: h5py.File) -> None:
+    """Write AO188's frames, its reference frame as the flux, and its actuators."""
+    from astropy.io import fits
+
+    with fits.open(folder / "respM.fits.fz") as found:
+        file["interaction_matrix"] = next(one.data for one in found if one.data is not None)
+    file["flux_frame"] = fits.getdata(folder / "wfsref.fits").astype(np.float64)
+    file["positions"] = np.loadtxt(folder / "act2Dpos.txt")[:, 1:] * 7.92 / 2.0
+
+
+BENCHES = (
+    Bench(
+        name="papyrus",
+        words="PAPYRUS: a pyramid with an ALPAO mirror of 241 actuators; nine KL modes as frames "
+        "of 240 x 240 pixels, strokes unknown",
+        instrument=PAPYRUS,
+        write=write_papyrus,
+    ),
+    Bench(
+        name="ao188",
+        words="AO188 of Subaru with its near-infrared pyramid: 188 actuators of a bimorph as "
+        "frames of 160 x 160 pixels, strokes and modulation unknown",
+        instrument=AO188,
+        write=write_ao188,
+    ),
+)
+
+
+def fit_bench(bench: Bench, data: Path) -> Fit:
+    """Return the fit of a bench's matrix in the folder ``data``."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with h5py.File(folder / "matrix.h5", "w") as file:
+            bench.write(data / bench.name, file)
+        told = folder / f"{bench.name}.toml"
+        told.write_text(bench.instrument, encoding="utf-8")
+        report = fit_file(load_instrument(told), folder / "matrix.h5", FitOptions(), threads=1)
+    return report.fit
+
+
+def draw(fit: Fit, path: Path) -> None:
+    """Draw measured, modelled and residual maps, and where disjoint sets lead."""
+    from matplotlib.figure import Figure
+
+    columns = shown_modes(fit)
+    columns = columns[np.linspace(0, len(columns) - 1, 3).round().astype(int)]
+    figure = Figure(figsize=(12.0, 9.0), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3, 2), squeeze=False).ravel()
+    grid = upper.subplots(3, 3)
+    for row, column in zip(grid, columns, strict=True):
+        measured = as_maps(fit.measured[:, column], fit.valid)
+        model = as_maps(fit.synthetic[:, column] * fit.gains[column], fit.valid)
+        limit = 3.0 * float(np.nanstd(measured))
+        for axes, name, values in zip(
+            row,
+            ("measured", "model", "residual"),
+            (measured, model, measured - model),
+            strict=True,
+        ):
+            axes.imshow(values, origin="lower", cmap="RdBu_r", vmin=-limit, vmax=limit)
+            axes.set(xticks=[], yticks=[], title=f"{name}, column {fit.modes[column]}: Sx | Sy")
+    left, right = lower.subplots(1, 2)
+    image = left.imshow(100.0 * side_by_side(fit.residual_map), origin="lower", vmin=0.0)
+    left.set(title="left over: Sx | Sy, % of the measured RMS", xticks=[], yticks=[])
+    figure.colorbar(image, ax=left, shrink=0.7)
+    _draw_sets(right, fit)
+    figure.savefig(path, dpi=80)
+
+
+def _draw_sets(axes: Any, fit: Fit) -> None:  # noqa: ANN401 - matplotlib's, imported when drawn
+    """Draw the shift of each disjoint set alone, with its 1 σ."""
+    sets = () if fit.registration is None else fit.registration.sets
+    for number, one in enumerate(sets):
+        at = one.steps[:, :2] + fit.alpha.vector[:2]
+        axes.errorbar(
+            at[:, 0],
+            at[:, 1],
+            xerr=one.sigma[:, 0],
+            yerr=one.sigma[:, 1],
+            fmt="o" if one.even else "x",
+            markersize=4.0,
+            linewidth=0.6,
+            color=f"C{number}",
+            label=one.words,
+        )
+    axes.plot(*fit.alpha.vector[:2], "k+", markersize=14.0)
+    axes.set(
+        title="shift of disjoint sets",
+        xlabel="shift x, subapertures",
+        ylabel="shift y, subapertures",
+    )
+    axes.legend(fontsize="x-small")
+
+
+def page(found: dict[str, Fit]) -> str:
+    """Return the page in Markdown."""
+    lines = [
+        "# Matrices of real benches",
+        "",
+        "Generated by `python -m pyrcal_studies.benches --data PATH`: change the code, not this "
+        "page.",
+        "",
+        "Matrices that PAPYRUS and AO188 have published, fitted with what is public of them. "
+        "There is no true registration to compare with: disjoint sets of modes, actuators and "
+        "subapertures are fitted alone, and their scatter is compared with σ.",
+        "",
+    ]
+    for bench in BENCHES:
+        if bench.name in found:
+            lines += _of_bench(bench, found[bench.name])
+    return "\n".join(lines)
+
+
+def _of_bench(bench: Bench, fit: Fit) -> list[str]:
+    registration, control = fit.registration, fit.reconstructor
+    if registration is None or control is None:
+        return []
+    names = dict(zip(PARAMETERS, ("shift x", "shift y", "rotation", "magnification"), strict=True))
+    values = fit.alpha.vector * BOUNDARY_SCALE
+    rows = zip(
+        names.values(),
+        values,
+        registration.sigma_statistical * BOUNDARY_SCALE,
+        registration.sigma_systematic * BOUNDARY_SCALE,
+        strict=True,
+    )
+    left = "" if fit.left_over is None else fit.left_over.words
+    counted = sorted(
+        (one for one in fit.alternatives if one.sigma_share > 0.0),
+        key=lambda one: -float(np.max(np.abs(one.moved / fit.sigma))),
+    )
+    terms = "; ".join(
+        f"{one.words} (at most {float(np.max(np.abs(one.moved / fit.sigma))):.1f} σ)"
+        for one in counted[:3]
+    )
+    return [
+        f"## {bench.name}",
+        "",
+        f"{bench.words}.",
+        "",
+        f"![Maps and disjoint sets of {bench.name}](real_benches_{bench.name}.png)",
+        "",
+        f"- **Registration: {'' if registration.determined else 'not '}determined.** "
+        f"{registration.reason}.",
+        f"- **Reconstructor:** {control.reason}.",
+        f"- Advice: {fit.recommendation}.",
+        f"- Explanations that add most to the systematic part of σ: {terms or 'none'}.",
+        f"- What is left over: {left or 'nothing stands out'}.",
+        "",
+        "α, in subapertures, degrees and as a ratio:",
+        "",
+        "| | value | statistical σ | systematic σ |",
+        "| --- | --- | --- | --- |",
+        *(f"| {name} | {value:.4f} | {one:.4f} | {two:.4f} |" for name, value, one, two in rows),
+        "",
+        "Disjoint sets: largest difference of two sets, and over their combined σ. Sets of one "
+        "side of the pupil do not enter σ: a mirror that is drawn distorted moves opposite halves "
+        "in opposite directions.",
+        "",
+        "| sets | shift x, y (subapertures) | rotation (deg) | magnification | over combined σ | "
+        "in σ |",
+        "| --- | --- | --- | --- | --- | --- |",
+        *map(_set_row, registration.sets),
+        "",
+    ]
+
+
+def _set_row(one: Any) -> str:  # noqa: ANN401 - a partition of the fit
+    x, y, turn, size = np.ptp(one.steps, axis=0) * BOUNDARY_SCALE
+    tension = ", ".join(f"{value:.1f}" for value in one.tension)
+    return (
+        f"| {one.words} | {x:.4f}, {y:.4f} | {turn:.4f} | {size:.5f} | {tension} | "
+        f"{'yes' if one.even else 'no'} |"
+    )
+
+
+def main() -> int:
+    """Fit, draw, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--data", type=Path, required=True, help="folder of papyrus/ and ao188/")
+    given = parser.parse_args()
+    found = {}
+    for bench in BENCHES:
+        if not (given.data / bench.name).is_dir():
+            print(f"{bench.name}: not in {given.data}, left out", file=sys.stderr)
+            continue
+        fit = found[bench.name] = fit_bench(bench, given.data)
+        draw(fit, PAGE.with_name(f"real_benches_{bench.name}.png"))
+        print(f"{bench.name}: {fit.recommendation}", flush=True)
+    PAGE.write_text(page(found), encoding="utf-8")
+    print(PAGE)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

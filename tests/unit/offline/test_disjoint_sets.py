@@ -1,0 +1,67 @@
+"""Sets of a linear problem: their steps, their scatter and what enters σ."""
+
+import numpy as np
+import pytest
+
+from pyrcal.offline.disjoint_sets import Normals, jackknife_sigma, pupil_partitions
+from service.estimation.solver import Projection
+
+N_ROWS, N_MODES = 120, 32
+EVERY = np.arange(N_MODES)
+
+
+def problem(seed, wrong=0.0):
+    """Four unknowns, noise of 1, and a second half of modes that sees the first one displaced."""
+    rng = np.random.default_rng(seed)
+    jacobian = rng.normal(size=(4, N_ROWS, N_MODES))
+    residual = rng.normal(size=(N_ROWS, N_MODES))
+    residual += wrong * np.where(EVERY < N_MODES // 2, -1.0, 1.0) * jacobian[0]
+    seen = Projection(
+        gains=np.ones(N_MODES), residual=residual, jacobian=jacobian, weights=np.ones(N_MODES)
+    )
+    # at the solution the scores of all modes are zero
+    at_rest = residual - np.tensordot(seen.best_step, jacobian, axes=1)
+    return Projection(
+        gains=np.ones(N_MODES), residual=at_rest, jacobian=jacobian, weights=np.ones(N_MODES)
+    )
+
+
+def compared(seen, partitions):
+    parts = Normals.of_modes(seen)
+    return list(parts.compare(partitions, np.zeros((4, 4)), np.zeros(4), 1.0))
+
+
+def test_the_jackknife_of_pure_noise_is_its_formal_sigma():
+    formal = 1.0 / np.sqrt(N_ROWS * N_MODES)
+    found = [jackknife_sigma(compared(problem(seed), {"combs": EVERY % 8})) for seed in range(20)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(formal, rel=0.2)
+
+
+def test_the_steps_of_two_halves_average_to_none():
+    (one,) = compared(problem(3), {"halves": EVERY % 2})
+    np.testing.assert_allclose(one.steps.mean(axis=0), 0.0, atol=0.2 * one.sigma.max())
+
+
+def test_sets_that_disagree_count_by_themselves_and_not_by_the_mean_over_all():
+    seen = problem(4, wrong=0.5)
+    found = compared(seen, {"odd": EVERY % 2, "low": 2 * EVERY // N_MODES})
+    assert found[1].tension[0] > 3.0
+    assert np.all(found[0].tension < 4.0)
+    assert jackknife_sigma(found)[0] == pytest.approx(0.5, rel=0.2)
+    assert np.all(jackknife_sigma(found)[1:] < 0.05)
+
+
+def test_halves_of_the_pupil_are_compared_and_do_not_enter_sigma():
+    seen = problem(5, wrong=0.5)
+    (one,) = compared(seen, {"left and right half": 2 * EVERY // N_MODES})
+    assert not one.even
+    assert np.all(jackknife_sigma([one]) == 0.0)
+
+
+def test_partitions_of_a_pupil_list_every_slope_that_counts():
+    valid = np.hypot(*(np.indices((10, 10)) - 4.5)) < 5.0
+    rows = np.ones(2 * int(valid.sum()), dtype=bool)
+    rows[:3] = False
+    for labels in pupil_partitions(valid, 2, rows).values():
+        assert len(labels) == rows.sum()
+        assert len(np.unique(labels)) > 1

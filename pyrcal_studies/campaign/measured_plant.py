@@ -434,6 +434,33 @@ def table(rows: Iterable[Row]) -> str:
     return text
 
 
+def summary(rows: Iterable[Row]) -> str:
+    """Return one line for each size of the model error and each mode of the service, Markdown."""
+    text = heading(
+        *("model error per mode", "service mode", "draws", "difference / σ: RMS", "largest"),
+        *("first reconstructor, s: median", "latest", "all stable modes", "wavefront error ratio"),
+        *("largest", "runs with an alarm"),
+    )
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        kind = Path(row["matrix"]).stem if row["matrix"] else f"{row['error']:.0%}"
+        groups.setdefault((kind, row["mode"]), []).append(row)
+    for (kind, mode), group in groups.items():
+        off = np.array([row["off_sigma"] for row in group if "off_sigma" in row])
+        first = [row["first_s"] for row in group if row["first_s"] is not None]
+        ratio = [row["late_nm"] / row["best_nm"] for row in group]
+        n_all = sum(row["n_modes"] == row["n_stable"] for row in group)
+        text += line(
+            *(kind, mode, len(group)),
+            *(f"{np.sqrt(np.mean(off**2)):.2f}", f"{np.abs(off).max():.1f}"),
+            *(f"{np.median(first):.0f}", f"{max(first):.0f}"),
+            f"{n_all} of {len(group)}",
+            *(f"{np.median(ratio):.3f}", f"{max(ratio):.3f}"),
+            sum(bool(row["said"]) for row in group),
+        )
+    return text
+
+
 def main() -> int:
     """Run what is missing, then print the table."""
     parser = argparse.ArgumentParser(prog="python -m pyrcal_studies.campaign.measured_plant")
@@ -454,7 +481,7 @@ def main() -> int:
     for plan in file.missing(plans(given)):
         file.add(play(plan))
         sys.stderr.write(table(file.rows[-1:]).splitlines()[-1] + "\n")
-    tell(table(file.rows), given.table, "python -m pyrcal_studies.campaign.measured_plant")
+    tell(summary(file.rows), given.table, "python -m pyrcal_studies.campaign.measured_plant")
     return 0
 
 

@@ -41,8 +41,9 @@ from service.tracking.step_context import StepContext
 from service.tracking.update_policy import is_settled, limit_modes
 from service.wire import Status
 
-SIZE_RANGE = (0.4, 2.0)
-"""Of a mode's response over the median of the modes dithered with it: optical gains lie within."""
+PLAUSIBLE_RESPONSE_RATIO = (0.4, 2.0)
+"""Plausible range of a mode's response relative to the median of the modes dithered with it:
+optical gains stay within it, and so do all modes of a model that is 40 % wrong per mode."""
 
 MIN_RESPONSE = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
@@ -375,7 +376,10 @@ def _classify(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which modes answer as they should, and which certainly do not; the rest may do."""
     typical = float(np.median(size))
-    low, high = max(SIZE_RANGE[0] * typical, MIN_RESPONSE), SIZE_RANGE[1] * typical
+    low, high = (
+        max(PLAUSIBLE_RESPONSE_RATIO[0] * typical, MIN_RESPONSE),
+        PLAUSIBLE_RESPONSE_RATIO[1] * typical,
+    )
     seen = gains > SIGNIFICANT * sigma
     proven = seen & (gains > low) & (gains < high)
     contrary = (gains + SIGNIFICANT * sigma < low) | (gains - SIGNIFICANT * sigma > high)

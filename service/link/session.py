@@ -30,12 +30,15 @@ RX_BUFFER_BYTES = 16 * 65_535
 """Buffers that a link reads into, used again and again: with the usual one alone zenoh makes and
 clears another for almost every 64 kB that come."""
 
+MAX_MESSAGE_BYTES = 2 * max(wire.CHUNK_LIMIT, wire.BATCH_LIMIT)
+"""Longest message that a link assembles: twice the longest of the contract, in which a matrix of
+any size travels in parts. zenoh's own limit is 1 GB for each sender, and that memory is kept."""
+
 TOKENS_TIMEOUT_S = 1.0
 """For the routers to say which tokens are there; they do within milliseconds."""
 
 RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
 """Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
-
 
 ABSENT_PAUSE_S: Final = 0.3
 """Before a command is repeated: an RTC that is not there makes a query end at once."""
@@ -108,6 +111,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "timestamping/enabled": True,
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/shared_memory/enabled": False,
         **endpoint.security.zenoh,
     }

@@ -383,8 +383,9 @@ class _Look:
         value, newest = float(self.value(logs)), logs[-DIVERGED_PARTS:]
         if diverged is not None and len(newest) == DIVERGED_PARTS and newest.min() > diverged:
             value, limit = float(newest.min()), diverged
-        elif not self.decides:
-            limit = max(float(np.log(SEVERAL)), limit)
+        else:
+            # however noisy the loop was: no healthy one is worse by a factor of several for so long
+            limit = min(limit, float(np.log(SEVERAL))) if self.decides else float(np.log(SEVERAL))
         rms = float(np.exp(0.5 * max(value, -40.0)))
         return _Ground(value > limit, words.format(rms), rms, float(np.exp(0.5 * limit)))
 

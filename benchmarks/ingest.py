@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
@@ -26,7 +25,6 @@ import numpy as np
 
 from benchmarks.ingest_processes import Sending, compute_without_pause, send_frames
 from service.config.link_tables import Router, link_security, read_link_tables, router_of
-from service.link.guard import refusals_of_zenoh
 from service.rtc_bridge import Bridge, Endpoint
 
 SYSTEM = "benchmark"
@@ -100,13 +98,7 @@ def measure(arguments: argparse.Namespace) -> Result:
     """Return what one run of sender, link and worker gave."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint, router = _both_ends(Path(folder), arguments.secured)
-        watched = refusals_of_zenoh(_refused) if endpoint.security.zenoh else nullcontext()
-        with watched:
-            return _measured(arguments, endpoint, router)
-
-
-def _refused(who: str, what: str, where: str) -> None:
-    raise SystemExit(f"{who} was refused {what} on {where}")
+        return _measured(arguments, endpoint, router)
 
 
 def _both_ends(folder: Path, secured: str) -> tuple[Endpoint, Router]:

@@ -43,10 +43,10 @@ RADII = (1.0, 1.03, 1.06, 1.1)
 BACK_S = 0.3
 """From the verdict until the matrix before is in use again."""
 
-SETTLED_S = 1.3
+SETTLED_S = 3.0
 """With a matrix before the next trial."""
 
-JUDGED_S = 3.3
+JUDGED_S = 4.3
 """At most, with the one on trial."""
 
 LOST_RATIO = 1.5
@@ -91,7 +91,7 @@ class Night:
 
     def __init__(self, plant: str, seed: int) -> None:
         self._rng = rng = np.random.default_rng(seed)
-        seeing = [f"--seeing-at={t}:{rng.uniform(0.6, 1.1):.2f}" for t in range(3, 70, 3)]
+        seeing = [f"--seeing-at={t}:{rng.uniform(0.6, 1.1):.2f}" for t in range(3, 120, 3)]
         words = [
             f"--instrument={SMALL}",
             f"--plant={plant}",

@@ -31,7 +31,6 @@ from service.config.settings import ApiTable
 from service.errors import ConfigurationError, PyrcalError, shown
 from service.files.fit_folder import FitRequest
 from service.files.last_telemetry import LastTelemetry
-from service.link.guard import refusals_of_zenoh
 from service.model.instrument import Instrument, instrument_sha256
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.actions import Actions, Publishing
@@ -109,9 +108,7 @@ async def _serve(settings: Settings, instrument: Instrument, workers: WorkerPool
             settings.archive.last_telemetry_s, settings.archive.last_telemetry_mb * 1_000_000
         )
         bridge = Bridge(endpoint, last)
-        secured = bool(endpoint.security.zenoh)
-        watched = refusals_of_zenoh(bridge.guard.refused) if secured else contextlib.nullcontext()
-        with archive, announced(archive.directory, where), watched, bridge:
+        with archive, announced(archive.directory, where), bridge:
             modes = [mode.config_id for mode in instrument.sensor_modes]
             bridge.expect(instrument.basis_id, instrument.config_id, modes)
             supervisor = _supervisor(settings, instrument, system, bridge, workers, archive)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import math
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Annotated, Any
 
 from pydantic import PlainValidator
@@ -18,12 +20,31 @@ _NEAR = 0.75
 _FORM = '{ of = "elevation", at = [20, 80], values = [0.1, -0.1] }'
 
 
-def _term(value: object) -> Term:
-    """Return a term as a file has it: a number, an expression or a table."""
+NORTH_STEP_SUBAP = 0.02
+"""Largest change of a law after a whole turn of azimuth: a tenth of what a matrix bears."""
+
+NORTH_STEP_DEG = 0.05
+NORTH_STEP_MAGNIFICATION = 0.001
+
+
+def _term(value: object, *, north_step: float, turn: float = 0.0) -> Term:
+    """Return a term as a file has it: a number, an expression or a table.
+
+    It may differ by ``north_step`` after a whole turn of azimuth, or by a multiple of ``turn``.
+    """
     try:
-        return _checked(value)
+        term = _checked(value)
+        step = term.north_step()
     except ModelError as error:
         raise ValueError(str(error)) from error
+    left = math.remainder(step, turn) if turn else step
+    if abs(left) > north_step:
+        raise ValueError(
+            f"found a law that is {step:.4g} more after a whole turn of azimuth: it would leap at "
+            f"north; expected the same, to {north_step:g}, as of sin(azimuth) or of a table whose "
+            "first and last values agree"
+        )
+    return term
 
 
 def _checked(value: object) -> Term:
@@ -47,8 +68,27 @@ def _checked(value: object) -> Term:
     return term
 
 
-_Term = Annotated[
-    Term | None, PlainValidator(_term, json_schema_input_type=float | str | dict[str, Any])
+_INPUT = float | str | dict[str, Any]
+_Shift = Annotated[
+    Term | None,
+    PlainValidator(
+        partial(_term, north_step=NORTH_STEP_SUBAP),
+        json_schema_input_type=_INPUT,
+    ),
+]
+_Rotation = Annotated[
+    Term | None,
+    PlainValidator(
+        partial(_term, north_step=NORTH_STEP_DEG, turn=360.0),
+        json_schema_input_type=_INPUT,
+    ),
+]
+_Magnification = Annotated[
+    Term | None,
+    PlainValidator(
+        partial(_term, north_step=NORTH_STEP_MAGNIFICATION),
+        json_schema_input_type=_INPUT,
+    ),
 ]
 
 
@@ -59,19 +99,20 @@ class LawTable(Read):
     A number, an expression of `azimuth`, `elevation` (degrees, as the RTC's status or the
     observatory reports them) and of names of the observatory's values, or a table
     `{ of = "elevation", at = [20, 80], values = [0.1, -0.1] }` with straight lines between.
-    α is followed as its deviation from this.
+    α is followed as its deviation from this. After a whole turn of azimuth each term must be the
+    same, but for whole turns of the rotation.
     """
 
-    shift_x_subap: _Term = None
+    shift_x_subap: _Shift = None
     """Subapertures; None: 0."""
 
-    shift_y_subap: _Term = None
+    shift_y_subap: _Shift = None
     """Subapertures; None: 0."""
 
-    rotation_deg: _Term = None
+    rotation_deg: _Rotation = None
     """Degrees, as `azimuth - 12.98`; None: 0."""
 
-    magnification: _Term = None
+    magnification: _Magnification = None
     """Ratio; None: 1."""
 
 

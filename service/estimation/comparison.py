@@ -229,7 +229,7 @@ class Before:
             part_s=part_s,
             power=power,
             mode_sigma=measure_sigma(logs, MIN_MODE_SCATTER),
-            residual_sigma=measure_sigma(residual_logs, MIN_SCATTER),
+            residual_sigma=measure_sigma(residual_logs, MIN_SCATTER, lower_half=True),
             n_groups=n_recent,
             level=level,
             peak=max(part.peak for part in parts),
@@ -240,10 +240,11 @@ class Before:
         return MEDIAN_NOISE * sigma * float(np.sqrt(1.0 / n_groups + 1.0 / self.n_groups))
 
 
-def measure_sigma(logs: Array, least: float) -> float:
+def measure_sigma(logs: Array, least: float, *, lower_half: bool = False) -> float:
     """Return 1 σ of ``logs`` ``(n_groups, n)`` in one group, correlation between groups included.
 
-    The interquartile range is used, which a gust in a tenth of the time does not change.
+    The interquartile range is used, which a gust in a tenth of the time does not change; with
+    ``lower_half`` only the half below the median, which a gust in a third of it does not.
     """
     found = PRIOR_SCATTER * PRIOR_SCATTER
     for length in NOISE_LENGTHS:
@@ -251,8 +252,9 @@ def measure_sigma(logs: Array, least: float) -> float:
         if n < 2 or not logs.shape[1]:
             continue
         means = logs[len(logs) - n * length :].reshape(n, length, -1).mean(axis=1)
-        quartiles = np.quantile(means - np.median(means, axis=0), (0.25, 0.75))
-        square = length * (float(quartiles[1] - quartiles[0]) / 1.349) ** 2
+        low, middle, high = np.quantile(means - np.median(means, axis=0), (0.25, 0.5, 0.75))
+        spread = 2.0 * (middle - low) if lower_half else high - low
+        square = length * (float(spread) / 1.349) ** 2
         n_values = n * logs.shape[1]
         mixed = (n_values * square + PRIOR_VALUES * PRIOR_SCATTER**2) / (n_values + PRIOR_VALUES)
         found = mixed if length == 1 else max(found, mixed)
@@ -383,8 +385,9 @@ class _Look:
         value, newest = float(self.value(logs)), logs[-DIVERGED_PARTS:]
         if diverged is not None and len(newest) == DIVERGED_PARTS and newest.min() > diverged:
             value, limit = float(newest.min()), diverged
-        elif not self.decides:
-            limit = max(float(np.log(SEVERAL)), limit)
+        else:
+            # however noisy the loop was: no healthy one is worse by a factor of several for so long
+            limit = min(limit, float(np.log(SEVERAL))) if self.decides else float(np.log(SEVERAL))
         rms = float(np.exp(0.5 * max(value, -40.0)))
         return _Ground(value > limit, words.format(rms), rms, float(np.exp(0.5 * limit)))
 

@@ -1,28 +1,23 @@
 """Who comes onto a secured link, what is refused to whom, and which certificates are about to end.
 
-zenoh says who is connected, and in its log alone what it has refused: :func:`refusals_of_zenoh`
-reads that. It does not say where somebody came from who was not let in at all.
+zenoh reports each connection that is made, with the name of its certificate; a name without a role
+is counted as refused. What zenoh itself refuses (a TLS handshake, a message that the role does not
+allow) it reports nowhere but in its trace log, a line for each message that it lets through or not:
+that log is not read here. A router of one's own can write it (docs/operate/link.md).
 """
 
 from __future__ import annotations
 
-import fcntl
-import os
-import re
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import structlog
 import zenoh
 
 from service.link.statistics import EndingCertificate, Refusal
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 DAY_S: Final = 86400.0
 
@@ -95,7 +90,8 @@ class LinkGuard:
             zenoh_id=str(link.zid),
         )
         if made and role == "none":
-            self.refused(name, "anything", f"it has no role in [zenoh.access], {address}")
+            host = address.rpartition(":")[0]  # each connection has another port
+            self.refused(name, "anything", f"it has no role in [zenoh.access], {host}")
 
     def refused(self, who: str, what: str, where: str) -> None:
         """Note something that was refused, and log it unless that was done a moment ago."""
@@ -160,100 +156,3 @@ def ending_in_words(certificates: Sequence[EndingCertificate]) -> str:
         + ("has ended" if one.remaining_s <= 0.0 else f"ends in {one.remaining_s / DAY_S:.0f} days")
         for one in certificates
     )
-
-
-# --- zenoh's log
-
-DIRECTIVES: Final = ",".join(
-    (
-        "off",
-        "zenoh::net::routing::interceptor=trace",
-        "zenoh_link_tls::unicast=warn",
-        "zenoh_transport::unicast::establishment::accept=debug",
-    )
-)
-"""What zenoh is asked to log; a line for each message that it lets through is among it."""
-
-PIPE_BYTES: Final = 1 << 20
-"""Of zenoh's lines that wait; beyond it they are lost, and nothing waits for them."""
-
-READ_EVERY_S: Final = 0.2
-
-TELLING: Final = (b"unauthorized", b"intercepted", b"zenoh_link_tls", b"UsrPwd")
-"""Most of what zenoh logs is what it lets through, hundreds of lines a second: not read."""
-
-_COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
-_THREAD: Final = re.compile(r"ThreadId\(\d+\)")
-_UNAUTHORIZED: Final = re.compile(
-    r" on (?P<subject>\S+) is unauthorized to (?P<what>.+) \(ingress\) on (?P<key>\S+)"
-)
-_NAME: Final = re.compile(r"(?:CertCommonName|Username)\((.*?)\)")
-_NO_CERTIFICATE: Final = re.compile(r"zenoh_link_tls::unicast: (?P<why>.+?)(?:\. Hint.*)?$")
-_NO_USER: Final = re.compile(r"UsrPwd extension - (?P<why>.+?)(?: at /\S+)?$")
-
-
-class ZenohLog:
-    """Reads lines of zenoh's log, and tells what was refused."""
-
-    def __init__(self, refused: Callable[[str, str, str], None]) -> None:
-        self._refused = refused
-        self._said: dict[str, re.Match[str]] = {}
-        """What each thread of zenoh's said last, before it says that it has refused that."""
-
-    def read(self, line: str) -> None:
-        """Take one line."""
-        line = _COLOURS.sub("", line.rstrip())
-        found = _THREAD.search(line)
-        thread = found[0] if found else ""
-        said = self._said.pop(thread, None)
-        if "Msg intercepted!" in line:
-            if said is not None:
-                name = _NAME.search(said["subject"])
-                self._refused(name[1] if name else "no name", said["what"], said["key"])
-        elif (unauthorized := _UNAUTHORIZED.search(line)) is not None:
-            self._said[thread] = unauthorized
-        elif (without := _NO_CERTIFICATE.search(line)) is not None:
-            self._refused("no certificate of ours", "Connect", without["why"])
-        elif (user := _NO_USER.search(line)) is not None:
-            self._refused("no known name and password", "Connect", user["why"])
-
-
-@contextmanager
-def refusals_of_zenoh(refused: Callable[[str, str, str], None]) -> Iterator[None]:
-    """Report who was refused what, and where, while the block lasts.
-
-    zenoh logs to this process's standard output and offers no other way: it becomes a pipe that is
-    read here. A service prints nothing there.
-    """
-    reading, writing = os.pipe()
-    before = os.dup(1)
-    fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-    os.set_blocking(writing, False)
-    os.dup2(writing, 1)
-    os.close(writing)
-    zenoh.init_log_from_env_or(DIRECTIVES)
-    over = threading.Event()
-    reader = threading.Thread(target=_read_all, args=(reading, refused, over), name="refusals")
-    reader.start()
-    try:
-        yield
-    finally:
-        os.dup2(before, 1)
-        os.close(before)
-        over.set()  # the pipe need not end: processes that were started meanwhile have it, too
-        reader.join()
-
-
-def _read_all(
-    reading: int, refused: Callable[[str, str, str], None], over: threading.Event
-) -> None:
-    log, rest, is_over = ZenohLog(refused), b"", False
-    os.set_blocking(reading, False)
-    with os.fdopen(reading, "rb", buffering=0) as pipe:
-        while not is_over:
-            is_over = over.wait(READ_EVERY_S)
-            data = rest + (pipe.read(PIPE_BYTES) or b"")
-            whole, _, rest = data.rpartition(b"\n")
-            if any(word in whole for word in TELLING):
-                for line in whole.split(b"\n"):
-                    log.read(line.decode(errors="replace"))

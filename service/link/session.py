@@ -30,12 +30,15 @@ RX_BUFFER_BYTES = 16 * 65_535
 """Buffers that a link reads into, used again and again: with the usual one alone zenoh makes and
 clears another for almost every 64 kB that come."""
 
+MAX_MESSAGE_BYTES = 2 * max(wire.CHUNK_LIMIT, wire.BATCH_LIMIT)
+"""Longest message that a link assembles: twice the longest of the contract, in which a matrix of
+any size travels in parts. zenoh's own limit is 1 GB for each sender, and that memory is kept."""
+
 TOKENS_TIMEOUT_S = 1.0
 """For the routers to say which tokens are there; they do within milliseconds."""
 
 RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
 """Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
-
 
 ABSENT_PAUSE_S: Final = 0.3
 """Before a command is repeated: an RTC that is not there makes a query end at once."""
@@ -108,6 +111,7 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
         "timestamping/enabled": True,
         "transport/link/tx/lease": round(1000 * endpoint.lease_s),
         "transport/link/rx/buffer_size": RX_BUFFER_BYTES,
+        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,
         "transport/shared_memory/enabled": False,
         **endpoint.security.zenoh,
     }
@@ -283,6 +287,10 @@ def send_command(
 ) -> bytes:
     """Return the RTC's answer to a command, repeated with the same id until there is one.
 
+    zenoh ends a query at once that nobody serves. That an RTC does not offer an optional command is
+    concluded only if its liveliness token was there at each attempt: an RTC that has just lost its
+    link serves nothing for a moment, either.
+
     Raises
     ------
     WireError
@@ -291,7 +299,8 @@ def send_command(
         If there is none after all attempts, or it is not signed as it must be.
     """
     payload, kind = wire.encode(command), wire.command_kind(command)
-    selector = wire.Keys(endpoint.system).command(kind)
+    keys = wire.Keys(endpoint.system)
+    selector, n_unserved, n_present = keys.command(kind), 0, 0
     for attempt in range(endpoint.command_attempts):
         if attempt:
             time.sleep(ABSENT_PAUSE_S)
@@ -300,12 +309,17 @@ def send_command(
         answer = ask(session, selector, timeout_s, signed, wire.Encodings.COMMAND)
         if answer is not None:
             return _vouched(answer, selector, command, signatures)
-        # zenoh ends a query at once that nobody serves
-        if kind in OPTIONAL and time.monotonic() - began_s < timeout_s / 2:
-            reason = f"unsupported: the RTC offers no {kind}"
-            return wire.encode(
-                wire.Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
-            )
+        if time.monotonic() - began_s < timeout_s / 2:
+            n_unserved += 1
+            n_present += bool(tokens(session, keys.alive(wire.Role.RTC)))
+    if kind in OPTIONAL and n_present == endpoint.command_attempts:
+        reason = f"unsupported: the RTC offers no {kind}"
+        return wire.encode(wire.Reply(id=command.id, accepted=False, reason=reason, start_seq=None))
+    if n_unserved == endpoint.command_attempts:
+        raise LinkError(
+            f"the RTC was not there for {kind} command {command.id}, which was not carried out: "
+            "its link has been lost; give the command again when the RTC is back"
+        )
     raise LinkError(
         f"no answer from the RTC to {kind} command {command.id} after "
         f"{endpoint.command_attempts} attempts: whether it was carried out is unknown"

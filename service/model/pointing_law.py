@@ -8,6 +8,8 @@ of numbers. Quick to import: mathematics come with the answers.
 from __future__ import annotations
 
 import ast
+import contextlib
+import itertools
 import math
 import operator
 from collections.abc import Callable, Mapping
@@ -90,6 +92,25 @@ class Term:
         nodes = ast.walk(_parsed(self.expression))
         found = {node.id for node in nodes if isinstance(node, ast.Name)}
         return frozenset(found - FUNCTIONS.keys())
+
+    def north_step(self) -> float:
+        """Return the change of the term after a whole turn of azimuth, 0 if it has no azimuth.
+
+        The telescope points to the same place then, so any difference is a leap of the law where
+        azimuth goes from 360 to 0. Beyond its ends a table keeps the values of its ends, which must
+        therefore agree.
+        """
+        if "azimuth" not in self.names:
+            return 0.0
+        if self.at and self.expression.strip() == "azimuth":
+            return self.values[-1] - self.values[0]
+        steps = [0.0]
+        for elevation, azimuth in itertools.product((20.0, 50.0, 80.0), (-180.0, 0.0)):
+            others = dict.fromkeys(self.names, 1.0) | {"elevation": elevation}
+            ends = [others | {"azimuth": azimuth + turn} for turn in (0.0, 360.0)]
+            with contextlib.suppress(ModelError):  # of values that nobody has reported yet
+                steps.append(self.value(ends[1]) - self.value(ends[0]))
+        return max(steps, key=abs)
 
     def value(self, reported: Reported) -> float:
         """Return the number.

@@ -246,6 +246,7 @@ LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
     alarms.OVER_BUDGET: _is_over_budget,
     alarms.NOT_ACKNOWLEDGED: _not_used_since,
     alarms.DISAGREES: _in_doubt,
+    alarms.NOT_RESTORED: lambda context: context.registration is None,
 }
 """Whether an alarm that an event has raised still lasts; all others are ended by an event, too."""
 

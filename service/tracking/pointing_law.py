@@ -7,6 +7,7 @@ law, whatever the telescope does meanwhile.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.errors import ModelError
 from service.model.misregistration import Misregistration, step_text, wrapped
-from service.model.pointing_law import PointingLaw, Reported
+from service.model.pointing_law import ANGLES, PointingLaw, Reported
 from service.tracking import events as ev
 from service.tracking.events import Event
 from service.tracking.operations.acquisition_stages import set_acquisition
@@ -40,6 +41,15 @@ WAY_KEPT = 240
 MAX_STEP = np.array([0.5, 0.5, np.deg2rad(3.0), 0.02])
 """By which a law may move at once, and each second besides, numeric units: telescopes turn by a few
 degrees a second at most. Further is a leap of what is told."""
+
+FREE_STEP = np.array([0.03, 0.03, np.deg2rad(0.3), 0.002])
+"""By which a law of the pointing alone may move while the telescope stands, numeric units."""
+
+STEP_PER_DEG = np.array([0.2, 0.2, np.deg2rad(3.0), 0.004])
+"""By which it may move besides for each degree that the telescope turns: near the zenith a field
+turns faster than the azimuth, and a pupil that turns about a point ten subapertures away moves by
+0.17. A law that is not periodic moves by its whole turn at north, where the telescope has hardly
+turned."""
 
 BELIEVED_S = 3.0
 """A leap of the pointing that has stood for so long is believed."""
@@ -68,7 +78,9 @@ def follow_law(context: StepContext) -> None:
         return
     state = context.alpha.law
     since_s = (context.now_ns - state.worked_out_ns_utc) / SECOND_NS
-    if state.nominal is not None and _is_far(state.nominal, now, since_s):
+    if state.nominal is not None and (
+        _is_far(state.nominal, now, since_s) or _outruns_pointing(context, law, now)
+    ):
         _hold(context, state.nominal, now)
         return
     _carry(context, now)
@@ -223,6 +235,20 @@ def _is_far(one: Misregistration, other: Misregistration, since_s: float) -> boo
     return bool(np.any(np.abs(difference(one, other)) > allowed))
 
 
+def _outruns_pointing(context: StepContext, law: PointingLaw, now: Misregistration) -> bool:
+    """Return whether a law of the pointing alone moves by more than the telescope has turned."""
+    state, pointing = context.alpha.law, context.alpha.pointing
+    if state.nominal is None or state.pointing is None or pointing is None:
+        return False
+    if not law.names <= set(ANGLES):  # values of the observatory change by themselves
+        return False
+    turned_deg = abs(pointing.elevation_deg - state.pointing.elevation_deg) + abs(
+        math.remainder(pointing.azimuth_deg - state.pointing.azimuth_deg, 360.0)
+    )
+    allowed = FREE_STEP + STEP_PER_DEG * turned_deg
+    return bool(np.any(np.abs(difference(state.nominal, now)) > allowed))
+
+
 def _hold(context: StepContext, before: Misregistration, now: Misregistration) -> None:
     """Let α stand where what is told leaps; one that lasts is believed, and α doubted."""
     law, leap = context.alpha.law, context.alpha.law.leap
@@ -264,7 +290,12 @@ def _carry(context: StepContext, now: Misregistration) -> None:
     if acquisition.alpha is not None and before is not None and before != now:
         found = acquisition.alpha.stepped(difference(before, now))
         set_acquisition(context, replace(acquisition, alpha=found))
-    state = LawState(nominal=now, worked_out_ns_utc=context.now_ns, way=_way(context, now))
+    state = LawState(
+        nominal=now,
+        worked_out_ns_utc=context.now_ns,
+        way=_way(context, now),
+        pointing=context.alpha.pointing,
+    )
     if state != context.alpha.law:
         _set(context, state)
 

@@ -287,8 +287,16 @@ def _send(
 
 
 def on_acknowledgement(context: StepContext, event: Acknowledgement) -> None:
-    """Fold the RTC's answer to a reconstructor back in; a late one is accepted."""
-    record = _acknowledged_record(context.state, event)
+    """Fold the RTC's answer to a reconstructor back in; a late one is accepted.
+
+    A rejection without an id is of a commit that the RTC could not read. It says nothing of a
+    matrix of this service that is on its way: anyone may have sent that commit, and one of the
+    service's own is given up after ``ACKNOWLEDGE_WITHIN_S`` without an answer.
+    """
+    if event.id is None:
+        _warn_of_unreadable_commit(context, event)
+        return
+    record = context.state.reconstructor(event.id)
     if record is None:
         text = f"an acknowledgement for {event.id}, which this service never sent"
         context.warn("acknowledgement.unknown", text)
@@ -449,11 +457,14 @@ def _why_unjudged(record: ReconstructorRecord) -> str:
     return record.reason if record.gate is None and going else ""
 
 
-def _acknowledged_record(state: TrackerState, event: Acknowledgement) -> ReconstructorRecord | None:
-    """Return which reconstructor is acknowledged: a commit nobody could read was the last one."""
-    if event.id is not None:
-        return state.reconstructor(event.id)
-    return next((r for r in reversed(state.matrices.reconstructors) if r.on_its_way), None)
+def _warn_of_unreadable_commit(context: StepContext, event: Acknowledgement) -> None:
+    on_way = next((r.id for r in context.matrices.reconstructors if r.on_its_way), None)
+    text = f"the RTC rejected a commit that it could not read: {event.reason or 'no reason given'}"
+    if on_way is None:
+        text += ". This service has sent none: another program sends commits to the RTC"
+    else:
+        text += f". {on_way} is on its way: if the RTC does not apply it, this may be why"
+    context.warn("acknowledgement.unreadable-commit", text)
 
 
 def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledgement) -> bool:

@@ -359,6 +359,9 @@ class LawState:
     leap: LawLeap | None = None
     """None: what it is told is believed."""
 
+    pointing: Pointing | None = None
+    """Where the telescope pointed when the nominal registration was worked out."""
+
 
 def moved(registration: Registration, step: Array) -> Registration:
     """Return what is known of α with all of it a step ``(4,)`` further, numeric units."""

@@ -8,7 +8,7 @@ from service.tracking import commands as cmd
 from service.tracking import dither, mode_proof, offload
 from service.tracking.alarm_records import restore_records
 from service.tracking.alarm_rules import derive_alarms
-from service.tracking.alarms import Interlock
+from service.tracking.alarms import NOT_RESTORED, Interlock
 from service.tracking.operations.acquisition import acquisition_to_save, restore_acquisition
 from service.tracking.operations.acquisition_stages import abort_acquisition
 from service.tracking.operations.measurement import give_up
@@ -205,6 +205,8 @@ def _take_over_alpha(context: StepContext, saved: Saved, now_ns: int) -> None:
     if reason is not None:
         text = f"the α saved before the restart is not taken over: {reason}"
         context.warn("registration.not-restored", text)
+        if saved.registration is not None:
+            context.raise_alarm(NOT_RESTORED, text)
         forget_registration(context)
         return
     if saved.acquisition is not None:

@@ -43,6 +43,7 @@ _LAST = {"Connection": "close"}
 """What follows on such a connection is not to be trusted."""
 
 _READS = {"GET", "HEAD", "OPTIONS"}
+_OWN_SITES = {"same-origin", "none"}
 
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
 
@@ -258,6 +259,14 @@ class Authentication(Middleware):
             detail = (
                 f"found Origin {origin!r:.100}, expected none or http://{host}: a page from "
                 "elsewhere cannot use this service"
+            )
+            return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
+        site = request.headers.get("sec-fetch-site", "same-origin").lower()
+        # a link from another page may be followed; a browser that hides the origin may not order
+        if request.method not in _READS and origin is None and site not in _OWN_SITES:
+            detail = (
+                f"found Sec-Fetch-Site {site!r:.100} and no Origin, expected a request of this "
+                "page or of a program: a page from elsewhere cannot use this service"
             )
             return Refusal(HTTPStatus.FORBIDDEN, "foreign-origin", detail)
         return None

@@ -65,6 +65,19 @@ async def test_a_page_from_elsewhere_cannot_act(service, origin):
     assert service.commands == []
 
 
+@pytest.mark.parametrize(
+    ("site", "status"),
+    [("cross-site", 403), ("same-site", 403), ("same-origin", 202), ("none", 202)],
+)
+async def test_a_browser_that_hides_the_origin_cannot_order_from_elsewhere(service, site, status):
+    async with client_of(service) as client:
+        response = await client.post("/v1/rollback", headers={"Sec-Fetch-Site": site})
+        assert response.status_code == status
+        linked = await client.get("/v1/state", headers={"Sec-Fetch-Site": site})
+        assert linked.status_code == 200
+    assert len(service.commands) == (status == 202)
+
+
 @pytest.mark.parametrize("origin", ["http://127.0.0.1:8080", "HTTP://127.0.0.1:8080", None])
 async def test_its_own_page_and_programs_that_are_no_browser_can(service, origin):
     headers = {} if origin is None else {"Origin": origin}

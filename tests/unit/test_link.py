@@ -5,7 +5,8 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from service.errors import UnknownIdError, WireError
+from service.errors import LinkError, UnknownIdError, WireError
+from service.link import session
 from service.link.intake import LEFT_AS_THEY_CAME, QUEUE_LENGTH, Intake
 from service.link.leader_election import LeaderElection, SessionWatch
 from service.link.matrices import OFFERS, MeasuredIntake, Offer, Outbox
@@ -18,11 +19,16 @@ from service.wire import (
     Keys,
     Loop,
     Manifest,
+    RampRequest,
+    Reply,
+    Role,
     Status,
+    decode,
     encode,
     encode_frames,
     layout_of,
 )
+from service.wire.signing import Signatures
 
 
 class Clock:
@@ -632,3 +638,25 @@ def test_a_batch_is_judged_by_what_was_expected_when_it_came(clock):
     send(intake, 10)
     assert spans(intake.drain()) == [("s1", 0, 10)]
     assert intake.statistics().frames_refused == {"basis": 10}
+
+
+def asked_for_a_ramp(monkeypatch, token_there):
+    """Send a ramp that nobody serves; the RTC's token is there at each attempt, or is not."""
+    there = iter(token_there)
+    monkeypatch.setattr(session, "ask", lambda *_, **__: None)
+    monkeypatch.setattr(session, "tokens", lambda *_: ["alive/rtc"] if next(there) else [])
+    monkeypatch.setattr(session, "ABSENT_PAUSE_S", 0.0)
+    command = RampRequest(id="ramp", groups=((0, 9),), gains=(0.5,), frames_per_gain=100)
+    endpoint = Endpoint(system="flao", command_attempts=3)
+    return session.send_command(None, endpoint, command, Signatures(None, Role.SERVICE))
+
+
+def test_an_rtc_that_is_there_and_serves_no_ramp_offers_none(monkeypatch):
+    reply = decode(Reply, asked_for_a_ramp(monkeypatch, [True] * 3))
+    assert (reply.accepted, reply.reason) == (False, "unsupported: the RTC offers no ramp")
+
+
+@pytest.mark.parametrize("there", [[False] * 3, [False, True, True], [True, False, True]])
+def test_an_rtc_that_has_just_lost_its_link_is_not_said_to_offer_no_ramp(monkeypatch, there):
+    with pytest.raises(LinkError, match="was not carried out"):
+        asked_for_a_ramp(monkeypatch, there)

@@ -204,3 +204,13 @@ def test_before_noise_is_measured_it_is_assumed():
     assert measure_sigma(np.zeros((1, 1)), 0.0) == pytest.approx(PRIOR_SCATTER)
     few = measure_sigma(np.zeros((4, 1)), 0.0)
     assert few == pytest.approx(PRIOR_SCATTER * np.sqrt(4.0 / 6.0))
+
+
+def test_a_gust_before_the_swap_does_not_count_as_noise_of_the_residual():
+    """Three of 12 groups: without it σ would be several times as large."""
+    logs = np.random.default_rng(13).normal(size=(12, 1)) * 0.15
+    blown = logs.copy()
+    blown[5:8] += 1.5
+    calm = measure_sigma(logs, 0.0, lower_half=True)
+    assert measure_sigma(blown, 0.0, lower_half=True) < 2.0 * calm
+    assert measure_sigma(blown, 0.0) > 3.0 * calm

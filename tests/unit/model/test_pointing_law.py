@@ -95,3 +95,20 @@ def test_a_law_is_a_registration_and_what_it_leaves_out_is_nominal():
     )
     with pytest.raises(ModelError, match="magnification > 0"):
         PointingLaw(magnification=Term("-1")).at(TOLD)
+
+
+@pytest.mark.parametrize(
+    ("term", "step"),
+    [
+        (Term("0.0008 * azimuth"), 0.288),
+        (Term("azimuth", (0.0, 360.0), (0.1, 0.3)), 0.2),
+        (Term("azimuth", (-180.0, 180.0), (0.1, 0.1)), 0.0),
+        (Term("0.1 * sin(azimuth) + elevation / 100"), 0.0),
+        (Term("azimuth - 12.98"), 360.0),
+        (Term("0.1 * sin(azimuth / 2)"), 0.2),
+        (Term("elevation"), 0.0),
+        (Term("0.001 * azimuth + derotator"), 0.36),
+    ],
+)
+def test_the_step_of_a_term_after_a_turn_of_azimuth(term, step):
+    assert abs(term.north_step()) == pytest.approx(step, abs=1e-12)

@@ -106,3 +106,20 @@ def test_the_simulator_has_laws_of_pointing_alone(file, tmp_path):
     options = parse_options([f"--instrument={path}", "--seed=1"])
     with pytest.raises(ConfigurationError, match="found a law of derotator"):
         build_telescope(options, load_instrument(path))
+
+
+@pytest.mark.parametrize(
+    ("term", "found"),
+    [
+        ('shift_x_subap = "0.0008 * azimuth"', "0.288"),
+        ('shift_y_subap = { of = "azimuth", at = [0, 360], values = [0.1, 0.3] }', "0.2"),
+        ('rotation_deg = "azimuth / 2"', "180"),
+        ('magnification = "1 + azimuth / 10000"', "0.036"),
+    ],
+)
+def test_a_law_that_would_leap_at_north_is_refused(tmp_path, term, found):
+    path = tmp_path / "law.toml"
+    text = f"{INSTRUMENT.read_text(encoding='utf-8')}\n[law]\n{term}\n"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=f"{found} more after a whole turn of azimuth"):
+        load_instrument(path)

@@ -251,3 +251,26 @@ def test_shifts_of_the_law_are_in_the_subapertures_of_the_first_mode():
     night = Night(policy=replace(WITH_LAW, sensor_modes=modes)).meet(t_ns=START_NS)
     night.point(at(100.0, 20.0))
     assert night.state.alpha.law.nominal.shift_x_subap == pytest.approx(0.1)
+
+
+def test_a_law_that_leaps_at_north_does_not_move_alpha():
+    """By 0.288 subapertures, while the telescope turns by 0.7 deg: no matrix is made for it."""
+    law = PointingLaw(shift_x_subap=Term("0.0008 * azimuth"))
+    night = Night(policy=replace(POLICY, law=law)).meet(t_ns=START_NS)
+    for _ in range(3):
+        night.point(at(359.6), after_s=2.0)
+        night.window(law.at({"azimuth": 359.6, "elevation": 50.0}))
+    before = night.alpha.shift_x_subap
+    night.point(at(0.3))
+    assert night.alpha.shift_x_subap == pytest.approx(before)
+    assert "leapt" in night.problem
+    for _ in range(round(BELIEVED_S / 0.2) + 1):
+        night.point(at(0.3))
+    assert night.state.alpha.registration.doubt, "α is doubted where the leap lasts"
+
+
+def test_a_law_of_the_pointing_may_move_as_fast_as_the_telescope(night):
+    """Three degrees of azimuth in one status: the rotation follows at once."""
+    night.point(at(103.0))
+    assert night.problem == ""
+    assert night.alpha.vector == pytest.approx(placed(103.0).vector)

@@ -103,9 +103,13 @@ def test_a_doubt_survives_but_the_window_that_raised_it_does_not(before):
 def test_what_does_not_fit_is_left_and_said(before, changes, away_s, reason):
     again = restarted(before, away_s, **changes)
     assert again.state.alpha.registration is None
-    (entry,) = again.state.log
+    (entry,) = (e for e in again.state.log if e.name == "registration.not-restored")
     assert entry.level is Level.WARNING
     assert reason in entry.text
+    assert reason in again.state.alarm("alpha-not-restored").text
+    again.meet()
+    again.see()
+    assert again.state.alarm("alpha-not-restored") is None, "α is known again"
 
 
 def test_what_does_not_fit_the_rtc_that_comes_is_dropped(before):

@@ -90,12 +90,24 @@ def test_a_wrong_matrix_is_over_when_the_rtc_acknowledges_the_right_one_or_start
     assert story.state.matrices.mismatched_id is None
 
 
-def test_a_commit_the_rtc_could_not_read_is_rejected_though_it_names_none():
+def test_a_commit_the_rtc_could_not_read_is_not_taken_for_a_matrix_on_its_way():
+    """Anyone may have sent it: the reason is logged, and the matrix waits for its own answer."""
     story = sent()
-    answer(story, None, MatrixState.REJECTED, matrix_id=None)
-    assert story.matrix_state("cm-1") is MatrixState.REJECTED
-    story.tell(acknowledged(None, state=MatrixState.REJECTED, reason="x", frame_seq=None))
-    assert "acknowledgement.unknown" in story.logged
+    story.tell(acknowledged(None, state=MatrixState.REJECTED, reason="signature", frame_seq=None))
+    assert story.matrix_state("cm-1") is MatrixState.PUBLISHED
+    (said,) = (e for e in story.state.log if e.name == "acknowledgement.unreadable-commit")
+    assert "signature" in said.text
+    assert "cm-1" in said.text
+    answer(story, SUM)
+    assert story.state.matrices.in_use == "cm-1"
+
+
+def test_a_commit_that_only_the_rtc_has_seen_is_told_with_its_reason():
+    story = sent()
+    answer(story, SUM)
+    story.tell(acknowledged(None, state=MatrixState.REJECTED, reason="no map", frame_seq=None))
+    said = [e for e in story.state.log if e.name == "acknowledgement.unreadable-commit"]
+    assert "no map. This service has sent none" in said[-1].text
 
 
 # ---------------------------------------------------------------- a known id in a new session

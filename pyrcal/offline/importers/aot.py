@@ -138,17 +138,16 @@ def from_aot(
 def _chosen_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: ANN401
     """Return the loop that is asked for, or the only one with an interaction matrix."""
     measured = [one for one in system.loops if getattr(one, "interaction_matrix", None) is not None]
-    listed = "; ".join(
-        f"{number} {one.uid} ({_words(one)})" for number, one in enumerate(system.loops, start=1)
-    )
     if wanted is None:
         if len(measured) == 1:
             return measured[0]
+        listed = _listed(system)
         what = "no loop" if not measured else f"{len(measured)} loops"
         raise MatrixError(
             f"{path}: found {what} with an interaction matrix, expected one: choose with --loop: "
-            f"{listed or 'none'}"
+            f"{listed}"
         )
+    listed = _listed(system)
     for number, one in enumerate(system.loops, start=1):
         if wanted in {str(number), one.uid}:
             if one not in measured:
@@ -156,7 +155,13 @@ def _chosen_loop(path: Path, system: Any, wanted: str | None) -> Any:  # noqa: A
                     f"{path}: loop {one.uid}: found no interaction matrix, expected one: {listed}"
                 )
             return one
-    raise MatrixError(f"{path}: --loop: found {wanted}, expected one of {listed or 'none'}")
+    raise MatrixError(f"{path}: --loop: found {wanted}, expected one of {listed}")
+
+
+def _listed(system: Any) -> str:  # noqa: ANN401
+    """Return the loops of a file, each with its number."""
+    loops = (f"{k} {one.uid} ({_words(one)})" for k, one in enumerate(system.loops, start=1))
+    return "; ".join(loops) or "none"
 
 
 def _words(loop: Any) -> str:  # noqa: ANN401

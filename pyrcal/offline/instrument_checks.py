@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.methods import Settled
-from pyrcal.offline.models import BETTER, FAR_BETTER, FitModels, Optic, Other
+from pyrcal.offline.models import BETTER, CHEAP, FAR_BETTER, FitModels, Optic, Other
 from pyrcal.offline.pupil_checks import Few, TriedPupil
-from pyrcal.offline.solver import refine
+from pyrcal.offline.solver import Solution, refine
 from pyrcal.offline.uncertainty import Uncertainty
+from service.model.kinds import Stop
 
 Array = NDArray[np.float64]
 
@@ -124,7 +125,7 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
     Each is allowed its own registration, coupling and sensor, to first order about those found;
     where the matrix cannot tell, it is fitted as well.
     """
-    solution, own = settled.solution, few.left(few.own)
+    own = few.left(few.own)
     found = [
         Rival(
             change=Other(words=one.words, believed=FAR_BETTER),
@@ -140,11 +141,22 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
         share, moved = seen.chi_at_best / own, np.zeros(4)
         estimate = seen.best_step[:4] - few.step(few.own)[:4]
         if change.believed <= share < 1.0 / BETTER:
-            there = refine(other, settled.target, solution.alpha, settled.nuisances)
-            moved = there.vector - solution.vector if there.converged else moved
+            there, here = _fitted_alike(other, settled), _fitted_alike(settled.models, settled)
+            moved = there.vector - here.vector if there.converged else moved
             estimate = moved if there.converged else estimate
         found.append(Rival(change=change, share=share, moved=moved, estimate=estimate))
     return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
+
+
+def _fitted_alike(models: FitModels, settled: Settled) -> Solution:
+    """Return the fit of an instrument on the cheap grid, by the derivatives of the solution.
+
+    Two instruments are compared by fits that are alike in all but the instrument.
+    """
+    start, near = settled.solution.alpha, settled.solution.near
+    # with the mirror as stop every shift has a response of its own: none is worth keeping
+    cheap = models.model(CHEAP, once=models.instrument.stop is Stop.MIRROR)
+    return refine(models, settled.target, start, settled.nuisances, near=near, decides=cheap)
 
 
 def doubt_of_width(settled: Settled, few: Few) -> Array:

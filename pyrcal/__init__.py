@@ -7,37 +7,71 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from service import __version__
-from service.errors import PyrcalError
+from service.errors import (
+    ConfigurationError,
+    MatrixError,
+    ModelError,
+    PyrcalError,
+    StorageError,
+)
 
 if TYPE_CHECKING:
     from pyrcal.client.rest import Service
     from pyrcal.offline.design import dither_sigma, interaction_matrix
-    from pyrcal.offline.fit_file import fit_file
+    from pyrcal.offline.fit_file import fit, fit_file
+    from pyrcal.offline.fitted import Fit
     from pyrcal.offline.importers.oopao import from_oopao, to_oopao
     from pyrcal.offline.matrix import FitOptions
-    from pyrcal.offline.report import read_fit
+    from pyrcal.offline.report import FitReport, KnownFit, read_fit
     from pyrcal.playback.player import Track
     from pyrcal.playback.track import track
     from service.config.instrument import load_instrument
-    from service.control.reconstructor import Recipe, reconstruct
+    from service.config.settings import Settings
+    from service.control.reconstructor import (
+        Inversion,
+        InversionMethod,
+        Prior,
+        Recipe,
+        reconstruct,
+    )
+    from service.control.reconstructor import Recipe as InversionOptions
     from service.files.bundle import Bundle, read_bundle, write_bundle
     from service.model.arrays import arrays_of
+    from service.model.arrays import arrays_of as array_backend
+    from service.model.instrument import Instrument
     from service.model.interaction import RtcInteractionModel
     from service.model.misregistration import Misregistration
     from service.model.modes import modal_basis
+    from service.model.slopes import Orientation
 
 __all__ = [
     "Bundle",
+    "ConfigurationError",
+    "Fit",
     "FitOptions",
+    "FitReport",
+    "Instrument",
+    "Inversion",
+    "InversionMethod",
+    "InversionOptions",
+    "KnownFit",
+    "MatrixError",
     "Misregistration",
+    "ModelError",
+    "Orientation",
+    "Prior",
     "PyrcalError",
     "Recipe",
     "RtcInteractionModel",
     "Service",
+    "Settings",
+    "StorageError",
     "Track",
     "__version__",
+    "array_backend",
     "arrays_of",
     "dither_sigma",
+    "fit",
     "fit_file",
     "from_oopao",
     "interaction_matrix",
@@ -53,14 +87,26 @@ __all__ = [
 
 _HOMES = {
     "Bundle": "service.files.bundle",
+    "Fit": "pyrcal.offline.fitted",
     "FitOptions": "pyrcal.offline.matrix",
+    "FitReport": "pyrcal.offline.report",
+    "Instrument": "service.model.instrument",
+    "Inversion": "service.control.reconstructor",
+    "InversionMethod": "service.control.reconstructor",
+    "InversionOptions": "service.control.reconstructor",
+    "KnownFit": "pyrcal.offline.report",
     "Misregistration": "service.model.misregistration",
+    "Orientation": "service.model.slopes",
+    "Prior": "service.control.reconstructor",
     "Recipe": "service.control.reconstructor",
     "RtcInteractionModel": "service.model.interaction",
     "Service": "pyrcal.client.rest",
+    "Settings": "service.config.settings",
     "Track": "pyrcal.playback.player",
+    "array_backend": "service.model.arrays",
     "arrays_of": "service.model.arrays",
     "dither_sigma": "pyrcal.offline.design",
+    "fit": "pyrcal.offline.fit_file",
     "fit_file": "pyrcal.offline.fit_file",
     "from_oopao": "pyrcal.offline.importers.oopao",
     "interaction_matrix": "pyrcal.offline.design",
@@ -74,9 +120,17 @@ _HOMES = {
     "write_bundle": "service.files.bundle",
 }
 
+_RENAMED = {"InversionOptions": "Recipe", "array_backend": "arrays_of"}
+"""Public names of what is called otherwise in its module."""
+
+_MODULES = {"conventions"}
+"""Modules that may be used without an import of their own."""
+
 
 def __getattr__(name: str) -> object:
     """Import a name of the library when it is first used."""
+    if name in _MODULES:
+        return import_module(f"{__name__}.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_HOMES[name]), _RENAMED.get(name, name))

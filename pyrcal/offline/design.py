@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.config import load_instrument
 from service.errors import ModelError
 from service.files.disk_cache import cached_basis
 from service.model.instrument import Instrument
@@ -15,10 +17,11 @@ from service.model.misregistration import Misregistration
 
 
 def interaction_matrix(
-    instrument: Instrument, alpha: Misregistration | None = None
+    instrument: Instrument | str | Path, alpha: Misregistration | None = None
 ) -> NDArray[np.float32]:
     """Return the noise-free D(α) of an instrument, ``(n_slopes, n_modes)`` slope per metre of OPD.
 
+    ``instrument`` is what ``load_instrument`` returns or takes.
     Rows are in the order of the RTC's slopes. Without ``alpha`` the registration is perfect. The
     modes are cached on disk (in ``$PYRCAL_SERVICE__CACHE_DIR``, or ``~/.cache/pyrcal``); many
     matrices of one instrument are quickest with one ``RtcInteractionModel``.
@@ -32,6 +35,8 @@ def interaction_matrix(
     ----------
     Heritier et al. 2018, equation 1: D = M_WFS M_DM.
     """
+    if not isinstance(instrument, Instrument):
+        instrument = load_instrument(instrument)
     model = RtcInteractionModel(instrument, cached_basis(instrument))
     return np.asarray(model.interaction_matrix(alpha or Misregistration()), np.float32)
 

@@ -26,7 +26,7 @@ from service.model.slopes import as_maps, side_by_side
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import SubFigure
+    from matplotlib.figure import Figure, SubFigure
 
 
 _WIDTH = 15.0
@@ -64,36 +64,47 @@ def write_sheet(report: FitReport, instrument: Instrument, path: Path) -> None:
         If matplotlib is not installed, or the file cannot be written.
     """
     check_plots()
+    fit = report.fit
+    heading = f"{report.instrument}: {report.reference}"
+    try:
+        draw_sheet(fit, heading, instrument).savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
+
+
+def draw_sheet(fit: Fit, heading: str, instrument: Instrument | None = None) -> Figure:
+    """Return all figures of a fit; the mirror over the subapertures needs the instrument.
+
+    Raises
+    ------
+    ConfigurationError
+        If matplotlib is not installed.
+    """
+    check_plots("plot")
     from matplotlib.figure import Figure
 
-    fit = report.fit
     steps = fit.paper_table or ()
     heights = [2 * _ROW, _MAP_ROW * _rows(shown_modes(fit), _MODES_ACROSS) + 0.4]
     if steps:
         heights.append(_SCAN_ROW * _rows(steps, _SCANS_ACROSS))
     figure = Figure(figsize=(_WIDTH, sum(heights) + 0.8), layout="constrained")
     advice = textwrap.wrap(fit.recommendation, 150) + textwrap.wrap(verdict_line(fit), 150)
-    heading = [
-        f"{report.instrument}: {report.reference}",
-        *advice,
-        *textwrap.wrap(verdict_line(fit), 150),
-    ]
-    figure.suptitle("\n".join(heading), fontsize="medium")
+    figure.suptitle("\n".join([heading, *advice]), fontsize="medium")
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).ravel()
     grid = parts[0].subplots(2, 3)
     singular_values(grid[0, 0], fit)
     gains(grid[0, 1], fit)
     slopes_rms(grid[0, 2], fit)
-    registration(grid[1, 0], fit, instrument)
+    if instrument is None:
+        grid[1, 0].set_axis_off()
+    else:
+        registration(grid[1, 0], fit, instrument)
     residual(grid[1, 1], fit)
     residual_by_mode(grid[1, 2], fit)
     slope_maps(parts[1], fit)
     if steps:
         scans(parts[2], steps)
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
+    return figure
 
 
 Array = NDArray[np.float64]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,11 @@ from pyrcal.offline.solver import ANAMORPHOSIS_SIGMA
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Determination
 from service.model.slopes import Orientation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from service.model.instrument import Instrument
 
 TOLD = 0.5
 """1 σ of an anamorphosis over what is expected of any, below which modes tell of it."""
@@ -148,3 +154,19 @@ class Fit(Determination):
         sigma = self.anamorphosis_sigma
         told = sigma is not None and bool(np.all(sigma < TOLD * ANAMORPHOSIS_SIGMA))
         return self.alpha.stretches if told else None
+
+    def plot(self, instrument: Instrument | None = None) -> Figure:
+        """Return the figures of this fit, as ``pyrcal fit --plot`` draws them.
+
+        With the ``instrument``, its mirror is drawn over the subapertures as well. Save them with
+        ``fit.plot().savefig("fit.png")``.
+
+        Raises
+        ------
+        ConfigurationError
+            If matplotlib, the extra ``plots``, is not installed.
+        """
+        figures = import_module("pyrcal.offline.figures")  # it draws this record
+        heading = "" if instrument is None else instrument.name
+        figure: Figure = figures.draw_sheet(self, heading, instrument)
+        return figure

@@ -30,7 +30,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.models import FitModels, Optic
+from pyrcal.offline.models import CHEAP, FitModels, Optic
 from pyrcal.offline.solver import (
     LONGEST_OPTIC_STEP,
     Nuisances,
@@ -186,6 +186,9 @@ class Settled:
     nuisances: Nuisances
     """About these models."""
 
+    on_fine_grid: bool = True
+    """Whether the fine model has decided."""
+
     @property
     def by_mode(self) -> Array:
         """``(n_modes,)`` RMS of the residual over the RMS of the measurement."""
@@ -204,33 +207,59 @@ def settle(
 ) -> Settled:
     """Return the minimum on the fine grid.
 
-    What is found of the instrument is linear only close by, so the fit is done again about it. A
-    table of modes ends somewhere, and where depends on the registration: the slopes near its edge
-    are left out, and the fit is done again if that changed anything.
+    What is found of the instrument is linear only close by, so the fit is done again about it: on
+    the cheap grid until that has come to rest, then on the fine one. A table of modes ends
+    somewhere, and where depends on the registration: the slopes near its edge are left out, and the
+    fit is done again if that changed anything.
     """
     seen = _known(models, target, start)
     solution = refine(models, seen, start, nuisances)
     settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
-    # displaced images look like another modulation, so they come first where one is known
-    looks = [_with_nearest_images, _with_nearest_sensor]
-    if Optic.SENSOR in nuisances.unknown:
-        looks.reverse()
-    for look in looks:
-        models, nuisances = look(settled)
-        if models is not settled.models:
-            solution = refine(models, seen, settled.solution.alpha, nuisances)
-            settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
-    before = np.inf
+    settled = _with_nearest_instrument(settled)
+    models, nuisances = settled.models, settled.nuisances
+    before, approaching = np.inf, True
     for _ in range(MAX_REPEATS):
         left = settled.solution.projection.chi
         if models is settled.models:
             models, nuisances = _adjusted(settled, move_images=left < IMAGES_GAIN * before)
         before = left
-        there = _known(models, target, settled.solution.alpha)
+        there, near = _known(models, target, settled.solution.alpha), None
         if models is settled.models and np.array_equal(there.rows, settled.target.rows):
-            break
-        solution = refine(models, there, settled.solution.alpha, nuisances)
-        settled = Settled(solution=solution, target=there, models=models, nuisances=nuisances)
+            if settled.on_fine_grid:
+                break
+            approaching, near = False, settled.solution.near
+        decides = models.cheap if approaching else models.fine
+        start = settled.solution.alpha
+        solution = refine(models, there, start, nuisances, near=near, decides=decides)
+        settled = Settled(
+            solution=solution,
+            target=there,
+            models=models,
+            nuisances=nuisances,
+            on_fine_grid=not approaching,
+        )
+    if settled.on_fine_grid:
+        return settled
+    solution = refine(models, settled.target, settled.solution.alpha, nuisances)
+    return replace(settled, solution=solution, on_fine_grid=True)
+
+
+def _with_nearest_instrument(settled: Settled) -> Settled:
+    """Return the fit with images and sensor that explain the matrix best, where they seem far off.
+
+    Displaced images look like another modulation, so they come first where a modulation is known.
+    """
+    searches = [_with_nearest_images, _with_nearest_sensor]
+    if Optic.SENSOR in settled.nuisances.unknown:
+        searches.reverse()
+    for search in searches:
+        models, nuisances = search(settled)
+        if models is not settled.models:
+            start = settled.solution.alpha
+            solution = refine(models, settled.target, start, nuisances, decides=models.cheap)
+            settled = replace(
+                settled, solution=solution, models=models, nuisances=nuisances, on_fine_grid=False
+            )
     return settled
 
 
@@ -256,7 +285,8 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     def left(change: float) -> float:
         models.counter.n += 1
         changed = subset.adjusted(Optic.SENSOR, change) if change else subset
-        return few.project(changed.cheap.interaction_matrix(solution.alpha), every).chi_at_best
+        matrix = changed.model(CHEAP, once=True).interaction_matrix(solution.alpha)
+        return few.project(matrix, every).chi_at_best
 
     found = [left(change) for change in CHANGES]
     best = int(np.argmin(found))

@@ -58,11 +58,15 @@ class PupilNumber:
             return replace(about, obscuration_ratio=value)
         return replace(about, wfs=replace(about.wfs, pupil_diameter_subap=value))
 
+    def rate(self, few: Few) -> Array:
+        """Return how D of the file's value changes with its power, ``(n_slopes, n_few)``."""
+        beside = self.reported**self.power + self.step
+        there = few.matrix(few.of(self.changed(few.models.instrument, beside)))
+        return np.asarray((there - few.own) / self.step)
+
     def near(self, few: Few) -> tuple[float, Lead, Array]:
         """Return the value that explains most, its lead, α's move; to first order."""
-        light = self.reported**self.power
-        there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
-        rate = (there - few.own) / self.step
+        light, rate = self.reported**self.power, self.rate(few)
         if not few.tells(few.own, rate):
             return self.reported, Lead(share=1.0, sigma=0.0), np.zeros(4)
         step = few.step(few.own, rate)
@@ -76,17 +80,23 @@ class PupilNumber:
         return value, few.lead(matrix), few.step(matrix)[:4] - few.step(few.own)[:4]
 
     def found(self, few: Few) -> tuple[float, Array]:
-        """Return the value that explains most, and D of it ``(n_slopes, n_few)``."""
-        light, matrix = self.reported**self.power, few.own
+        """Return the value that explains most, and D of it ``(n_slopes, n_few)``.
+
+        A second step takes its rate from the first, unless that was too short to tell one.
+        """
+        light, matrix, rate = self.reported**self.power, few.own, self.rate(few)
         low, high = (limit**self.power for limit in self.range)
         for _ in range(_STEPS):
-            there = few.matrix(few.of(self.changed(few.models.instrument, light + self.step)))
-            rate = (there - matrix) / self.step
             if not few.tells(matrix, rate):
                 break
+            before, left = light, matrix
             light += float(few.step(matrix, rate)[-1])
             light = float(np.clip(light, low, high))
+            if light == before:
+                break
             matrix = few.matrix(few.of(self.changed(few.models.instrument, light)))
+            if abs(light - before) > self.step:
+                rate = (matrix - left) / (light - before)
         return light ** (1.0 / self.power), matrix
 
 
@@ -163,7 +173,7 @@ class Few:
         """Return D of an instrument, ``(n_slopes, n_few)``."""
         own = tried.basis is self.models.basis
         basis = self.model.basis if own else tried.basis.subset(self.modes)
-        return self._at_solution(tried.model(CHEAP, basis))
+        return self._at_solution(tried.model(CHEAP, basis, once=True))
 
     def left(self, matrix: Array, *more: Array) -> float:
         """Return χ² at the best unknowns, those given by a derivative included."""

@@ -374,7 +374,7 @@ class Provenance:
         return found
 
 
-def read_fit(path: Path) -> KnownFit:
+def read_fit(path: str | Path) -> KnownFit:
     """Return the fit in a file that ``pyrcal fit`` wrote: its JSON document, or its product.
 
     Raises
@@ -382,6 +382,7 @@ def read_fit(path: Path) -> KnownFit:
     MatrixError
         If it is neither.
     """
+    path = Path(path)
     try:
         if h5py.is_hdf5(path):
             with h5py.File(path, "r", locking=False) as file:

@@ -23,6 +23,7 @@ from service.estimation.solver import (
     Projection,
     within_limits,
 )
+from service.model.interaction import InteractionModel
 from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import signals_of_slopes, slopes_of
@@ -282,6 +283,10 @@ class Solution:
     matrix: NDArray[np.float32]
     """``(n_slopes, n_modes)`` the model there."""
 
+    near: Array
+    """``(n_unknowns - n_maps, n_slopes, n_modes)`` derivatives of the model, taken nearby, before
+    a gain map is applied and without its own."""
+
     derivatives: Array
     """``(4, n_slopes, n_modes)`` of the model, taken nearby, its gain map applied."""
 
@@ -303,17 +308,33 @@ def refine(
     start: Misregistration,
     nuisances: Nuisances,
     max_steps: int = MAX_NEAR_STEPS,
+    *,
+    near: Array | None = None,
+    decides: InteractionModel | None = None,
 ) -> Solution:
     """Return the minimum on the fine grid, with derivatives frozen on a cheaper one.
 
     Near the minimum the derivatives' own error only slows the last steps down: what decides is
     the residual, and that is the fine grid's.
+
+    Parameters
+    ----------
+    models, columns, start, nuisances
+        Of the instrument; what was measured; where to begin; the unknowns beside α.
+    max_steps
+        Steps after which it ends, settled or not.
+    near
+        Derivatives of a solution nearby, ``Solution.near``; None: they are computed here.
+    decides
+        The model whose residual decides; None: the fine one.
     """
     vector, values = start.vector, nuisances.begin(start)
-    models.counter.n += 4
-    frozen = models.cheap.derivatives(start)
-    matrix = models.matrix(models.fine, start)
-    near = np.concatenate([frozen, nuisances.derivatives(models, start, matrix, frozen)])
+    decides = models.fine if decides is None else decides
+    matrix = models.matrix(decides, start)
+    if near is None:
+        models.counter.n += 4
+        frozen = models.cheap.derivatives(start)
+        near = np.concatenate([frozen, nuisances.derivatives(models, start, matrix, frozen)])
     seen, every = _seen(columns, matrix, near, values, nuisances)
     converged = False
     for _ in range(max_steps):
@@ -321,7 +342,7 @@ def refine(
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
-        matrix = models.matrix(models.fine, nuisances.at(start, vector, values))
+        matrix = models.matrix(decides, nuisances.at(start, vector, values))
         seen, every = _seen(columns, matrix, near, values, nuisances)
         next_step = _bounded_step(seen, values, nuisances)
         stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
@@ -333,6 +354,7 @@ def refine(
         alpha=nuisances.at(start, vector, values),
         nuisances=values,
         matrix=matrix,
+        near=near,
         derivatives=every[:4],
         nuisance_derivatives=every[4:],
         projection=seen,

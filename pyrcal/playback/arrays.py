@@ -140,7 +140,7 @@ class Arrays:
         if matrix is not None:
             yield _matrix_message(matrix, status)
         every = max(1, round(STATUS_S * status.frame_rate_hz))
-        told, unusable = -1, np.zeros(0, np.intp)
+        last_status, unusable = -1, np.zeros(0, np.intp)
         for start, stop in _batches(seq, _frames_at_once(n_slopes + 2 * n_modes)):
             rows = self._rows(start, stop, n_modes)
             usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)  # False for NaN, too
@@ -148,8 +148,8 @@ class Arrays:
             for first, last in _runs(usable):
                 numbers = seq[[start + first, start + last - 1]]
                 since = numbers - seq[0]
-                if since[0] // every != told:
-                    told = since[0] // every
+                if since[0] // every != last_status:
+                    last_status = since[0] // every
                     yield _status_message(status, int(numbers[0]), int(since[0]))
                 header = self._header(status, int(numbers[0]), last - first, int(since[0]))
                 payload, attachment = encode_frames(header, rows[first:last])

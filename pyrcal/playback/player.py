@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Concatenate, Final, ParamSpec, TypeVar
+from importlib import import_module
+from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from service.link.intake import Intake
 from service.link.matrices import MeasuredMatrix
 from service.link.session import Endpoint
 from service.model.instrument import Instrument
+from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.model.slopes import SlopeRecipe
 from service.runtime.engine import Engine
 from service.runtime.estimates import fit_passive, fitted, read_own_matrix
@@ -39,6 +41,9 @@ from service.tracking.registration import HistoryEntry, PassiveState
 from service.tracking.state import LogEntry, LoopState, Mode, OperatorState, TrackerState
 from service.tracking.step_context import new_lines
 from service.wire import DitherRequest, Manifest, Reply, Status, decode
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -83,6 +88,39 @@ class Track:
 
     state: TrackerState
     """At the end."""
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """``(n,)`` end of each measurement of α, seconds since the first frame."""
+        ends_ns = np.array([entry.t_ns_utc for entry in self.entries], np.int64)
+        return (ends_ns - self.first_ns_utc) / SECOND_NS
+
+    @property
+    def alpha(self) -> NDArray[np.float64]:
+        """``(n, 4)`` filtered α after each measurement, in the units of ``PARAMETERS``."""
+        return _at_boundary([entry.filtered.vector for entry in self.entries])
+
+    @property
+    def sigma(self) -> NDArray[np.float64]:
+        """``(n, 4)`` 1 σ of ``alpha``, the model's error included."""
+        return _at_boundary([entry.filtered_sigma for entry in self.entries])
+
+    def plot(self, title: str = "") -> Figure:
+        """Return α over time as a figure, as ``pyrcal track --plot`` draws it.
+
+        Raises
+        ------
+        ConfigurationError
+            If matplotlib, the extra ``plots``, is not installed.
+        """
+        report = import_module("pyrcal.playback.report")  # it draws this record
+        figure: Figure = report.draw(self, title)
+        return figure
+
+
+def _at_boundary(vectors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return vectors in numeric units as rows in the units of ``PARAMETERS``."""
+    return np.asarray(np.array(vectors).reshape(-1, len(PARAMETERS)) * BOUNDARY_SCALE)
 
 
 class Player:

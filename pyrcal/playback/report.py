@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.figures import check_plots
 from pyrcal.playback.player import Track
 from pyrcal.terminal import table as aligned
 from service.errors import ConfigurationError
@@ -22,6 +23,7 @@ from service.tracking.state import Level
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -236,6 +238,21 @@ def plot(track: Track, title: str, path: Path) -> None:
     ConfigurationError
         If the file cannot be written.
     """
+    try:
+        draw(track, title).savefig(path, dpi=110)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
+
+
+def draw(track: Track, title: str) -> Figure:
+    """Return a figure of α over time, every estimator's and the filtered one.
+
+    Raises
+    ------
+    ConfigurationError
+        If matplotlib is not installed.
+    """
+    check_plots("plot")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
@@ -246,10 +263,7 @@ def plot(track: Track, title: str, path: Path) -> None:
     if track.entries or track.passive:
         every[0].legend(fontsize="small", ncols=4)
     every[-1].set_xlabel("seconds since the first frame")
-    try:
-        figure.savefig(path, dpi=110)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--plot: cannot write {path}: {error}") from error
+    return figure
 
 
 def _draw(axes: Axes, track: Track, k: int) -> None:

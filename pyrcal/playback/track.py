@@ -58,17 +58,23 @@ def main(options: argparse.Namespace) -> int:
     return NOTHING_FOUND if found.state.alpha.registration is None else FOUND
 
 
-def track(path: Path, instrument: Instrument, settings: Settings | None = None) -> Track:
+def track(
+    path: str | Path, instrument: Instrument | str | Path, settings: Settings | None = None
+) -> Track:
     """Return α over time from recorded telemetry, by the service's own estimators.
 
     ``path`` is a recording of pyrcal's, arrays in ``.npz`` or HDF5, an AOT file or pyRTC's session
-    (docs/integrate/tracking.md); ``settings`` None: the usual ones.
+    (docs/integrate/tracking.md). ``instrument`` is what ``load_instrument`` returns or takes;
+    ``settings`` None: the usual ones.
 
     Raises
     ------
     PyrcalError
         If the file, the instrument or the settings cannot be used.
     """
+    path = Path(path)
+    if not isinstance(instrument, Instrument):
+        instrument = load_instrument(instrument)
     settings = settings or load_settings(None, {})
     with threadpool_limits(1):
         if _is_recording(path):

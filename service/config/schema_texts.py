@@ -105,10 +105,13 @@ def _field_texts(record: type) -> dict[str, str]:
 def _type(field: Schema, kinds: Mapping[str, Schema]) -> str:
     if "$ref" in field:
         return _type(kinds[field["$ref"].rpartition("/")[2]], kinds)
-    for word in ("anyOf", "prefixItems"):
-        if word in field:
-            several = [_type(each, kinds) for each in field[word] if each.get("type") != "null"]
-            return (" or " if word == "anyOf" else ", ").join(dict.fromkeys(several))
+    if "anyOf" in field:
+        several = [_type(each, kinds) for each in field["anyOf"] if each.get("type") != "null"]
+        return " or ".join(dict.fromkeys(several))
+    if "prefixItems" in field:
+        parts = [_type(each, kinds) for each in field["prefixItems"]]
+        alike = len(set(parts)) == 1
+        return f"list of {len(parts)}: {parts[0] if alike else ', '.join(parts)}"
     if "enum" in field:
         return ", ".join(f"`{value}`" for value in field["enum"])
     if "const" in field:

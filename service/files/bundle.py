@@ -68,7 +68,7 @@ class Bundle:
         return _digest(_manifest(self))
 
 
-def write_bundle(path: Path, bundle: Bundle) -> None:
+def write_bundle(path: str | Path, bundle: Bundle) -> None:
     """Write a bundle, complete or not at all: FITS where the name ends so, else HDF5.
 
     Raises
@@ -80,6 +80,7 @@ def write_bundle(path: Path, bundle: Bundle) -> None:
     StorageError
         If the disk refuses.
     """
+    path = Path(path)
     if path.exists():
         raise ConfigurationError(f"{path}: is there already; a bundle is never overwritten")
     _check(bundle)
@@ -99,7 +100,7 @@ def write_bundle(path: Path, bundle: Bundle) -> None:
     write_whole(path, fill)
 
 
-def read_bundle(path: Path) -> Bundle:
+def read_bundle(path: str | Path) -> Bundle:
     """Return a bundle, every array as it was written.
 
     Raises
@@ -108,6 +109,7 @@ def read_bundle(path: Path) -> Bundle:
         If it is none, of another version, or anything in it is not what was written: the message
         names the array.
     """
+    path = Path(path)
     with opened(path) as container:
         stored = {name.lower(): array for name, array in container.arrays.items()}
         if MANIFEST not in stored:

@@ -47,6 +47,8 @@ Way = Callable[[Array], Array]
 LARGEST_STRETCH = 0.2
 """Beyond a fifth the image is another one."""
 
+_AXES = 2
+
 _POINTS_TOGETHER = 2048
 """Of the pupil, whose modes are evaluated at once: fewer would cut tiles of plates in pieces."""
 
@@ -352,7 +354,20 @@ class InteractionModel:
         if self.instrument.stop is Stop.TELESCOPE:
             steps = -self.instrument.with_anamorphosis(alpha).on_mirror(np.eye(2))
             ways[:0] = [partial(_shifting, step=step) for step in steps]
+        if len(ways) > _AXES and isinstance(self._rendered(alpha), np.ndarray):
+            return self._along(alpha, ways)
         return [self._moved(alpha, way) for way in ways]
+
+    def _along(self, alpha: Misregistration, ways: list[Way]) -> list[Shapes]:
+        """Return the rates of modes that are arrays along several ways, from their gradient."""
+        steps = [partial(_shifting, step=step) for step in np.eye(_AXES)]
+        along_x, along_y = (self._moved(alpha, step) for step in steps)
+        points = self._mirror_points(alpha)
+        found: list[Shapes] = []
+        for way in ways:
+            x, y = way(points).astype(self._dtype).T
+            found.append(along_x * x[:, None] + along_y * y[:, None])
+        return found
 
     def _seen_together(self, alpha: Misregistration, shapes: list[Shapes]) -> list[Array]:
         """Return the signals of each of some shapes, with one response for all if none is kept."""

@@ -117,7 +117,14 @@ class LocalShapes:
 
     def array(self) -> Array:
         """Return the shapes ``(n_points, n_shapes)``."""
-        return np.asarray(self.combined(self.sparse()))
+        if self.combination is None or self.n_layers > 1:
+            return np.asarray(self.combined(self.sparse()))
+        weights = [patch.weights.dtype for patch in self.patches]
+        found = np.zeros(self.shape, np.result_type(self.combination, *weights))
+        for patch in self.patches:
+            heights = patch.weights[patch.tile.lit]
+            found[patch.tile.places] = heights @ self.combination[patch.functions]
+        return found
 
     def sparse(self) -> Any:  # noqa: ANN401 - scipy has no types
         """Return the functions of all layers ``(n_points, n_all_functions)``, sparse."""

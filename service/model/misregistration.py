@@ -82,6 +82,11 @@ class Misregistration:
         return f"({x:+.2f}, {y:+.2f} subap, {turned:+.2f} deg, {size:.4f})"
 
     @property
+    def rotation_deg(self) -> float:
+        """Rotation from sensor +x towards +y, in degrees."""
+        return float(np.rad2deg(self.rotation_rad))
+
+    @property
     def vector(self) -> NDArray[np.float64]:
         """Numeric 4-vector: shifts in subapertures, rotation in radians, magnification."""
         return np.array(
@@ -157,6 +162,10 @@ class Determination:
     def sigma(self) -> NDArray[np.float64]:
         """``(4,)`` 1 σ, numeric units."""
         return np.sqrt(np.diag(self.covariance))
+
+    def sigma_to_boundary(self) -> dict[str, float]:
+        """Return 1 σ of the four named numbers used in files and in REST (degrees)."""
+        return at_boundary(self.sigma)
 
 
 def step_text(step: NDArray[np.float64]) -> str:

@@ -16,6 +16,16 @@ def test_everything_that_is_offered_is_there(name):
     assert getattr(pyrcal, name) is not None
 
 
+def test_the_conventions_need_no_import_of_their_own():
+    code = "import pyrcal; pyrcal.conventions.check"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_names_of_the_documents_are_the_same_things():
+    assert pyrcal.InversionOptions is pyrcal.Recipe
+    assert pyrcal.array_backend is pyrcal.arrays_of
+
+
 def test_nothing_else_is_offered():
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
         _ = pyrcal.nonsense
@@ -41,7 +51,9 @@ def test_the_services_own_commands_are_those_of_pyrcal(capsys, command):
 SIGNATURES = {
     "dither_sigma": "near, modes, amplitude_m, n_frames, slope_noise",
     "fit_file": "instrument, path, options, dataset, threads, memory_gb, basis, progress",
+    "array_backend": "library",
     "arrays_of": "library",
+    "fit": "instrument, matrix, modes, noise, flux_frame, double_pass, options, threads",
     "from_oopao": "tel, dm, wfs, calib, M2C, ngs",
     "interaction_matrix": "instrument, alpha",
     "load_instrument": "name_or_path",

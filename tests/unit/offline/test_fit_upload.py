@@ -9,7 +9,7 @@ from dataclasses import replace
 import h5py
 import pytest
 
-from pyrcal.offline import matrix
+from pyrcal.offline import fit_file
 from pyrcal.offline.fit_upload import MOST_FILES, fit_upload, open_upload
 from service.cli.serve import FIT_PROGRAM
 from service.config import load_instrument
@@ -217,7 +217,7 @@ def test_an_instrument_may_come_with_the_matrix(tmp_path):
 
 
 def test_a_packaged_instrument_may_be_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(matrix, "modal_basis", lambda _instrument: flao_basis())
+    monkeypatch.setattr(fit_file, "cached_basis", lambda _instrument: flao_basis())
     with pytest.raises(MatrixError, match=r"found shape \(224, 40\); expected \(1408 slopes"):
         fitted(uploaded(tmp_path, HERE / "tiny.h5"), modes=None, instrument="flao-lbt")
 

@@ -8,6 +8,7 @@ import pytest
 from pyrcal.__main__ import main
 from pyrcal.offline.instruments.implied import described, implied
 from pyrcal.offline.instruments.template import EXAMPLES, template
+from pyrcal.offline.system_file import SystemFile
 from service.config import load_instrument
 from service.config.instrument_schema import whole_of
 from service.config.schema_texts import tables_of
@@ -156,3 +157,16 @@ def test_a_picture_that_cannot_be_written_is_refused(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     assert main(["instrument", "show", str(TINY), str(tmp_path / "tiny.nothing")]) == 2
     assert "cannot write" in capsys.readouterr().err
+
+
+def test_a_list_of_fixed_length_is_said_to_be_one():
+    """Their outer list was dropped: an array of two stood in the manual as one number."""
+    every = [
+        key
+        for whole in (whole_of(next(iter(KINDS.values()))), SystemFile)
+        for table in tables_of(whole)
+        for key in table.keys
+    ]
+    types = {key.name: key.type for key in every}
+    assert types["influence_table"] == "list of 2: integer ≥ 1"
+    assert types["star_arcsec"] == types["shift_m"] == "list of 2: number"

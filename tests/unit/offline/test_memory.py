@@ -68,7 +68,7 @@ def test_a_fit_that_is_too_large_is_refused_in_one_line_before_it_is_begun(monke
 
 
 def test_too_large_is_refused_in_one_line_before_modes_are_made(monkeypatch, tmp_path):
-    monkeypatch.setattr(reconstruct, "modal_basis", None)
+    monkeypatch.setattr(reconstruct, "cached_basis", None)
     words = ["reconstruct", str(TINY), "0,0,0,1", "--modes", "30", "--memory-gb", "0.05"]
     options = command_line().parse_args([*words, "--output", str(tmp_path / "cm.h5")])
     with pytest.raises(ModelError) as refused:

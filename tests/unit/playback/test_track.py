@@ -6,10 +6,12 @@ import h5py
 import numpy as np
 import pytest
 
+import pyrcal
 from pyrcal.__main__ import main
 from pyrcal_studies.campaign.small import SMALL
 from pyrcal_studies.campaign.telemetry import LINE_FRACTIONS
 from service.config import load_instrument
+from service.model.misregistration import BOUNDARY_SCALE
 from sim_rtc.assembly import build_telescope
 from sim_rtc.options import parse_options
 
@@ -104,6 +106,16 @@ def test_sines_in_an_npz_give_alpha(telemetry, tmp_path, capsys):
             file["t_ns_utc"][()], [entry["t_ns_utc"] for entry in found["entries"]]
         )
         assert file["measured"].shape == (len(found["entries"]), 4)
+
+
+def test_the_library_takes_names_and_gives_arrays(telemetry, tmp_path):
+    found = pyrcal.track(str(saved(tmp_path, telemetry)), str(SMALL))
+    assert found.t.shape == (len(found.entries),)
+    assert found.alpha.shape == found.sigma.shape == (len(found.entries), 4)
+    np.testing.assert_allclose(found.alpha[-1], found.entries[-1].filtered.vector * BOUNDARY_SCALE)
+    assert 0.0 < found.t[0] < SECONDS
+    found.plot("a night").savefig(tmp_path / "night.png")
+    assert (tmp_path / "night.png").stat().st_size > 10_000
 
 
 def test_hdf5_says_the_same_as_npz(telemetry, tmp_path, capsys):

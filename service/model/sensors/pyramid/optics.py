@@ -395,8 +395,37 @@ class PyramidOptics:
             return TiledResponse(shapes, self._scale, self.arrays)
         there = self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
+        if shapes is not None and self._are_few(shapes.shape[1]):
+            return partial(self._fold_few, weighted=self._weighted(shapes))
         known = None if shapes is None else there(shapes)
         return partial(self._fold, lit=lit, scale=scale, shapes=known)
+
+    def _are_few(self, n_shapes: int) -> bool:
+        """Return whether so few shapes cost less than the gradient at every point of a row."""
+        n_lines = self.recipe.kind.n_planes * self.wfs.n_subapertures
+        n_points = len(self.pupil.coordinates)
+        return n_shapes * (n_points + n_lines) < n_points * n_lines
+
+    def _weighted(self, shapes: Array) -> Foreign:
+        """Return shapes ``(n_lit, n_shapes)`` times the amplitude on the grid ``(N, N n_shapes)``.
+
+        0 at points that are not lit.
+        """
+        on_grid = np.zeros((*self.pupil.lit.shape, shapes.shape[1]), self.dtype)
+        on_grid[self.pupil.lit] = shapes * self._scale[self.pupil.lit][:, None]
+        return self.arrays.there(on_grid.reshape(len(on_grid), -1))
+
+    def _fold_few(self, along_y: Foreign, along_x: list[Foreign], *, weighted: Foreign) -> Foreign:
+        """Return the response of every line ``(n_lines, n_shapes)`` without its gradient.
+
+        The sums over y, then over x and the terms: products of matrices both.
+        """
+        xp = self.arrays.xp
+        over_y = xp.matmul(along_y.T, weighted)
+        n_terms, n_u = along_x[0].shape[1:]
+        over_y = xp.reshape(over_y, (n_terms * n_u, -1))
+        flat = [xp.reshape(part, (part.shape[0], -1)) for part in along_x]
+        return xp.concat([xp.matmul(part, over_y) for part in flat], axis=0)
 
     @property
     def _scale(self) -> Array:

@@ -240,7 +240,7 @@ class Before:
         return MEDIAN_NOISE * sigma * float(np.sqrt(1.0 / n_groups + 1.0 / self.n_groups))
 
 
-def measure_sigma(logs: Array, least: float, *, lower_half: bool = False) -> float:
+def measure_sigma(logs: Array, min_sigma: float, *, lower_half: bool = False) -> float:
     """Return 1 σ of ``logs`` ``(n_groups, n)`` in one group, correlation between groups included.
 
     The interquartile range is used, which a gust in a tenth of the time does not change; with
@@ -258,7 +258,7 @@ def measure_sigma(logs: Array, least: float, *, lower_half: bool = False) -> flo
         n_values = n * logs.shape[1]
         mixed = (n_values * square + PRIOR_VALUES * PRIOR_SCATTER**2) / (n_values + PRIOR_VALUES)
         found = mixed if length == 1 else max(found, mixed)
-    return max(float(np.sqrt(found)), least)
+    return max(float(np.sqrt(found)), min_sigma)
 
 
 def grouped(parts: tuple[Part, ...], part_s: float) -> tuple[Part, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +82,9 @@ class LeftOver:
     modes: tuple[tuple[int, float], ...]
     """Basis index and RMS share left over of modes that stand out, largest first."""
 
+    level: float = 1.0
+    """RMS share of the signal that is left over, in all subapertures."""
+
     arms: tuple[Arm, ...] = ()
     """Lines from the middle outwards along which more is left over, the clearest first."""
 
@@ -91,32 +95,36 @@ class LeftOver:
     """Change of what is left over across the pupil along x and along y, over its mean."""
 
     @property
-    def words(self) -> str:
-        """Where something stands out; empty: nowhere."""
-        parts = []
+    def _shape_words(self) -> Iterator[str]:
+        """Lines, rim, planes and gradient that stand out."""
         if self.arms:
             named = ", ".join(arm.words for arm in self.arms)
-            parts.append(
+            yield (
                 f"lines from the middle outwards, as the arms of a secondary make: {named} "
                 "(spiders_m, spiders_deg)"
             )
         if self.border is not None and self.border > RIM:
-            parts.append(
+            yield (
                 f"the rim leaves {self.border:.1f} times as much as the inside "
                 "(pupil_diameter_subap, valid_subapertures)"
             )
         if len(self.planes) == 2 and max(self.planes) > UNEVEN_PLANES:
             worse = "x" if self.planes[0] > self.planes[1] else "y"
-            parts.append(
+            yield (
                 f"S{worse} leaves {max(self.planes) / min(self.planes):.1f} times as much as the "
                 "other component"
             )
         if np.hypot(*self.gradient) > GRADIENT:
             angle = np.rad2deg(np.arctan2(self.gradient[1], self.gradient[0]))
-            parts.append(
+            yield (
                 f"it grows by {np.hypot(*self.gradient):.0%} of its mean across the pupil towards "
                 f"{angle:.0f} deg: light that is uneven (--flux-map, --gain-map)"
             )
+
+    @property
+    def words(self) -> str:
+        """Where something stands out; empty: nowhere."""
+        parts = list(self._shape_words) if self.level > LEAST else []
         if self.subapertures:
             named = ", ".join(f"row {y} column {x}" for y, x, _ in self.subapertures)
             parts.append(
@@ -157,6 +165,7 @@ def left_over(
         border=float(_rms(at_border) / _rms(inside)) if inside.any() and at_border.any() else None,
         subapertures=tuple(_strange_places(by_place, border)),
         modes=tuple(_strange_modes(by_mode, size, modes)),
+        level=_rms(by_place[known]),
         arms=tuple(_arms(by_place)),
         planes=_by_plane(planes),
         gradient=_gradient(by_place),
@@ -188,7 +197,7 @@ def arms_of(planes: Array) -> tuple[Arm, ...]:
     by_place = np.full(known.shape, np.nan)
     squares = np.where(np.isfinite(planes), planes, 0.0) ** 2
     by_place[known] = np.sqrt(np.mean(squares, axis=0))[known]
-    return tuple(_arms(by_place))
+    return tuple(_arms(by_place)) if _rms(by_place[known]) > LEAST else ()
 
 
 def _arms(by_place: Array) -> list[Arm]:

@@ -8,7 +8,7 @@ import pytest
 from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.fit_table import table
 from pyrcal.offline.instrument_checks import FoundOptic
-from pyrcal.offline.left_over import LeftOver
+from pyrcal.offline.left_over import Arm, LeftOver
 from pyrcal.offline.models import Optic
 from pyrcal.offline.origins import Origin
 from pyrcal.offline.report import document, read_fit
@@ -193,16 +193,26 @@ def test_what_was_found_is_said_once_and_its_key_whole():
 
 
 def test_where_something_is_left_over_is_told():
-    left = LeftOver(border=2.5, subapertures=((1, 2, 0.4),), modes=((4, 0.3),))
+    left = LeftOver(
+        border=2.5,
+        subapertures=((1, 2, 0.4),),
+        modes=((4, 0.3),),
+        arms=(Arm(angle_deg=120.0, offset_subap=-1.5, excess=2.0),),
+        planes=(0.9, 1.1),
+    )
     report = a_report(a_fit(left_over=left))
     text = table(report)
     assert "2.5 times as much at the pupil's border as inside" in text
     assert "row 1 column 2" in text
     assert "4 (30%)" in text
+    assert "120 deg, -1.5 subapertures off" in text
     assert document(report)["left_over"] == {
         "border": 2.5,
         "subapertures": [{"row": 1, "column": 2, "share": 0.4}],
         "modes": [{"mode": 4, "share": 0.3}],
+        "arms": [{"angle_deg": 120.0, "offset_subap": -1.5, "excess": 2.0}],
+        "planes": [0.9, 1.1],
+        "gradient": [0.0, 0.0],
     }
 
 

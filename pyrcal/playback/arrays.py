@@ -374,7 +374,7 @@ class Arrays:
             shown = f"{values[row]:.17g}" if values.dtype.kind == "f" else str(values[row])
             raise self._refusal(name, f"{shown} in row {row}", expected)
 
-    def _number(self, name: str, default: float | None, most: float) -> float:
+    def _number(self, name: str, default: float | None, limit: float) -> float:
         given = self.facts.get(name, self.found.get(name, default))
         if given is None:
             raise self._refusal(name, "no such number", "it as an attribute or an array of one")
@@ -382,8 +382,8 @@ class Arrays:
             value = float(np.asarray(given[()] if hasattr(given, "shape") else given).item())
         except (TypeError, ValueError) as error:
             raise self._refusal(name, str(given), "one number") from error
-        if not 0.0 <= value <= most:
-            raise self._refusal(name, f"{value:g}", f"a number from 0 to {most:g}")
+        if not 0.0 <= value <= limit:
+            raise self._refusal(name, f"{value:g}", f"a number from 0 to {limit:g}")
         return value
 
     def _refusal(self, name: str, found: str, expected: str) -> ConfigurationError:

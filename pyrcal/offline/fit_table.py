@@ -148,8 +148,14 @@ def _alternatives(fit: Fit) -> Iterator[str]:
             yield f"{'':20s}{words} {far:.1f} sigma ({most.words})"
 
 
-_DISPLACED_PX = 0.03
-"""Displacements of the pupil images that are worth a line; less is found on exact matrices."""
+NOTABLE_DISPLACEMENT_PX = 0.03
+"""Displacement of a pupil image from which on it is mentioned; less is found on exact matrices."""
+
+
+def displacement_words(offsets_px: NDArray[np.float64]) -> str:
+    """Return displacements of the pupil images ``(4, 2)`` as the instrument file states them."""
+    places = ", ".join(f"[{x:.2f}, {y:.2f}]" for x, y in offsets_px)
+    return f"image_offsets_px = [{places}]"
 
 
 def _as_written(fit: Fit) -> str:
@@ -171,9 +177,9 @@ def _extras(fit: Fit) -> Iterator[str]:
         words = _anamorphosis(fit.alpha.stretches, fit.anamorphosis_sigma)
         told = "" if fit.anamorphosis is not None else "not observable with these modes: "
         yield f"{'anamorphosis':20s}{told}{words}"
-    if fit.image_offsets_px is not None and np.abs(fit.image_offsets_px).max() > _DISPLACED_PX:
-        places = ", ".join(f"[{x:.2f}, {y:.2f}]" for x, y in fit.image_offsets_px)
-        yield f"{'pupil images':20s}image_offsets_px = [{places}] (fitted; the file does not say)"
+    places = fit.image_offsets_px
+    if places is not None and np.abs(places).max() > NOTABLE_DISPLACEMENT_PX:
+        yield f"{'pupil images':20s}{displacement_words(places)} (fitted; the file does not say)"
     if fit.gain_map is not None:
         gains = fit.gain_map[fit.valid]
         yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"

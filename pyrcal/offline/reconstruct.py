@@ -11,9 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.offline.fit_table import NOTABLE_DISPLACEMENT_PX, displacement_words
 from pyrcal.offline.importers.specula import write_specula
 from pyrcal.offline.instrument_checks import COUPLING_KEY
 from pyrcal.offline.light import read_light
@@ -201,7 +203,14 @@ def _with_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
     """Return the instrument with the sensor that the fit found; say so."""
     for key, value in fit.instrument_found.items():
         say(f"note: made with {key} = {value:.3g}, as {fit.origin} found; correct the instrument")
-    sensor_key = kind_of(instrument).fitted_key(instrument.wfs)
+    kind = kind_of(instrument)
+    if fit.image_offsets_px is not None and kind.image_offsets(instrument) is None:
+        # D with images on the pixel grid is 20 % wrong for images 0.2 pixel beside it
+        instrument = replace(instrument, wfs=kind.with_images_at(instrument, fit.image_offsets_px))
+        if np.abs(fit.image_offsets_px).max() > NOTABLE_DISPLACEMENT_PX:
+            words = displacement_words(fit.image_offsets_px)
+            say(f"note: made with {words}, as {fit.origin} found; add it to the instrument file")
+    sensor_key = kind.fitted_key(instrument.wfs)
     if sensor_key is None or sensor_key not in fit.instrument_found:
         return instrument
     number = fit.instrument_found[sensor_key]

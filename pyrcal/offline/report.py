@@ -325,6 +325,10 @@ class KnownFit:
     instrument_found: Mapping[str, float] = field(default_factory=dict)
     """What the fit found where the instrument file says otherwise or nothing, by key."""
 
+    image_offsets_px: NDArray[np.float64] | None = None
+    """``(4, 2)`` displacements of the pupil images that the fit found, as the instrument file
+    states them; None if the file states them, or the sensor has one image."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Provenance:
@@ -411,6 +415,9 @@ def _of_document(values: dict[str, Any], path: Path) -> KnownFit:
         accepted=str(values["verdict"]).startswith("accepted"),
         **_control(values.get("reconstructor")),
         instrument_found=_otherwise(values.get("instrument_found", {})),
+        image_offsets_px=None
+        if values.get("image_offsets_px") is None
+        else np.array(values["image_offsets_px"], dtype=np.float64),
         origin=str(path),
     )
 

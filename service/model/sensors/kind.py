@@ -322,6 +322,20 @@ class SensorKind(ABC):
         """
         raise ModelError(f"a {self.name}: found several images, expected a pyramid's")
 
+    def with_images_at(
+        self, instrument: Instrument, offsets_px: NDArray[np.float64]
+    ) -> SensorDescription:
+        """Return the sensor with its images displaced as an instrument file states it, ``(4, 2)``.
+
+        The inverse of ``offsets_px``.
+
+        Raises
+        ------
+        ModelError
+            If it has only one image.
+        """
+        raise ModelError(f"a {self.name}: found several images, expected a pyramid's")
+
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         """Return where the instrument file places the pupil's image on the grid, (x, y).
 

@@ -55,7 +55,9 @@ def test_a_far_shift_of_a_mirror_that_is_no_other_is_as_sure_as_it_is_right():
     assert found.residual_fraction < STRANGE_RESIDUAL / 5.0
     sigma = np.sqrt(found.covariance[0, 0])
     assert abs(error(found, far)[0]) < 2.0 * sigma
-    assert sigma < 0.5 * FAR_SHARE[0] * np.hypot(0.9, 0.3)
+    # other diameters, light and places of the pupil, which the matrix does not exclude, are in it
+    assert found.registration.sigma_statistical[0] < 0.5 * FAR_SHARE[0] * np.hypot(0.9, 0.3)
+    assert sigma < 0.003
 
 
 @pytest.mark.parametrize("signs", [(1, 1, 1, 1), (-1, 1, 1, -1)])

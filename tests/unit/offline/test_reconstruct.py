@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,7 +15,7 @@ from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError, ModelError
 from service.files.whole import write_whole
 from service.model.instrument import instrument_sha256
-from service.model.interaction import InteractionModel
+from service.model.interaction import InteractionModel, RtcInteractionModel
 from service.model.kinds import SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
@@ -240,3 +241,26 @@ def test_a_file_that_is_no_fit_is_refused():
     Path("fit.json").write_text("[1, 2]", encoding="utf-8")
     with pytest.raises(MatrixError, match="expected what pyrcal fit wrote"):
         made("fit.json")
+
+
+def test_pupil_images_that_the_fit_found_displaced_are_so_in_the_reconstructors_model(capsys):
+    """As the instrument file would say it; on the pixel grid D would differ by much more."""
+    places = np.array([[0.2, 0.1], [-0.2, 0.0], [0.1, -0.2], [-0.1, 0.1]])
+    with made(kept(a_tiny_report(image_offsets_px=places)), "--no-gains") as file:
+        found = file["interaction_matrix"][()]
+    assert "image_offsets_px = [[0.20, 0.10]" in capsys.readouterr().err
+    instrument = load_instrument(TINY)
+    slopes = replace(instrument.slopes, orientation=Orientation(flip_y=True), order=SlopeOrder.YX)
+    told = replace(
+        instrument,
+        slopes=slopes,
+        wfs=replace(instrument.wfs, image_offsets_subap=tuple(map(tuple, places))),
+    )
+    model = RtcInteractionModel(
+        told, modal_basis(told), pupil_sampling=SAMPLING, detector_nodes=SAMPLING
+    )
+    expected = model.interaction_matrix(ALPHA)[:, :50]
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    on_grid = model_matrix()[1][:, :50]
+    assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(expected))
+    assert abs(np.linalg.norm(on_grid) / np.linalg.norm(found) - 1.0) > 1e-3

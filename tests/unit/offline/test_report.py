@@ -37,6 +37,7 @@ KEYS = {
     "left_over",
     "anamorphosis",
     "anamorphosis_sigma",
+    "image_offsets_px",
     "instrument_found",
     "seconds",
 }

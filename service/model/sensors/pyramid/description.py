@@ -203,6 +203,13 @@ def offsets_px(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[
     return _in_rtc_axes(instrument, offsets) * _pixels(instrument)
 
 
+def with_images_at(instrument: Instrument, offsets_px: NDArray[np.float64]) -> Pyramid:
+    """Return the pyramid with its images displaced as the file's key states it, ``(4, 2)``."""
+    pixels = _pixels(instrument)
+    places = tuple((float(x) / pixels, float(y) / pixels) for x, y in offsets_px)
+    return replace(pyramid_in(instrument), image_offsets_subap=places)
+
+
 def _in_rtc_axes(instrument: Instrument, offsets: NDArray[np.float64]) -> NDArray[np.float64]:
     turned = turned_offsets(
         offsets.reshape(2, 2, 2).transpose(1, 2, 0),

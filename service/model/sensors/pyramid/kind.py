@@ -212,6 +212,12 @@ class PyramidKind(SensorKind):
         return offsets_px(instrument, offsets)
 
     @override
+    def with_images_at(self, instrument: Instrument, offsets_px: NDArray[np.float64]) -> Pyramid:
+        from service.model.sensors.pyramid.description import with_images_at
+
+        return with_images_at(instrument, offsets_px)
+
+    @override
     def pupil_offset(self, instrument: Instrument) -> tuple[float, float] | None:
         from service.model.sensors.pyramid.description import pupil_offset
 

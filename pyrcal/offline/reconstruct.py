@@ -209,7 +209,7 @@ def _with_sensor(instrument: Instrument, fit: KnownFit) -> Instrument:
         instrument = replace(instrument, wfs=kind.with_images_at(instrument, fit.image_offsets_px))
         if np.abs(fit.image_offsets_px).max() > NOTABLE_DISPLACEMENT_PX:
             words = displacement_words(fit.image_offsets_px)
-            say(f"note: made with {words}, as {fit.origin} found; add it to the instrument file")
+            say(f"note: made with {words}, as {fit.origin} found")
     sensor_key = kind.fitted_key(instrument.wfs)
     if sensor_key is None or sensor_key not in fit.instrument_found:
         return instrument

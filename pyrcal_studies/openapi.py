@@ -324,6 +324,10 @@ class FitDocument(BaseModel):
     anamorphosis_sigma: list[float] | None = None
     """1 σ of both; null: it was not to be fitted."""
 
+    image_offsets_px: list[list[float]] | None = None
+    """Displacements [x, y] of a pyramid's four pupil images that were fitted, detector pixels, as
+    `wfs.image_offsets_px` states them; null if the instrument file states them."""
+
     instrument_found: dict[str, dict[str, float | None]] = {}
     """What of the instrument was fitted, too, by its key: found, sigma, and as the file says it."""
 

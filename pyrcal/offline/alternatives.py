@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.disjoint_sets import SIGNIFICANT
-from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
+from pyrcal.offline.instrument_checks import MIN_EXPLAINED, AsTold, FoundOptic, Rival
 from pyrcal.offline.methods import Settled
 from pyrcal.offline.models import BETTER, FAR_BETTER, Optic
 from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil, gain_maps
@@ -83,12 +83,26 @@ class Alternative:
     """Whether it is another explanation, whose move is an error of the registration until it is
     excluded; other weights and sets of modes are none."""
 
+    is_number: bool = False
+    """Whether it is a number at the value that explains most, of which the fit has another."""
+
     @property
     def sigma_share(self) -> float:
         """Part of the square of its move that is in the systematic part of σ: 0 to 1."""
         if not self.counts:
             return 0.0
         return 1.0 if self.preferred else OTHER_SHARE if self.undecided else 0.0
+
+    def weight(self, residual_fraction: float) -> float:
+        """Return the weight of the square of its move in σ, 0 to 1.
+
+        Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any number fitted
+        besides explains some of that by chance: less than so much is no evidence for it.
+        """
+        explained = residual_fraction
+        if self.is_number and self.share is not None:
+            explained *= float(np.sqrt(max(1.0 - self.share, 0.0)))
+        return self.sigma_share * min(1.0, explained / MIN_EXPLAINED) ** 2
 
 
 def alternatives(
@@ -117,7 +131,7 @@ def alternatives(
     """
     beside = (_of_pupil(one, others) for one in pupils)
     found = [
-        *map(_of_rival, others),
+        *(_of_rival(one, pupils) for one in others),
         *(one for one in beside if one is not None),
         *_that_can(_off_centre(few)),
         *_that_can(_axes_apart(few)),
@@ -172,7 +186,7 @@ def moved_words(moved: Array) -> str:
 # --- other instruments
 
 
-def _of_rival(rival: Rival) -> Alternative:
+def _of_rival(rival: Rival, pupils: tuple[TriedPupil, ...]) -> Alternative:
     return Alternative(
         words=rival.change.words,
         share=rival.share,
@@ -181,6 +195,7 @@ def _of_rival(rival: Rival) -> Alternative:
         undecided=not rival.believed and is_open(rival.lead),
         key=rival.change.words,
         counts=True,
+        is_number=any(one.words == rival.change.words for one in pupils),
     )
 
 
@@ -195,6 +210,7 @@ def _of_pupil(one: TriedPupil, others: tuple[Rival, ...]) -> Alternative | None:
         undecided=is_open(one.lead),
         key=one.words,
         counts=True,
+        is_number=True,
     )
 
 
@@ -234,6 +250,7 @@ def _off_centre(few: Few) -> Iterator[Alternative]:
         undecided=is_open(lead),
         key="pupil, or valid_subapertures, centred",
         counts=True,
+        is_number=True,
     )
 
 
@@ -255,6 +272,7 @@ def _axes_apart(few: Few) -> Iterator[Alternative]:
         ),
         undecided=is_open(lead),
         counts=True,
+        is_number=True,
     )
 
 
@@ -269,6 +287,7 @@ def _uneven_light(few: Few) -> Iterator[Alternative]:
         undecided=is_open(lead),
         key="--gain-map",
         counts=True,
+        is_number=True,
     )
 
 
@@ -295,6 +314,7 @@ def _spiders(few: Few, arms_deg: tuple[float, ...]) -> Iterator[Alternative]:
         undecided=is_open(lead),
         key=words,
         counts=True,
+        is_number=True,
     )
 
 

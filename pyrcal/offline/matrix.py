@@ -398,15 +398,13 @@ def _answer(
     left_map = _residual_map(found)
     arms_deg = tuple(arm.angle_deg for arm in arms_of(left_map))
     tried = alternatives(settled, few, others, pupils, optics, without, arms_deg)
+    floor = min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
     moves = [doubt_of_width(settled, few), *(one.moved for one in tried)]
-    shares = [OTHER_SHARE, *(one.sigma_share for one in tried)]
+    shares = [OTHER_SHARE * floor, *(one.weight(residual_fraction) for one in tried)]
     if without is not None and without.as_likely:
         moves.append(without.moved)
-        shares.append(OTHER_SHARE)
-    sure = before.with_moves(
-        np.array(moves),
-        np.array(shares) * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2,
-    )
+        shares.append(OTHER_SHARE * floor)
+    sure = before.with_moves(np.array(moves), np.array(shares))
     findings = FitFindings(
         solution=solution,
         residual_fraction=residual_fraction,

@@ -60,6 +60,9 @@ FEW_MODES_POWER = np.array([1.0, 1.0, 1.0, 0.5])
 OTHER_SHARE = 0.5
 """Probability of an instrument that explains a matrix as well as the file's."""
 
+UNINFORMATIVE = 5.0
+"""1 σ of a set of modes over the median of all, beyond which it does not know a parameter."""
+
 N_SECTORS, N_RINGS = 12, 3
 MAX_SETS = 8
 MIN_PER_SET = 3
@@ -126,10 +129,15 @@ class Uncertainty:
 
     @property
     def subset_tension(self) -> float:
-        """Largest distance of a set from the common solution, in its own σ."""
+        """Largest distance of a set from the common solution, in its own σ.
+
+        A parameter that a set knows far worse than the others do is left out: its step is longer
+        than the model is linear.
+        """
         if len(self.subset_steps) < 2:
             return 0.0
         sigma = np.sqrt([np.diag(matrix) for matrix in self.subset_covariance])
+        sigma[sigma > UNINFORMATIVE * np.median(sigma, axis=0)] = np.inf
         return float(np.max(np.abs(self.subset_steps) / sigma))
 
 
@@ -200,10 +208,7 @@ def uncertainty(
         *by_row.compare(pupil_sets, held, pull, noise),
     )
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
-    scatter = np.zeros((4, 4))
-    if n_sets > 1:
-        scatter = np.diag(steps.var(axis=0, ddof=1) / n_sets)
-    statistical = _at_least(from_modes, scatter)
+    statistical = from_modes
     for kind in (mode_sets, pupil_sets):
         found = jackknife_sigma([one for one in sets if one.words in kind])
         statistical = _at_least(statistical, np.diag(found**2))

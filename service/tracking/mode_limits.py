@@ -183,7 +183,7 @@ class ModeProof:
     """1 σ by which the model leads a window of α astray, numeric units, by the scatter between the
     modes of the RTC's own matrix; None if it explains them well, or none was read."""
 
-    own_misfit: float | None = None
+    own_misfit_ratio: float | None = None
     """Median share of its modes' response that the model does not explain, in norm; None if no
     matrix was read."""
 

@@ -315,7 +315,7 @@ def note_recognised(context: StepContext, event: ev.ModesRecognised) -> None:
         own_response_ratio=event.response,
         own_uneven=event.uneven,
         own_weights=event.weights,
-        own_misfit=event.misfit,
+        own_misfit_ratio=event.misfit,
         own_model_error=event.model_error,
     )
     context.matrices = replace(context.matrices, mode_proof=proof)

@@ -260,7 +260,9 @@ define_view(
 )
 define_view("ModeLimitView", mode_limits.ModeLimit, "n_modes since_ns_utc until_ns_utc reason")
 define_view(
-    "ModeProofView", mode_limits.ModeProof, "n_proven contrary_modes own_response_ratio own_misfit"
+    "ModeProofView",
+    mode_limits.ModeProof,
+    "n_proven contrary_modes own_response_ratio own_misfit_ratio",
 )
 ALPHA = define_view(
     "AlphaView",

@@ -715,7 +715,7 @@ async def test_a_matrix_of_another_system_is_not_sent(bridge, rtc):
 
 async def test_no_rtc_at_all_is_a_link_error_within_seconds(bridge):
     begin = time.monotonic()
-    with pytest.raises(LinkError, match="no answer from the RTC to loop command l-1 after 3"):
+    with pytest.raises(LinkError, match="the RTC was not there for loop command l-1"):
         await bridge.command(LoopRequest(id="l-1", leak=0.98))
     assert time.monotonic() - begin < patience(3.0)
 

@@ -93,6 +93,7 @@ def clean_fits(seed):
 
 
 @pytest.mark.long
+@pytest.mark.timeout(600)
 def test_of_a_hundred_clean_matrices_nothing_is_said():
     found = [fit for seed in range(300, 325) for fit in clean_fits(seed)]
     assert len(found) == 100

@@ -54,7 +54,9 @@ def test_what_oopao_saved_is_imported_and_fitted(kind, gain, tmp_path, capsys):
     assert fit.accepted, fit.verdict
     assert np.median(fit.gains) == pytest.approx(gain, abs=0.01)
     assert np.all(np.abs(fit.alpha.vector - TRUE) < 3 * fit.sigma)
-    assert np.all(fit.sigma < [0.002, 0.002, np.deg2rad(0.02), 0.001])
+    # 8 subapertures and 30 modes do not exclude another stop or diameter, which is in sigma
+    assert np.all(fit.sigma < [0.005, 0.002, np.deg2rad(0.02), 0.003])
+    assert np.all(fit.registration.sigma_statistical < [0.001, 0.001, np.deg2rad(0.01), 0.001])
 
 
 def test_geometric_lenslets_are_mean_gradients(tmp_path):

@@ -43,7 +43,7 @@ def test_the_plant_is_as_wrong_as_it_should_be():
     response = response_of(plan)
     assert stable_modes(plan, response, fitted_alpha(plan, response)) == response.shape[1]
     night, _ = played()
-    misfit = night.state.matrices.mode_proof.own_misfit
+    misfit = night.state.matrices.mode_proof.own_misfit_ratio
     assert 0.6 * ERROR < misfit < 1.1 * ERROR
 
 

@@ -62,8 +62,8 @@ def bytes_of_fit(instrument: Instrument, n_modes: int, *, gain_map: bool = False
 _USUAL_UNKNOWNS = 9
 """Registration, turn of the axes, anamorphosis, coupling and modulation."""
 
-_OF_GAIN_MAP = 14
-"""Coefficients of the gain over the pupil."""
+_OF_GAIN_MAP = 20
+"""14 coefficients of the gain over the pupil, and all derivatives multiplied by that gain."""
 
 _KEPT = 2.3
 """Copies of the derivatives by each of them, float64, while a model is computed, ..."""

@@ -80,7 +80,7 @@ def test_a_healthy_rtc_keeps_the_contract_and_is_told_what_was_moved(tmp_path):
     status, checks, text = checked(tmp_path, "--yes", "--open-loop", "--seconds", "4")
     assert status == 0, text
     assert {name: one for name, one in checks.items() if one["outcome"] != "ok"} == {}
-    assert len(checks) == 25
+    assert len(checks) == 26
     assert "will move: loop: THE LOOP IS OPENED" in text
     assert all(one["where"].startswith("docs/rtc.md#") for one in checks.values())
 

@@ -185,7 +185,7 @@ def _extras(fit: Fit) -> Iterator[str]:
     places = fit.image_offsets_px
     if places is not None and np.abs(places).max() > NOTABLE_DISPLACEMENT_PX:
         plausible = np.abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
-        why = "the file does not say" if plausible else "too far for images: model errors, too"
+        why = "the file does not say" if plausible else "larger than pyramids have: model errors"
         yield f"{'pupil images':20s}{displacement_words(places)} (fitted; {why})"
     if fit.gain_map is not None:
         gains = fit.gain_map[fit.valid]

@@ -107,7 +107,7 @@ def document(report: FitReport) -> dict[str, Any]:
             }
             for one in fit.origins
         ],
-        "alternatives": [_alternative(one, fit.sigma) for one in fit.alternatives],
+        "alternatives": [_alternative(one, fit) for one in fit.alternatives],
         "left_over": None if fit.left_over is None else _left_over(fit.left_over),
         "notes": list(report.notes),
         "seconds": round(report.seconds, 3),
@@ -148,16 +148,16 @@ def _reconstructor(found: ReconstructorVerdict) -> dict[str, Any]:
     }
 
 
-def _alternative(one: Alternative, sigma: NDArray[np.float64]) -> dict[str, Any]:
+def _alternative(one: Alternative, fit: Fit) -> dict[str, Any]:
     return {
         "words": one.words,
         "misfit": None if one.share is None else _plain(one.share),
         "moved": _parameters(one.moved),
-        "moved_sigma": dict(zip(PARAMETERS, _plain(one.moved / sigma), strict=True)),
+        "moved_sigma": dict(zip(PARAMETERS, _plain(one.moved / fit.sigma), strict=True)),
         "preferred": bool(one.preferred),
         "undecided": bool(one.undecided),
         "key": one.key or None,
-        "in_sigma": one.sigma_share,
+        "in_sigma": _plain(one.weight(fit.residual_fraction)),
     }
 
 

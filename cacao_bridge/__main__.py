@@ -6,14 +6,12 @@ import argparse
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import structlog
-import zenoh
-import zenoh.ext
 from numpy.typing import NDArray
 from typing_extensions import override
 
@@ -21,23 +19,13 @@ from cacao_bridge.bundles import apply, roll_back
 from cacao_bridge.calibration import consent
 from cacao_bridge.computer import Cacao
 from cacao_bridge.settings import Settings, load
+from pyrcal.rtc.background import Background
+from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from pyrcal.terminal import print_lines
 from service.cli.program import leave, log_to_terminal, status_of, stop_signal
 from service.config.link_tables import Router, client_security, secret_of
-from service.wire import FrameHeader, Keys, Role, encode, encode_frames
-from service.wire.signing import Signatures
-from sim_rtc.computer.feed import Background
-from sim_rtc.link.matrices import Matrices
-from sim_rtc.link.replies import Replies
-from sim_rtc.link.session import (
-    Lifeline,
-    Token,
-    frames_publisher,
-    open_session,
-    status_publisher,
-)
+from service.wire import FrameHeader
 
-_STATUS_PERIOD_S: Final = 0.2
 _REPORT_PERIOD_S: Final = 10.0
 _UNLINKED_PAUSE_S: Final = 0.2
 _LEAST_BATCH_S: Final = 0.02
@@ -100,12 +88,9 @@ def _run(options: argparse.Namespace, stopped: threading.Event) -> int:
 class Sender(Background):
     """Sends rows in a thread of its own while a ``with`` block lasts: a put may wait."""
 
-    def __init__(
-        self, frames: zenoh.ext.AdvancedPublisher, sign: Callable[[bytes, bytes], bytes]
-    ) -> None:
+    def __init__(self, link: RtcLink) -> None:
         super().__init__("sender")
-        self._frames = frames
-        self._sign = sign
+        self._link = link
         self._waiting: queue.Queue[tuple[FrameHeader, NDArray[np.float32]]] = queue.Queue(_BACKLOG)
 
     def offer(self, header: FrameHeader, rows: NDArray[np.float32]) -> None:
@@ -122,8 +107,7 @@ class Sender(Background):
                 header, rows = self._waiting.get(timeout=_UNLINKED_PAUSE_S)
             except queue.Empty:
                 continue
-            payload, attachment = encode_frames(header, rows)
-            self._frames.put(payload, attachment=self._sign(attachment, payload))
+            self._link.publish_frames(header, rows)
 
 
 class Bridge:
@@ -137,64 +121,46 @@ class Bridge:
             security=client_security(settings.zenoh),
             secret=secret_of(settings.zenoh),
         )
-        self._signatures = Signatures(self._router.secret, Role.RTC)
         self._cacao = Cacao(settings)
         self._n_sent = 0
 
     def run(self, stopped: threading.Event) -> None:
-        """Bridge until ``stopped``; the service may come and go."""
-        keys = Keys(self._settings.wire.system)
+        """Bridge until ``stopped`` is set; the service may come and go."""
         try:
             while not self._cacao.known and not stopped.is_set():
-                self._cacao.poll()  # which matrix cacao has, before anybody may ask
+                # the service may ask for the matrix in use as soon as the link is open
+                self._cacao.poll()
                 stopped.wait(_UNLINKED_PAUSE_S)
-            replies = Replies(keys, self._cacao, self._signatures)
-            while (session := open_session(self._router, stopped)) is not None:
-                with session:
-                    replies.declare(session)
-                    with (
-                        Matrices(
-                            session, keys, self._cacao, signatures=self._signatures
-                        ) as matrices,
-                        Sender(
-                            frames_publisher(session, keys, 1.0 / _LEAST_BATCH_S),
-                            lambda *message: self._signatures.sign(keys.frames, *message),
-                        ) as sender,
-                        Token(session, keys, None),
-                    ):
-                        self._speak(session, keys, matrices, sender, stopped)
+            connection = RtcConnection(
+                self._cacao, self._router, batches_per_s=1.0 / _LEAST_BATCH_S
+            )
+            while not stopped.is_set():
+                with connection.open(stopped) as link:
+                    if link is not None:
+                        self._publish(link, stopped)
         finally:
             self._cacao.close()
 
-    def _speak(
-        self,
-        session: zenoh.Session,
-        keys: Keys,
-        matrices: Matrices,
-        sender: Sender,
-        stopped: threading.Event,
-    ) -> None:
-        """Send telemetry until ``stopped`` or cut off."""
-        status = status_publisher(session, keys)
-        lifeline, next_status_s, next_report_s = Lifeline(time.monotonic()), 0.0, 0.0
-        last_session = ""
-        while not stopped.is_set():
-            for header, rows in self._cacao.poll():
-                sender.offer(header, rows)
-                self._n_sent += header.n
-            if self._cacao.has_news:
-                matrices.look()
-            now_s = time.monotonic()
-            if now_s >= next_status_s or self._cacao.session != last_session:
-                status.put(self._signatures.sign(keys.status, encode(self._cacao.status())))
-                last_session, next_status_s = self._cacao.session, now_s + _STATUS_PERIOD_S
-                if lifeline.cut(session, now_s):
-                    _log.warning("link.cut-off", text=lifeline.text)
-                    return
-            if now_s >= next_report_s:
-                self._report()
-                next_report_s = now_s + _REPORT_PERIOD_S
-            stopped.wait(_UNLINKED_PAUSE_S if self._cacao.unlinked else self._cacao.pause_s)
+    def _publish(self, link: RtcLink, stopped: threading.Event) -> None:
+        """Publish telemetry and status until ``stopped`` is set or the link is lost."""
+        next_status_s, next_report_s, last_session = 0.0, 0.0, ""
+        with Sender(link) as sender:
+            while not stopped.is_set():
+                for header, rows in self._cacao.poll():
+                    sender.offer(header, rows)
+                    self._n_sent += header.n
+                if self._cacao.has_news:
+                    link.report_matrices()
+                now_s = time.monotonic()
+                if now_s >= next_status_s or self._cacao.session != last_session:
+                    link.publish_status(self._cacao.status())
+                    last_session, next_status_s = self._cacao.session, now_s + STATUS_PERIOD_S
+                    if link.is_lost():
+                        return
+                if now_s >= next_report_s:
+                    self._report()
+                    next_report_s = now_s + _REPORT_PERIOD_S
+                stopped.wait(_UNLINKED_PAUSE_S if self._cacao.unlinked else self._cacao.pause_s)
 
     def _report(self) -> None:
         _log.info(

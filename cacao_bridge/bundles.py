@@ -10,10 +10,10 @@ import numpy as np
 from cacao_bridge.calibration import keep, known, order
 from cacao_bridge.parts import Parts
 from cacao_bridge.settings import Settings, load_index, load_modes
+from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError
 from service.files.bundle import RECONSTRUCTOR, Place, read_bundle, why_not
 from service.wire import checked_id
-from sim_rtc.computer.telemetry import Identity, Reconstructor
 
 
 def apply(settings: Settings, path: Path) -> str:

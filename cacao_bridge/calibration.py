@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from cacao_bridge.parts import Parts
 from cacao_bridge.settings import Settings, load_index, load_modes
 from cacao_bridge.streams import Stream, StreamError, create, path_of
+from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError
 from service.files.durable import replace_file
 from service.wire import Manifest, checksum, decode, encode
-from sim_rtc.computer.telemetry import Identity, Reconstructor
 
 Array32 = NDArray[np.float32]
 _log = structlog.get_logger("cacao")

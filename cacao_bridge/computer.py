@@ -12,10 +12,13 @@ import structlog
 from numpy.typing import NDArray
 
 from cacao_bridge.calibration import Calibration
-from cacao_bridge.dither import Mirror, Player, refusal
+from cacao_bridge.dither import Mirror, Player, check_request
 from cacao_bridge.rows import LEAST_KEPT, Rows
 from cacao_bridge.settings import OF_THE_SUM, Settings
 from cacao_bridge.streams import GoneError, Stream, StreamError, path_of, settled
+from pyrcal.rtc.identity import Identity, Reconstructor, new_session
+from pyrcal.rtc.replies import FinishedMeasurement
+from pyrcal.rtc.staging import Terms
 from service.wire import (
     Command,
     DitherRequest,
@@ -28,9 +31,6 @@ from service.wire import (
     Status,
 )
 from service.wire.codec import TEXT_LIMIT
-from sim_rtc.computer.measure import Measurement
-from sim_rtc.computer.reconstructors import Terms
-from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session
 
 Array32 = NDArray[np.float32]
 _log = structlog.get_logger("cacao")
@@ -338,9 +338,9 @@ class Cacao:
         """Return ids and first frames of the matrices taken up since the last call."""
         return [self._swaps.popleft() for _ in range(len(self._swaps))]
 
-    def take_measured(self) -> list[Measurement]:
-        """Return nothing: nothing is measured."""
-        return []
+    def take_measured(self) -> tuple[FinishedMeasurement, ...]:
+        """Return no measurement: cacao measures with its own programs."""
+        return ()
 
     def status(self) -> Status:
         """Return the loop's status."""
@@ -426,7 +426,7 @@ class Cacao:
             return f"busy: {self.complaint}"[:1000], None
         if self._player is not None and not self._player.ended.is_set():
             return f"busy: {self._player.status.request.id} plays", None
-        reason = refusal(request, loop.n_modes, loop.frame_rate_hz, loop.max_dither_m)
+        reason = check_request(request, loop.n_modes, loop.frame_rate_hz, loop.max_dither_m)
         if reason:
             return reason, None
         try:

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from cacao_bridge.streams import Stream, StreamError
+from pyrcal.rtc.background import Background
+from pyrcal.rtc.dither import Dither, check_dither
 from service.wire import DitherRequest, DitherStatus
-from sim_rtc.computer.feed import Background
 
 Array32 = NDArray[np.float32]
 _log = structlog.get_logger("cacao")
@@ -60,6 +61,12 @@ class Player(Background):
         """Take the request, and the receiver of what was played for which frames."""
         super().__init__("dither")
         self._mirror, self._slopes, self.status, self._played = mirror, slopes, status, played
+        self._dither = Dither(
+            status.request,
+            start_seq=status.start_seq,
+            n_modes=len(mirror.per_metre),
+            frame_rate_hz=mirror.frame_rate_hz,
+        )
         self.ended = threading.Event()
         self.seen = slopes.counter
         """The last frame of which it is known what was played in answer to it."""
@@ -74,8 +81,7 @@ class Player(Background):
             self.ended.set()
 
     def _play(self) -> None:
-        request = self.status.request
-        last = self.status.start_seq + round(request.duration_s * self._mirror.frame_rate_hz)
+        last = self._dither.stop_seq
         pause_s = 1.0 / (_LOOKS_PER_FRAME * self._mirror.frame_rate_hz)
         before, value_m = self._slopes.counter, self._value_m(0)
         moved_s = time.monotonic()
@@ -98,25 +104,23 @@ class Player(Background):
                 return
 
     def _value_m(self, seq: int) -> Array32:
-        """Return ``(n_modes,)`` metres of frame ``seq``."""
-        request, start = self.status.request, self.status.start_seq
-        value_m = np.zeros(len(self._mirror.per_metre), dtype=np.float32)
-        if request.frequency_hz is not None and seq >= start:
-            turns = np.array(request.frequency_hz) * ((seq - start) / self._mirror.frame_rate_hz)
-            strokes = np.array(request.amplitude_m) * math.sqrt(2.0)
-            value_m[list(request.modes)] = strokes * np.sin(2.0 * np.pi * turns)
-        return value_m
+        """Return the dither of frame ``seq``, ``(n_modes,)`` metres of OPD."""
+        commands = self._dither.commands(seq, 1)
+        if commands is None:
+            return np.zeros(len(self._mirror.per_metre), dtype=np.float32)
+        return np.asarray(commands[0])
 
 
-def refusal(request: DitherRequest, n_modes: int, frame_rate_hz: float, most_m: float) -> str:
-    """Return why a dither cannot be played; empty: it can."""
+def check_request(
+    request: DitherRequest, n_modes: int, frame_rate_hz: float, max_amplitude_m: float
+) -> str:
+    """Return the reason to reject a dither, in the contract's words, or an empty string."""
     if request.frequency_hz is None:
         return "unsupported: random signs; only sines are played"
-    if max(request.modes) >= n_modes:
-        return f"range: mode {max(request.modes)}, expected 0 to {n_modes - 1}"
-    if max(request.amplitude_m) > most_m:
-        return f"range: amplitude_m {max(request.amplitude_m)}, expected at most {most_m}"
-    if max(request.frequency_hz) >= frame_rate_hz / 2.0:
-        half = f"below {frame_rate_hz / 2.0:g}"
-        return f"range: frequency_hz {max(request.frequency_hz)}, expected {half}"
-    return ""
+    return check_dither(
+        request,
+        n_modes=n_modes,
+        frame_rate_hz=frame_rate_hz,
+        max_amplitude_m=max_amplitude_m,
+        max_duration_s=math.inf,
+    )

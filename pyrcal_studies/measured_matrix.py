@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal.rtc.identity import Identity
 from service.config import load_instrument
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import build_telescope
-from sim_rtc.computer.measure import product
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.telemetry import Identity
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.linear import LinearOptics
 
@@ -89,7 +88,7 @@ def measure(computer: RealTimeComputer, request: MeasureRequest, truth: Array) -
     while not (ended := computer.take_measured()):
         n_frames += len(computer.next_batch().slopes)
     here = Identity(system="study", basis_id="basis", config_id="sensor")
-    manifest, matrix = product(ended[0], here, created_ns=0)
+    manifest, matrix = ended[0].product(here, created_ns=0)
     if matrix is None:
         raise ValueError(f"{request.pattern}: {manifest.reason}")
     expected = truth[:, list(request.modes)]

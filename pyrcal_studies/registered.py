@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.rtc.identity import Identity
 from service.config import load_instrument
 from service.estimation.solver import Columns, Projection
 from service.model.interaction import InteractionModel, Linearisation
 from service.model.misregistration import Misregistration
 from service.wire import MeasureRequest, Pattern
 from sim_rtc.assembly import Telescope, build_telescope
-from sim_rtc.computer.measure import product
-from sim_rtc.computer.telemetry import Identity
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 
@@ -82,7 +81,7 @@ def measured_by_day(words: str, n_average: int) -> tuple[Array, Telescope]:
     while not (ended := computer.take_measured()):
         computer.next_batch()
     here = Identity(system="study", basis_id="basis", config_id="sensor", double_pass=True)
-    manifest, matrix = product(ended[0], here, created_ns=0)
+    manifest, matrix = ended[0].product(here, created_ns=0)
     if matrix is None:
         raise ValueError(f"measurement: {manifest.reason}")
     return matrix.astype(np.float64) / PASSES, telescope

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError, ModelError
 from service.files.disk_cache import DiskCache, usual_folder
 from service.model.instrument import Instrument, TabulatedModes
@@ -26,12 +27,8 @@ from service.model.surface import mirror_surface
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, Feed, OpenLoopFeed, PhaseFeed, Source
 from sim_rtc.computer.gains import by_group
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.reconstructors import (
-    identity_of,
-    initial_reconstructor,
-    own_reconstructor,
-)
-from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
+from sim_rtc.computer.reconstructors import identity_of, initial_reconstructor, own_reconstructor
+from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.held_rate import DITHERED_FROM_HZ, frame_s, held_rate_hz, slow_motion
 from sim_rtc.options import Options
 from sim_rtc.rehearsal import with_modes

@@ -21,10 +21,11 @@ import structlog
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from pyrcal.rtc.identity import new_session
 from service.wire import FrameHeader, Loop, LoopRequest, encode_frames
 from sim_rtc.arguments import refusal
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.telemetry import FrameClock, Pace, new_session
+from sim_rtc.computer.telemetry import FrameClock, Pace
 
 _log = structlog.get_logger("sim_rtc")
 Array32 = NDArray[np.float32]

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from pyrcal.rtc.background import Background
 from service.errors import ConfigurationError
 from service.model.misregistration import PARAMETERS
 from service.model.slopes import slopes_of
 from sim_rtc.assembly import Telescope
-from sim_rtc.computer.feed import BATCH_FRAMES, Background
+from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.telemetry import Batch, FrameClock
 from sim_rtc.options import Options
 from sim_rtc.telescope.diffractive import DiffractiveOptics

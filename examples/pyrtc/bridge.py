@@ -1,43 +1,36 @@
 """The bench as an RTC of pyrcal's contract: telemetry out, dithers and matrices in."""
 
+import math
 import threading
 import time
 
 import numpy as np
 
+from pyrcal.rtc.dither import Dither, check_dither
+from pyrcal.rtc.identity import Identity, Reconstructor, new_session
+from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection
+from pyrcal.rtc.staging import Terms
 from service.errors import ConfigurationError, PyrcalError
 from service.files.bundle import Place, read_bundle, why_not
 from service.wire import (
     DitherRequest,
-    DitherStatus,
     DitherStop,
     FrameHeader,
-    Keys,
     Loop,
     LoopRequest,
     Reply,
-    Role,
     Status,
     checksum,
-    encode,
-    encode_frames,
 )
-from service.wire.signing import Signatures
-from sim_rtc.computer.reconstructors import Terms
-from sim_rtc.computer.telemetry import Identity, Reconstructor, new_session
-from sim_rtc.link.matrices import Matrices
-from sim_rtc.link.replies import Replies
-from sim_rtc.link.session import Token, frames_publisher, open_session, status_publisher
 
 from .bench import DELAY, RATE_HZ
 
 MOST_DITHER_M, MOST_DITHER_MODES = 60e-9, 8
 BATCH, DT_NS = 10, round(1e9 / RATE_HZ)
-STATUS_PERIOD_S = 0.2
 
 
 class Bridge:
-    """What pyrcal asks of an RTC (``sim_rtc.link.replies.Computer``), of a bench of pyRTC's.
+    """What pyrcal asks of an RTC (``pyrcal.rtc.Computer``), of a bench of pyRTC's.
 
     One thread makes frames; the others ask and command, and are heard between two frames.
     """
@@ -94,7 +87,9 @@ class Bridge:
             reason = self._refusal(command)
             start_seq = None if reason else self.seq + DELAY + BATCH
             if not reason:
-                self.dither = DitherStatus(request=command, start_seq=start_seq)
+                self.dither = Dither(
+                    command, start_seq=start_seq, n_modes=self.bench.n_modes, frame_rate_hz=RATE_HZ
+                )
             return reason, start_seq
         elif isinstance(command, LoopRequest):
             return self._change_loop(command), None
@@ -107,13 +102,14 @@ class Bridge:
             return f"busy: {self.dither.request.id} plays"
         if asked.frequency_hz is None:
             return "unsupported: random signs"
-        if len(asked.modes) > MOST_DITHER_MODES:
-            return f"range: {len(asked.modes)} modes, expected at most {MOST_DITHER_MODES}"
-        if max(asked.modes) >= self.bench.n_modes or max(asked.amplitude_m) > MOST_DITHER_M:
-            return f"range: modes below {self.bench.n_modes}, at most {MOST_DITHER_M} m"
-        if max(asked.frequency_hz) >= RATE_HZ / 2:
-            return f"range: frequency_hz {max(asked.frequency_hz)}, expected below {RATE_HZ / 2}"
-        return ""
+        return check_dither(
+            asked,
+            n_modes=self.bench.n_modes,
+            frame_rate_hz=RATE_HZ,
+            max_amplitude_m=MOST_DITHER_M,
+            max_duration_s=math.inf,
+            max_modes=MOST_DITHER_MODES,
+        )
 
     def _change_loop(self, asked):
         loop = self.bench.loop
@@ -197,7 +193,7 @@ class Bridge:
             cm_id=self.reconstructor.manifest.id,
             basis_id=self.identity.basis_id,
             config_id=self.identity.config_id,
-            dither=self.dither,
+            dither=None if self.dither is None else self.dither.status,
             max_dither_m=MOST_DITHER_M,
             max_dither_modes=MOST_DITHER_MODES,
             magnitude=None,
@@ -207,15 +203,12 @@ class Bridge:
         """Return the end of a frame's exposure: of the simulated sky, however long it takes."""
         return self.start_ns + seq * DT_NS
 
-    def _dither_m(self, seq):
-        told, u = self.dither, np.zeros(self.bench.n_modes)
-        if told is not None and seq >= told.start_seq + round(told.request.duration_s * RATE_HZ):
+    def _dither_m(self, first):
+        """Return the dither of a batch, ``(BATCH, n_modes)`` metres of OPD."""
+        if self.dither is not None and first >= self.dither.stop_seq:
             self.dither = None
-        elif told is not None and seq >= told.start_seq:
-            turns = np.array(told.request.frequency_hz) * (seq - told.start_seq) / RATE_HZ
-            strokes = np.sqrt(2.0) * np.array(told.request.amplitude_m)
-            u[list(told.request.modes)] = strokes * np.sin(2.0 * np.pi * turns)
-        return u
+        commands = None if self.dither is None else self.dither.commands(first, BATCH)
+        return np.zeros((BATCH, self.bench.n_modes)) if commands is None else commands
 
     def batch(self):
         """Return header and rows of the next frames; a new matrix multiplies from the first on."""
@@ -240,8 +233,7 @@ class Bridge:
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
             )
-            first = self.seq + DELAY
-            rows = [self.bench.frame(self._dither_m(seq)) for seq in range(first, first + BATCH)]
+            rows = [self.bench.frame(dither_m) for dither_m in self._dither_m(self.seq + DELAY)]
             self.seq += BATCH
         return header, np.array(rows, dtype=np.float32)
 
@@ -258,20 +250,16 @@ class Bridge:
                     print(error, flush=True)
 
     def run(self, router, n_frames, folder):
-        """Be an RTC of the service at ``router``, which may be late, for so many frames."""
-        keys, signed = Keys(self.identity.system), Signatures(router.secret, Role.RTC)
-        with open_session(router, threading.Event()) as session:
-            Replies(keys, self, signed).declare(session)
-            frames = frames_publisher(session, keys, RATE_HZ / BATCH)
-            status, told_s, said = status_publisher(session, keys), 0.0, None
-            matrices = Matrices(session, keys, self, signatures=signed)
-            with matrices, Token(session, keys, None):
-                while self.seq < n_frames:
-                    self.hear(folder)
-                    payload, attachment = encode_frames(*self.batch())
-                    frames.put(payload, attachment=signed.sign(keys.frames, attachment, payload))
-                    if self.swaps:
-                        matrices.look()
-                    if time.monotonic() - told_s > STATUS_PERIOD_S or said != self.session:
-                        said, told_s = self.session, time.monotonic()
-                        status.put(signed.sign(keys.status, encode(self.status())))
+        """Run as an RTC of the service at ``router`` for ``n_frames`` frames."""
+        connection = RtcConnection(self, router, batches_per_s=RATE_HZ / BATCH)
+        with connection.open() as link:
+            next_status_s, last_session = 0.0, None
+            while self.seq < n_frames:
+                self.hear(folder)
+                link.publish_frames(*self.batch())
+                if self.swaps:
+                    link.report_matrices()
+                if time.monotonic() >= next_status_s or last_session != self.session:
+                    last_session = self.session
+                    next_status_s = time.monotonic() + STATUS_PERIOD_S
+                    link.publish_status(self.status())

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 from typing_extensions import override
 
+from pyrcal.rtc.identity import Identity, Reconstructor
 from pyrcal_studies.campaign.observatory import Latencies, Observatory
 from pyrcal_studies.campaign.observatory_dome import START_NS, Dome, Moment
 from pyrcal_studies.campaign.rows import Row, RowFile, heading, line, tell
@@ -45,7 +46,7 @@ from service.tracking.state import Mode
 from service.wire import Status, checksum, decode, encode
 from sim_rtc.computer.feed import BATCH_FRAMES, Block, OpenLoopBlock
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.telemetry import Batch, FrameClock, Identity, LoopSettings, Reconstructor
+from sim_rtc.computer.telemetry import Batch, FrameClock, LoopSettings
 from sim_rtc.telescope.linear import LinearOptics
 
 Array = NDArray[np.float64]

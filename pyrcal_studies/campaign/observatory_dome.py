@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from pyrcal.rtc.identity import Reconstructor
 from service.config import load_instrument
 from service.estimation.frames import FrameBlock
 from service.model.misregistration import Misregistration
 from service.wire import Command, Reply, Status, decode, encode
 from sim_rtc.assembly import Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES, Block
-from sim_rtc.computer.telemetry import Batch, FrameClock, Reconstructor
+from sim_rtc.computer.telemetry import Batch, FrameClock
 from sim_rtc.options import Options, parse_options
 from sim_rtc.telescope.plant import Optics
 from sim_rtc.truth import WavefrontError

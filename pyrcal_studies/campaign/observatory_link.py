@@ -10,6 +10,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.rtc.staging import Outcome, Staging
 from pyrcal_studies.campaign.observatory_dome import Dome
 from service.archive.products import NoisyNumbers
 from service.archive.store import Provenance
@@ -19,7 +20,6 @@ from service.runtime.worker import Done, OpticsWorker
 from service.tracking.operation_records import MeasurementRecord
 from service.tracking.products import ReconstructorRecord
 from service.wire import Acknowledgement, Command, Manifest, Reply, split
-from sim_rtc.computer.reconstructors import Outcome, Staging
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -77,7 +77,7 @@ class ShortLink:
     def _carry_out(self, outcome: Outcome) -> list[Acknowledgement]:
         for reconstructor in outcome.staged:
             self._dome.stage(reconstructor)
-        return [self._told(one) for one in outcome.said]
+        return [self._told(one) for one in outcome.acknowledgements]
 
     def _told(self, acknowledgement: Acknowledgement) -> Acknowledgement:
         """Return what is heard of it."""

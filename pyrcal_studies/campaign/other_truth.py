@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from pyrcal.rtc.identity import Reconstructor
 from pyrcal_studies.campaign.observatory_checks import true_response
 from pyrcal_studies.campaign.observatory_dome import Dome, Moment
 from pyrcal_studies.campaign.observatory_link import ShortLink
@@ -27,7 +28,7 @@ from sim_rtc.assembly import Telescope
 from sim_rtc.computer.feed import Block
 from sim_rtc.computer.loop import LoopBlock, LoopTerms, ModalLoop
 from sim_rtc.computer.reconstructors import truncated_inverse
-from sim_rtc.computer.telemetry import Batch, Reconstructor
+from sim_rtc.computer.telemetry import Batch
 from sim_rtc.options import Options
 from sim_rtc.telescope.linear import LinearOptics
 from sim_rtc.telescope.mirror import modal_content

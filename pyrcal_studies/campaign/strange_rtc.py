@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from pyrcal.rtc.identity import Reconstructor
 from pyrcal_studies.campaign.observatory_dome import Dome
 from pyrcal_studies.campaign.observatory_link import ShortLink
 from service.estimation.frames import FrameBlock
@@ -29,8 +30,7 @@ from service.wire import (
     Status,
     layout_of,
 )
-from sim_rtc.computer.activities import LARGEST_DITHER_M
-from sim_rtc.computer.telemetry import Reconstructor
+from sim_rtc.computer.activities import MAX_DITHER_AMPLITUDE_M
 
 STRONG = 20.0
 """A dither is so much stronger than was asked for, as far as the mirror goes."""
@@ -186,7 +186,7 @@ class StrangeDome(Dome):
         """Tell the RTC something and return its answer."""
         if Mischief.STRONG_DITHER in self.mischief and isinstance(command, DitherRequest):
             self._asked[command.id] = command
-            most_m = LARGEST_DITHER_M
+            most_m = MAX_DITHER_AMPLITUDE_M
             strong = tuple(min(STRONG * a, most_m) for a in command.amplitude_m)
             command = replace(command, amplitude_m=strong)
         return super().order(command)

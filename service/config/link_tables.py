@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -188,7 +188,7 @@ class Router:
     """The router that a program connects to, and what it shows there."""
 
     endpoint: str
-    security: Mapping[str, object]
+    security: Mapping[str, object] = field(default_factory=dict)
     """What zenoh is told about certificates and users; empty: it shows nothing."""
 
     secret: bytes | None = None

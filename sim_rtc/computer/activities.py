@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import DitherKind, DitherRequest, DitherStatus, Loop, LoopRequest
+from pyrcal.rtc.dither import Dither
+from service.wire import DitherRequest, DitherStatus, Loop, LoopRequest
 from sim_rtc.computer.gains import GainRamp
 from sim_rtc.computer.measure import Measurement
 from sim_rtc.computer.telemetry import Batch, LoopSettings
@@ -19,10 +20,10 @@ from sim_rtc.computer.telemetry import Batch, LoopSettings
 Array32 = NDArray[np.float32]
 
 
-LARGEST_DITHER_M = 50e-9
-"""RMS of one mode, metres OPD."""
+MAX_DITHER_AMPLITUDE_M = 50e-9
+"""Largest RMS of one mode, metres of OPD."""
 
-_LONGEST_DITHER_S = 3600.0
+MAX_DITHER_DURATION_S = 3600.0
 
 _MOST_ENDED = 4
 """Ended measurements kept for whoever sends them."""
@@ -48,7 +49,7 @@ class Activities:
         """The dither that plays, as a status has it."""
         if self._dither is None:
             return None
-        return DitherStatus(request=self._dither.request, start_seq=self._dither.start_seq)
+        return self._dither.status
 
     @property
     def telemetry_dithers(self) -> bool:
@@ -89,7 +90,7 @@ class Activities:
             start_seq=start_seq,
             n_modes=self._n_modes,
             frame_rate_hz=self._frame_rate_hz,
-            late_frames=self.late_dither_frames,
+            delay_frames=self.late_dither_frames,
         )
 
     def end_dither(self) -> None:
@@ -152,64 +153,3 @@ class Activities:
             if ramp.done:
                 self._ramp = None
         return settings
-
-
-class Dither:
-    """One accepted dither, from its first frame to its last."""
-
-    def __init__(
-        self,
-        request: DitherRequest,
-        *,
-        start_seq: int,
-        n_modes: int,
-        frame_rate_hz: float,
-        late_frames: int = 0,
-    ) -> None:
-        """Take what was asked for; ``late_frames`` after ``start_seq`` it really begins."""
-        self.request = request
-        self._late_frames = late_frames
-        self.start_seq = start_seq
-        self._n_modes = n_modes
-        self._frame_rate_hz = frame_rate_hz
-        self.stop_seq = start_seq + max(1, round(request.duration_s * frame_rate_hz))
-        """First frame without it."""
-        self._modes = np.array(request.modes, dtype=np.intp)
-        self._amplitude_m = np.array(request.amplitude_m)
-        self._rng = np.random.default_rng(request.seed or 0)
-
-    def commands(self, seq0: int, n_frames: int) -> Array32 | None:
-        """Return the dither of these frames ``(n_frames, n_modes)``, metres; None: it is silent.
-
-        Frames must be asked for in order: a binary sequence is drawn as it is played.
-        """
-        seq = np.arange(seq0, seq0 + n_frames) - self._late_frames
-        playing = (seq >= self.start_seq) & (seq < self.stop_seq)
-        if not playing.any():
-            return None
-        out = np.zeros((n_frames, self._n_modes), dtype=np.float32)
-        out[np.ix_(playing, self._modes)] = self._waveform(seq[playing] - self.start_seq)
-        return out
-
-    def _waveform(self, frame: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return ``(n_playing, n_dithered)`` metres, ``frame`` counted from the first one."""
-        if self.request.kind is DitherKind.BINARY:
-            signs = self._rng.integers(0, 2, (len(frame), len(self._modes))) * 2 - 1
-            return np.asarray(signs * self._amplitude_m)
-        frequency = np.array(self.request.frequency_hz)
-        phase = 2 * np.pi * frequency * (frame[:, None] / self._frame_rate_hz)
-        return np.asarray(self._amplitude_m * np.sqrt(2.0) * np.sin(phase))
-
-
-def refusal(request: DitherRequest, *, n_modes: int, frame_rate_hz: float) -> str:
-    """Return why a dither cannot be played, in the wire's words; empty: it can."""
-    largest_m, highest_hz = max(request.amplitude_m), max(request.frequency_hz or (0.0,))
-    if max(request.modes) >= n_modes:
-        return f"range: mode {max(request.modes)}, expected 0 to {n_modes - 1}"
-    if largest_m > LARGEST_DITHER_M:
-        return f"range: amplitude_m {largest_m:.3g}, expected at most {LARGEST_DITHER_M:.3g}"
-    if highest_hz >= frame_rate_hz / 2:
-        return f"range: frequency_hz {highest_hz:g}, expected below {frame_rate_hz / 2:g}"
-    if request.duration_s > _LONGEST_DITHER_S:
-        return f"range: duration_s {request.duration_s:g}, expected at most {_LONGEST_DITHER_S:g}"
-    return ""

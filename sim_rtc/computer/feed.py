@@ -8,7 +8,6 @@ nothing holds a frame up.
 
 from __future__ import annotations
 
-import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
@@ -280,26 +279,6 @@ class PhaseFeed(Feed):
             detector=self._detector,
             rng=self._rng,
         )
-
-
-class Background(ABC):
-    """Work in a thread of its own while a ``with`` block lasts."""
-
-    def __init__(self, name: str) -> None:
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
-
-    @abstractmethod
-    def _work(self) -> None:
-        """Work until ``_stopped`` is set."""
 
 
 class Ahead:

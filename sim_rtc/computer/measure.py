@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.rtc.identity import Identity
 from service.wire import (
     CHUNK_LIMIT,
     MatrixLayout,
@@ -27,7 +28,6 @@ from sim_rtc.computer.strokes import (
     pokes,
     system_shapes,
 )
-from sim_rtc.computer.telemetry import Identity
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -96,6 +96,49 @@ class Measurement:
             If what was read back determines no matrix.
         """
         return self._solver.matrix()
+
+    def product(
+        self, identity: Identity, created_ns: int
+    ) -> tuple[MeasuredManifest, Array32 | None]:
+        """Return the manifest of the finished measurement, and its matrix.
+
+        The matrix is None if there is none; the manifest then has the reason. ``created_ns`` is
+        nanoseconds since the Unix epoch, UTC.
+        """
+        failure, matrix = self.failure, None
+        if not failure:
+            try:
+                matrix = self.matrix()
+            except np.linalg.LinAlgError as error:
+                failure = f"what was read back determines no matrix: {error}"
+        if matrix is not None and not np.isfinite(matrix).all():
+            failure, matrix = "the matrix came out with numbers that are not finite", None
+        request = self.request
+        if matrix is None:
+            layout = MatrixLayout(
+                shape=(self.n_slopes, len(request.modes)),
+                n_chunks=0,
+                chunk_bytes=CHUNK_LIMIT,
+                sha256="",
+            )
+        else:
+            layout = layout_of(matrix, CHUNK_LIMIT)
+        manifest = MeasuredManifest(
+            id=request.id,
+            layout=layout,
+            reason=failure or None,
+            modes=request.modes,
+            amplitude_m=request.amplitude_m,
+            n_average=request.n_average or 1,
+            pattern=request.pattern,
+            double_pass=identity.double_pass,
+            session=self.session,
+            basis_id=identity.basis_id,
+            config_id=identity.config_id,
+            system=identity.system,
+            created_ns=created_ns,
+        )
+        return manifest, matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -213,46 +256,3 @@ class MeasurementRules:
         elif request.pattern is Pattern.PUSH_PULL_ZONAL and self.mode_to_actuator is not None:
             n_shapes = len(self.mode_to_actuator)
         return n_shapes * frames_per_shape(request.n_average or 1)
-
-
-def product(
-    measured: Measurement, identity: Identity, created_ns: int
-) -> tuple[MeasuredManifest, Array32 | None]:
-    """Return a finished measurement's manifest, and the matrix or None.
-
-    ``created_ns`` is nanoseconds since the Unix epoch, UTC.
-    """
-    failure, matrix = measured.failure, None
-    if not failure:
-        try:
-            matrix = measured.matrix()
-        except np.linalg.LinAlgError as error:
-            failure = f"what was read back determines no matrix: {error}"
-    if matrix is not None and not np.isfinite(matrix).all():
-        failure, matrix = "the matrix came out with numbers that are not finite", None
-    request = measured.request
-    if matrix is None:
-        layout = MatrixLayout(
-            shape=(measured.n_slopes, len(request.modes)),
-            n_chunks=0,
-            chunk_bytes=CHUNK_LIMIT,
-            sha256="",
-        )
-    else:
-        layout = layout_of(matrix, CHUNK_LIMIT)
-    manifest = MeasuredManifest(
-        id=request.id,
-        layout=layout,
-        reason=failure or None,
-        modes=request.modes,
-        amplitude_m=request.amplitude_m,
-        n_average=request.n_average or 1,
-        pattern=request.pattern,
-        double_pass=identity.double_pass,
-        session=measured.session,
-        basis_id=identity.basis_id,
-        config_id=identity.config_id,
-        system=identity.system,
-        created_ns=created_ns,
-    )
-    return manifest, matrix

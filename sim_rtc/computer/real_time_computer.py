@@ -14,6 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.rtc.dither import check_dither
+from pyrcal.rtc.identity import Identity, Reconstructor, new_session
+from pyrcal.rtc.staging import Terms
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS
 from service.wire import (
     Command,
@@ -27,19 +30,16 @@ from service.wire import (
     Reply,
     Status,
 )
-from sim_rtc.computer.activities import LARGEST_DITHER_M, Activities, refusal
+from sim_rtc.computer.activities import (
+    MAX_DITHER_AMPLITUDE_M,
+    MAX_DITHER_DURATION_S,
+    Activities,
+)
 from sim_rtc.computer.feed import BATCH_FRAMES, BLOCK_FRAMES, Block
 from sim_rtc.computer.gains import LARGEST_GAIN, GainRamp, ramp_refusal
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
 from sim_rtc.computer.measure import Measurement, MeasurementRules
-from sim_rtc.computer.reconstructors import Terms
-from sim_rtc.computer.telemetry import (
-    Batch,
-    Identity,
-    LoopSettings,
-    Reconstructor,
-    new_session,
-)
+from sim_rtc.computer.telemetry import Batch, LoopSettings
 from sim_rtc.telescope.mirror import MirrorDrive
 from sim_rtc.telescope.plant import Optics
 
@@ -244,7 +244,7 @@ class RealTimeComputer:
                 basis_id=self.identity.basis_id,
                 config_id=self.identity.config_id,
                 dither=self._activities.dither,
-                max_dither_m=LARGEST_DITHER_M,
+                max_dither_m=MAX_DITHER_AMPLITUDE_M,
                 max_dither_modes=self._n_modes,
                 magnitude=None,
                 flux=None,
@@ -317,7 +317,13 @@ class RealTimeComputer:
 
     def _start_dither(self, request: DitherRequest) -> Reply:
         rate_hz = self._settings.frame_rate_hz
-        reason = refusal(request, n_modes=self._n_modes, frame_rate_hz=rate_hz)
+        reason = check_dither(
+            request,
+            n_modes=self._n_modes,
+            frame_rate_hz=rate_hz,
+            max_amplitude_m=MAX_DITHER_AMPLITUDE_M,
+            max_duration_s=MAX_DITHER_DURATION_S,
+        )
         with self._lock:
             reason = reason or self._activities.on_the_mirror()
             if reason:

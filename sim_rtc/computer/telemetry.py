@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-import uuid
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.wire import CHUNK_LIMIT, FrameHeader, Manifest, Status, layout_of
+from pyrcal.rtc.identity import Identity
+from service.wire import FrameHeader, Status
 from sim_rtc.telescope.plant import Optics
 
 Array32 = NDArray[np.float32]
@@ -35,51 +33,6 @@ class LoopSettings:
     closed: bool = True
     n_controlled_next: int
     """What a command has asked for; takes effect with the next matrix of that many rows."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Identity:
-    """Names the telemetry carries."""
-
-    system: str
-    basis_id: str
-    config_id: str
-    double_pass: bool = False
-    """Whether the light sees the mirror twice, as with a retro-reflector by day."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reconstructor:
-    """A matrix fit for the loop, and its manifest."""
-
-    manifest: Manifest
-    matrix: Array32
-    """``(n_controlled, n_slopes)``, metres per slope."""
-
-    @classmethod
-    def own(
-        cls,
-        name: str,
-        matrix: Array32,
-        identity: Identity,
-        *,
-        created_ns: int,
-        alpha: Mapping[str, float] | None = None,
-    ) -> Self:
-        """Return a matrix that no service has sent."""
-        manifest = Manifest(
-            id=name,
-            layout=layout_of(matrix, CHUNK_LIMIT),
-            alpha=alpha,
-            sigma=None,
-            im_id=None,
-            parent=None,
-            basis_id=identity.basis_id,
-            config_id=identity.config_id,
-            system=identity.system,
-            created_ns=created_ns,
-        )
-        return cls(manifest=manifest, matrix=matrix)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,11 +63,6 @@ class Batch:
 
     phase_m: Array32
     """``(n_points,)`` turbulence OPD during the first frame: never on the wire."""
-
-
-def new_session() -> str:
-    """Return a name no other session has."""
-    return uuid.uuid4().hex[:16]
 
 
 def frames_of(

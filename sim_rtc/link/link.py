@@ -12,34 +12,25 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import structlog
-import zenoh
 from typing_extensions import override
 
+from pyrcal.rtc.background import Background
+from pyrcal.rtc.link import STATUS_PERIOD_S, RtcConnection, RtcLink
 from service.files.recording import RecordedKind, RecordingWriter
-from service.wire import Keys, Role, encode, split
-from service.wire.signing import Signatures
-from sim_rtc.computer.feed import Background
+from service.wire import encode, split
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.telemetry import Batch, FrameClock, frames_of
 from sim_rtc.faults import FaultPlan, WireFaults
-from sim_rtc.link.matrices import Matrices
-from sim_rtc.link.replies import Replies
-from sim_rtc.link.session import (
-    Lifeline,
-    Token,
-    frames_publisher,
-    open_session,
-    status_publisher,
-)
+from sim_rtc.link.matrices import FaultyMatrices
 from sim_rtc.options import Options
 from sim_rtc.telescope.detector import Detector
 
 _log = structlog.get_logger("sim_rtc")
 
-_STATUS_PERIOD_S = 0.2
 _BACKLOG_S = 1.0
 """Of telemetry that waits for the publishing thread; beyond it the oldest is dropped, counted."""
 
@@ -68,9 +59,6 @@ class Link(Background):
         self._options = options
         self._clock = clock
         self._detector = detector
-        self._keys = Keys(computer.identity.system)
-        self._router = options.router
-        self._signatures = Signatures(self._router.secret, Role.RTC)
         self._backlog: deque[tuple[Batch, int, float]] = deque()
         """Batches, when their first exposure ended, nanoseconds, and at what loop time."""
         self._ready = threading.Condition()
@@ -108,39 +96,26 @@ class Link(Background):
 
     @override
     def _work(self) -> None:
-        replies = Replies(self._keys, self._computer, self._signatures)
-        while (session := open_session(self._router, self._stopped)) is not None:
-            self._speak(session, replies)
+        connection = RtcConnection(
+            self._computer,
+            self._options.router,
+            batches_per_s=self._options.frame_rate_hz / self._computer.batch_frames,
+            matrices=partial(FaultyMatrices, plan=self._plan, recorder=self._recorder),
+            on_token=lambda visible: self._record(RecordedKind.LIVELINESS, bytes([visible])),
+        )
+        while not self._stopped.is_set():
+            with connection.open(self._stopped) as link:
+                if link is not None:
+                    self._publish(link)
 
-    def _speak(self, session: zenoh.Session, replies: Replies) -> None:
-        """Do an RTC's part in a session until it is cut off or the link ends."""
-        with session:
-            replies.declare(session)
-            with self._ready:
-                # What has waited for a service is old: it would only arrive as a burst.
-                self._backlog.clear()
-            with (
-                Matrices(
-                    session,
-                    self._keys,
-                    self._computer,
-                    signatures=self._signatures,
-                    plan=self._plan,
-                    recorder=self._recorder,
-                ) as matrices,
-                Token(session, self._keys, self._recorder) as token,
-            ):
-                _log.info(
-                    "link.open", endpoint=self._options.router.endpoint, system=self._keys.system
-                )
-                self._publish(session, token, matrices)
-
-    def _publish(self, session: zenoh.Session, token: Token, matrices: Matrices) -> None:
-        batches_per_s = self._options.frame_rate_hz / self._computer.batch_frames
-        frames = frames_publisher(session, self._keys, batches_per_s)
-        status = status_publisher(session, self._keys)
+    def _publish(self, link: RtcLink) -> None:
+        """Publish telemetry and status until the link is lost or the program ends."""
+        endpoint, system = self._options.router.endpoint, self._computer.identity.system
+        _log.info("link.open", endpoint=endpoint, system=system)
+        with self._ready:
+            # Frames that waited for a service are old: they would arrive as one burst.
+            self._backlog.clear()
         next_status_s = 0.0
-        lifeline = Lifeline(time.monotonic())
         while not self._stopped.is_set():
             outgoing = self._next()
             if outgoing is not None:
@@ -148,20 +123,18 @@ class Link(Background):
                 self._note_matrix(batch.cm_id)
                 header, rows = frames_of(batch, self._computer.identity, t0_ns, self._clock.dt_ns)
                 for payload, attachment in self._faults.messages(header, rows, time_s):
-                    signed = self._signatures.sign(self._keys.frames, attachment, payload)
-                    frames.put(payload, attachment=signed)
+                    link.publish_encoded_frames(payload, attachment)
                     self._record(RecordedKind.FRAMES, payload, attachment)
             if self._computer.has_news:
-                matrices.look()
-            token.show(visible=not self._absent.is_set())
+                link.report_matrices()
+            link.token.show(visible=not self._absent.is_set())
             now_s = time.monotonic()
             if now_s >= next_status_s and not self._absent.is_set():
                 data = self._status()
-                status.put(self._signatures.sign(self._keys.status, data))
+                link.publish_encoded_status(data)
                 self._record(RecordedKind.STATUS, data)
-                next_status_s = now_s + _STATUS_PERIOD_S
-                if lifeline.cut(session, now_s):
-                    _log.warning("link.cut-off", text=lifeline.text)
+                next_status_s = now_s + STATUS_PERIOD_S
+                if link.is_lost():
                     return
 
     def _note_matrix(self, cm_id: str) -> None:
@@ -180,7 +153,7 @@ class Link(Background):
     def _next(self) -> tuple[Batch, int, float] | None:
         with self._ready:
             if not self._backlog:
-                self._ready.wait(_STATUS_PERIOD_S / 2)
+                self._ready.wait(STATUS_PERIOD_S / 2)
             return self._backlog.popleft() if self._backlog else None
 
     def _status(self) -> bytes:

@@ -17,6 +17,14 @@ import structlog
 import zenoh
 import zenoh.ext
 
+from pyrcal.rtc.matrices import acknowledge
+from pyrcal.rtc.replies import answer_applied, answer_commands
+from pyrcal.rtc.session import (
+    Token,
+    frames_publisher,
+    open_session,
+    status_publisher,
+)
 from service.config.link_tables import Router
 from service.errors import WireError
 from service.files.recording import Message, RecordedKind, Recording
@@ -31,13 +39,6 @@ from service.wire import (
     command_id,
     decode,
     encode,
-)
-from sim_rtc.link.replies import acknowledge, answer_applied, answer_commands
-from sim_rtc.link.session import (
-    Token,
-    frames_publisher,
-    open_session,
-    status_publisher,
 )
 
 _log = structlog.get_logger("sim_rtc")

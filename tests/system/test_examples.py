@@ -103,12 +103,16 @@ def test_the_rtc_joins_a_secured_link_and_takes_what_is_signed_alone(tmp_path, p
 
 
 @pytest.mark.long
-def test_the_rtc_keeps_the_contract(tmp_path, plant):
+@pytest.mark.parametrize(
+    ("module", "expected"),
+    [("examples.rtc", {"late-join", "images"}), ("examples.rtc_with_library", {"images"})],
+)
+def test_the_rtc_keeps_the_contract(tmp_path, plant, module, expected):
     status, checks, text = checked_beside(
-        tmp_path, lambda endpoint: ["examples.rtc", endpoint, SYSTEM, str(plant)], "--yes"
+        tmp_path, lambda endpoint: [module, endpoint, SYSTEM, str(plant)], "--yes"
     )
     flagged = {name for name, one in checks.items() if one["outcome"] != "ok"}
     if "delivery" in flagged and late_with_the_machine(checks["delivery"]):
         flagged.remove("delivery")
-    assert flagged == {"late-join", "images"}, text  # it sends no light
+    assert flagged == expected, text  # neither sends light
     assert status == int(any(one["outcome"] == "wrong" for one in checks.values()))

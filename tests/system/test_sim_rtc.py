@@ -16,6 +16,7 @@ import pytest
 import zenoh
 
 from benchmarks.plant import measure_linear
+from pyrcal.rtc.session import client_config
 from service.config.link_tables import Router
 from service.wire import (
     Acknowledgement,
@@ -37,7 +38,6 @@ from service.wire import (
     layout_of,
     split,
 )
-from sim_rtc.link.session import client_config
 from tests.system.cable import Cable, free_port
 from tests.system.night import Process, wait_for
 from tests.system.pace import patience, slowness

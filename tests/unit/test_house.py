@@ -23,6 +23,9 @@ CALLED_FROM_ELSEWHERE = {
     "collect",  # prometheus_client
 }
 
+CALLERS = ("sim_rtc", "cacao_bridge", "pyrcal_studies", "benchmarks", "examples")
+"""Folders whose calls of the programs count, beside those of the programs themselves."""
+
 WORDS_TOO = {"acquisition", "archive-failed", "dither", "margin"}
 """Alarms whose name means something else, too: a word of the wire, of REST, of a file."""
 
@@ -48,7 +51,7 @@ def test_nothing_is_there_that_nobody_calls():
     tool = vulture.Vulture(
         ignore_decorators=["@*.get", "@*.post", "@*.put", "@*.delete", "@*_validator*"]
     )
-    tool.scavenge([str(ROOT / name) for name in (*HELD, "sim_rtc", "pyrcal_studies", "benchmarks")])
+    tool.scavenge([str(ROOT / name) for name in (*HELD, *CALLERS)])
     idle = {
         item.name
         for item in tool.get_unused_code()

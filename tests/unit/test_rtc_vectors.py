@@ -7,14 +7,15 @@ import subprocess
 import numpy as np
 import pytest
 
+from pyrcal.rtc.identity import Identity
+from pyrcal.rtc.staging import Staging, Terms
 from pyrcal_studies.contract_tables import MESSAGES, rows_of
 from service import wire
 from service.errors import WireError
 from service.tracking.alarms import ALARMS
 from service.wire import CommandKind, Keys
 from service.wire.codec import MESSAGE_LIMIT
-from sim_rtc.computer.reconstructors import Staging, Terms
-from sim_rtc.computer.telemetry import Batch, Identity, frames_of
+from sim_rtc.computer.telemetry import Batch, frames_of
 from tests.vectors import FOLDER, PAGE, Vector, anchors_of, packed, vectors
 
 EVERY = vectors()
@@ -161,9 +162,12 @@ def taken(vector, staging):
     """What the simulated RTC says of a matrix, its last chunk first and its commit in between."""
     manifest = wire.decode(wire.Manifest, vector.message)
     first, *others = reversed(list(enumerate(vector.parts)))
-    said = staging.chunk(manifest.id, *first).said + staging.commit(manifest, 0.0).said
+    said = (
+        staging.chunk(manifest.id, *first).acknowledgements
+        + staging.commit(manifest, 0.0).acknowledgements
+    )
     for part in others:
-        said += staging.chunk(manifest.id, *part).said
+        said += staging.chunk(manifest.id, *part).acknowledgements
     return [wire.encode(each) for each in said]
 
 

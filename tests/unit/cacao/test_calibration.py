@@ -8,9 +8,9 @@ import pytest
 from cacao_bridge.calibration import Calibration, consent
 from cacao_bridge.settings import Settings, load
 from cacao_bridge.streams import Stream, StreamError, create, path_of
+from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError
 from service.wire import Manifest, layout_of
-from sim_rtc.computer.telemetry import Identity, Reconstructor
 from tests.unit.cacao.milk import keywords_in
 
 N_SLOPES, N_MODES, SHAPE = 4, 5, (2, 3)

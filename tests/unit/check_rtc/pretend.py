@@ -13,6 +13,10 @@ import numpy as np
 from check_rtc.client import RtcClient
 from check_rtc.connection import ReceivedMessage, Topic
 from check_rtc.watch import TelemetryObserver
+from pyrcal.rtc.dither import Dither, check_dither
+from pyrcal.rtc.identity import Identity
+from pyrcal.rtc.replies import ReplyCache
+from pyrcal.rtc.staging import Staging, Terms
 from service.errors import LinkError, WireError
 from service.link.session import Endpoint
 from service.model.misregistration import Misregistration
@@ -40,11 +44,7 @@ from service.wire import (
     split,
 )
 from service.wire.commands import command_kind
-from sim_rtc.computer.activities import Dither, refusal
 from sim_rtc.computer.real_time_computer import loop_refusal
-from sim_rtc.computer.reconstructors import Staging, Terms
-from sim_rtc.computer.telemetry import Identity
-from sim_rtc.link.replies import ReplyCache
 
 N_SLOPES, N_MODES, N_CONTROLLED, RATE_HZ, BATCH = 60, 24, 16, 1000.0, 50
 RESPONSE = 1e6 * np.random.default_rng(1).standard_normal((N_SLOPES, N_MODES))
@@ -272,7 +272,8 @@ class Pretend:
         return Reply(id=command.id, accepted=False, reason="unsupported: no", start_seq=None)
 
     def _start_dither(self, command):
-        reason = refusal(command, n_modes=N_MODES, frame_rate_hz=RATE_HZ)
+        limits = {"max_amplitude_m": 50e-9, "max_duration_s": 3600.0}
+        reason = check_dither(command, n_modes=N_MODES, frame_rate_hz=RATE_HZ, **limits)
         if reason:
             return Reply(id=command.id, accepted=False, reason=reason, start_seq=None)
         start_seq = self.seq + BATCH
@@ -282,7 +283,7 @@ class Pretend:
             start_seq=start_seq,
             n_modes=N_MODES,
             frame_rate_hz=RATE_HZ,
-            late_frames=self.twists.get("late_dither", 0),
+            delay_frames=self.twists.get("late_dither", 0),
         )
         self.told_dither = DitherStatus(request=command, start_seq=start_seq)
         return Reply(id=command.id, accepted=True, reason="", start_seq=start_seq)
@@ -360,7 +361,7 @@ class Pretend:
         )
 
     def _carry_out(self, outcome):
-        for said in outcome.said:
+        for said in outcome.acknowledgements:
             self._say(said)
         for staged in outcome.staged:
             due_s = self.now_s + self.twists.get("swap_s", 0.05)

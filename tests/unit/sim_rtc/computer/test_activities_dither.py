@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from pyrcal.rtc.dither import Dither, check_dither
 from service.wire import DitherKind, DitherRequest
-from sim_rtc.computer.activities import Dither, refusal
 
 
 def request(**changes):
@@ -68,4 +68,6 @@ def test_it_ends_within_a_batch():
     ],
 )
 def test_what_cannot_be_played_is_refused(changes, reason):
-    assert refusal(request(**changes), n_modes=5, frame_rate_hz=500.0) == reason
+    limits = {"max_amplitude_m": 50e-9, "max_duration_s": 3600.0}
+    found = check_dither(request(**changes), n_modes=5, frame_rate_hz=500.0, **limits)
+    assert found == reason

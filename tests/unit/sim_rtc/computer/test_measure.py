@@ -6,6 +6,7 @@ from itertools import count
 import numpy as np
 import pytest
 
+from pyrcal.rtc.identity import Identity, Reconstructor
 from service.model.misregistration import Misregistration
 from service.wire import (
     DitherKind,
@@ -23,7 +24,7 @@ from service.wire import (
 )
 from sim_rtc.assembly import build_telescope
 from sim_rtc.computer.feed import OpenLoopBlock
-from sim_rtc.computer.measure import MeasurementRules, product
+from sim_rtc.computer.measure import MeasurementRules
 from sim_rtc.computer.real_time_computer import RealTimeComputer
 from sim_rtc.computer.strokes import (
     PushPull,
@@ -32,7 +33,7 @@ from sim_rtc.computer.strokes import (
     pokes,
     system_shapes,
 )
-from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
+from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.options import parse_options
 from sim_rtc.telescope.linear import LinearOptics
 
@@ -145,7 +146,7 @@ def measured(computer, request):
         batches.append(computer.next_batch())
         ended = computer.take_measured()
         if ended:
-            return *product(ended[0], HERE, 7), batches
+            return *ended[0].product(HERE, 7), batches
     raise AssertionError("the measurement never ended")
 
 
@@ -357,7 +358,7 @@ def test_a_restart_ends_the_measurement_and_says_so():
     computer.next_batch()
     computer.restart()
     (ended,) = computer.take_measured()
-    manifest, matrix = product(ended, HERE, 7)
+    manifest, matrix = ended.product(HERE, 7)
     assert matrix is None
     assert manifest.reason == "the loop started over during the measurement"
     assert manifest.session == session
@@ -441,7 +442,7 @@ def test_by_day_the_light_meets_the_mirror_twice_and_the_manifest_says_so(
     assert computer.execute(request).accepted
     while not (ended := computer.take_measured()):
         computer.next_batch()
-    _, matrix = product(ended[0], HERE, 7)
+    _, matrix = ended[0].product(HERE, 7)
     single = build_telescope(parse_options(words), small_instrument).optics.at(0.0)
     expected = factor * single.slopes_per_command[:, list(modes)]
     assert relative(matrix, expected) < 0.03

@@ -3,6 +3,8 @@ from itertools import count
 import numpy as np
 import pytest
 
+from pyrcal.rtc.identity import Identity, Reconstructor
+from pyrcal.rtc.replies import ReplyCache
 from service.model.misregistration import Misregistration
 from service.wire import (
     DitherKind,
@@ -15,8 +17,7 @@ from service.wire import (
 )
 from sim_rtc.computer.feed import OpenLoopBlock
 from sim_rtc.computer.real_time_computer import RealTimeComputer
-from sim_rtc.computer.telemetry import Identity, LoopSettings, Reconstructor
-from sim_rtc.link.replies import ReplyCache
+from sim_rtc.computer.telemetry import LoopSettings
 from sim_rtc.telescope.linear import LinearOptics
 
 N_MODES, N_SLOPES = 4, 8

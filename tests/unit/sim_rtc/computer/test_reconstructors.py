@@ -3,9 +3,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal.rtc.identity import Identity
+from pyrcal.rtc.staging import Staging, Terms
 from service.wire import AckState, Manifest, layout_of, split
-from sim_rtc.computer.reconstructors import Staging, Terms, truncated_inverse
-from sim_rtc.computer.telemetry import Identity
+from sim_rtc.computer.reconstructors import truncated_inverse
 
 TERMS = Terms(
     session="s1",
@@ -51,22 +52,22 @@ def send(staging, matrix=MATRIX, leave_out=(), matrix_id="m1"):
 
 
 def states(outcome):
-    return [verdict.state for verdict in outcome.said]
+    return [verdict.state for verdict in outcome.acknowledgements]
 
 
 @pytest.mark.parametrize("commit_first", [True, False])
 def test_a_whole_matrix_is_staged_in_whatever_order_it_comes(staging, commit_first):
     if commit_first:
-        assert staging.commit(manifest(), 0.0).said == []
+        assert staging.commit(manifest(), 0.0).acknowledgements == []
         outcome = send(staging)
     else:
-        assert send(staging).said == []
+        assert send(staging).acknowledgements == []
         outcome = staging.commit(manifest(), 0.0)
     assert states(outcome) == [AckState.STAGED]
     np.testing.assert_array_equal(outcome.staged[0].matrix, MATRIX)
     applied = staging.applied("m1", 1230)
     assert (applied.state, applied.frame_seq) == (AckState.APPLIED, 1230)
-    assert staging.commit(manifest(), 5.0).said == [applied]
+    assert staging.commit(manifest(), 5.0).acknowledgements == [applied]
 
 
 def test_missing_chunks_are_asked_for_after_two_seconds_and_given_up_after_four(staging):
@@ -77,7 +78,7 @@ def test_missing_chunks_are_asked_for_after_two_seconds_and_given_up_after_four(
     assert staging.poll(13.9).missing == []
     outcome = staging.poll(14.0)
     assert states(outcome) == [AckState.REJECTED]
-    assert outcome.said[0].reason == "missing: chunks [1], 1 in all"
+    assert outcome.acknowledgements[0].reason == "missing: chunks [1], 1 in all"
 
 
 def test_an_asked_for_chunk_completes_the_matrix(staging):
@@ -86,7 +87,7 @@ def test_an_asked_for_chunk_completes_the_matrix(staging):
     staging.poll(12.0)
     outcome = staging.chunk("m1", 1, split(MATRIX, CHUNK_BYTES)[1])
     assert states(outcome) == [AckState.STAGED]
-    assert staging.poll(20.0).said == []
+    assert staging.poll(20.0).acknowledgements == []
 
 
 def test_a_chunk_of_the_wrong_length_is_asked_for_again(staging):
@@ -111,15 +112,15 @@ def test_a_chunk_of_the_wrong_length_is_asked_for_again(staging):
 def test_what_does_not_fit_is_rejected_at_once(staging, changes, reason):
     outcome = staging.commit(manifest(**changes), 0.0)
     assert states(outcome) == [AckState.REJECTED]
-    assert outcome.said[0].reason == reason
-    assert send(staging).said == []
+    assert outcome.acknowledgements[0].reason == reason
+    assert send(staging).acknowledgements == []
 
 
 def test_other_bytes_than_announced_are_rejected(staging):
     staging.commit(manifest(), 0.0)
     outcome = send(staging, 2 * MATRIX)
     assert states(outcome) == [AckState.REJECTED]
-    assert "sha256" in outcome.said[0].reason
+    assert "sha256" in outcome.acknowledgements[0].reason
 
 
 def test_an_id_is_never_used_again_for_another_matrix(staging):
@@ -127,7 +128,7 @@ def test_an_id_is_never_used_again_for_another_matrix(staging):
     staging.commit(manifest(), 0.0)
     outcome = staging.commit(manifest(2 * MATRIX), 1.0)
     assert states(outcome) == [AckState.REJECTED]
-    assert outcome.said[0].reason.startswith("id: m1 was used with sha256")
+    assert outcome.acknowledgements[0].reason.startswith("id: m1 was used with sha256")
     assert states(staging.commit(manifest(), 2.0)) == [AckState.STAGED]
 
 
@@ -136,7 +137,7 @@ def test_a_new_session_voids_what_is_not_applied(staging):
     staging.commit(manifest(), 0.0)
     staging.void()
     assert staging.applied("m1", 10) is None
-    assert staging.commit(manifest(), 1.0).said == []
+    assert staging.commit(manifest(), 1.0).acknowledgements == []
 
 
 def test_only_a_few_matrices_are_collected_at_a_time(staging):

@@ -1,24 +1,29 @@
-"""Reply to the service's queries.
+"""Answers to the service's queries: commands, and the matrix in use.
 
-A command is carried out once, however often it is sent.
+A command is executed once, even if it is sent several times.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import structlog
 import zenoh
+from numpy.typing import NDArray
 
+from pyrcal.rtc.identity import Identity, Reconstructor
+from pyrcal.rtc.staging import Terms
 from service.errors import WireError
 from service.wire import (
     Command,
     CommandKind,
     Encodings,
     Keys,
+    MeasuredManifest,
     Reply,
     command_id,
     decode_command,
@@ -26,18 +31,24 @@ from service.wire import (
     split,
 )
 from service.wire.signing import UNSIGNED, Signatures
-from sim_rtc.computer.measure import Measurement
-from sim_rtc.computer.reconstructors import Terms
-from sim_rtc.computer.telemetry import Identity, Reconstructor
 
-_log = structlog.get_logger("sim_rtc")
+_log = structlog.get_logger("rtc")
+
+
+class FinishedMeasurement(Protocol):
+    """A measured interaction matrix that is ready to be sent."""
+
+    def product(
+        self, identity: Identity, created_ns: int
+    ) -> tuple[MeasuredManifest, NDArray[np.float32] | None]:
+        """Return the manifest and the matrix; None in place of the matrix if there is none."""
 
 
 class Computer(Protocol):
-    """An RTC as the link needs it, simulated or another program."""
+    """What the link needs of an RTC: a program implements these methods to become one."""
 
     identity: Identity
-    """Names the telemetry carries."""
+    """Names that the telemetry carries."""
 
     @property
     def session(self) -> str:
@@ -45,30 +56,30 @@ class Computer(Protocol):
 
     @property
     def reconstructor(self) -> Reconstructor:
-        """The matrix that multiplies the slopes now."""
+        """The control matrix in use."""
 
     @property
     def largest_matrix_bytes(self) -> int:
-        """Bytes of a matrix for all modes."""
+        """Size of a control matrix for all modes."""
 
     def terms(self) -> Terms:
-        """Return what a new reconstructor must fit at present."""
+        """Return what a new reconstructor must agree with at present."""
 
     def stage(self, reconstructor: Reconstructor) -> None:
-        """Take a checked matrix, to be swapped in."""
+        """Accept a checked matrix; swap it in between two frames."""
 
     def take_swaps(self) -> list[tuple[str, int]]:
-        """Return ids and first frames of the matrices swapped in since the last call."""
+        """Return id and first frame of each matrix swapped in since the last call."""
 
-    def take_measured(self) -> list[Measurement]:
-        """Return the measurements that have ended since the last call."""
+    def take_measured(self) -> Sequence[FinishedMeasurement]:
+        """Return the measurements that were finished since the last call."""
 
     def execute(self, command: Command) -> Reply:
-        """Carry out a command, or say why not."""
+        """Execute a command and return the reply; a refusal carries its reason."""
 
 
 class Replies:
-    """The RTC's queryables; they answer on the network's threads."""
+    """Queryables of the RTC. They answer in zenoh's threads."""
 
     def __init__(self, keys: Keys, computer: Computer, signatures: Signatures = UNSIGNED) -> None:
         self._keys = keys
@@ -77,7 +88,7 @@ class Replies:
         self._cache = ReplyCache(computer.execute)
 
     def declare(self, session: zenoh.Session) -> None:
-        """Let the session answer from now on."""
+        """Declare the queryables in a session."""
         answer_commands(session, self._keys, self._reply, self._signatures)
         answer_applied(session, self._keys, self._applied, self._signatures)
 
@@ -108,7 +119,7 @@ def answer_commands(
     reply: Callable[[CommandKind, bytes], Reply],
     signatures: Signatures = UNSIGNED,
 ) -> None:
-    """Let a session answer commands of every kind by ``reply``."""
+    """Declare one queryable for each kind of command, answered by ``reply``."""
 
     def answering(kind: CommandKind) -> Callable[[zenoh.Query], None]:
         def answer(query: zenoh.Query) -> None:
@@ -129,7 +140,7 @@ def answer_applied(
     applied: Callable[[], tuple[bytes, list[bytes]] | None],
     signatures: Signatures = UNSIGNED,
 ) -> None:
-    """Let a session serve the matrix in use: its manifest, or one chunk."""
+    """Declare the queryable of the matrix in use, which returns its manifest or one chunk."""
 
     def answer(query: zenoh.Query) -> None:
         with query:
@@ -149,18 +160,8 @@ def answer_applied(
     session.declare_queryable(keys.applied, answer)
 
 
-def acknowledge(session: zenoh.Session, keys: Keys, data: bytes) -> None:
-    """Send an acknowledgement."""
-    session.put(
-        keys.acknowledgement,
-        data,
-        encoding=Encodings.ACKNOWLEDGEMENT,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        priority=zenoh.Priority.DATA_HIGH,
-    )
-
-
-_REMEMBERED_S = 600.0
+_REPLY_LIFETIME_S = 600.0
+"""Time for which the reply to a command is repeated if the command arrives again."""
 
 
 class _Answered(NamedTuple):
@@ -170,7 +171,7 @@ class _Answered(NamedTuple):
 
 
 class ReplyCache:
-    """Gives the same id the same reply for ten minutes."""
+    """Repeats the reply to a command that arrives again within ten minutes."""
 
     def __init__(self, execute: Callable[[Command], Reply]) -> None:
         self._execute = execute
@@ -178,12 +179,12 @@ class ReplyCache:
         self._answered: dict[str, _Answered] = {}
 
     def handle(self, command: Command, now_s: float) -> Reply:
-        """Return the reply; ``now_s`` is any clock that never goes back."""
+        """Return the reply to a command. ``now_s`` is a monotonic time in seconds."""
         with self._lock:
             self._answered = {
                 key: answered
                 for key, answered in self._answered.items()
-                if now_s - answered.time_s <= _REMEMBERED_S
+                if now_s - answered.time_s <= _REPLY_LIFETIME_S
             }
             known = self._answered.get(command.id)
             if known is None:

@@ -1,30 +1,32 @@
-"""An RTC's zenoh session: publishers, queryables, token."""
+"""The zenoh session of an RTC: configuration, publishers, liveliness token."""
 
 from __future__ import annotations
 
 import json
 import math
 import threading
+from collections.abc import Callable
 
 import structlog
 import zenoh
 import zenoh.ext
 
 from service.config.link_tables import Router
-from service.files.recording import RecordedKind, RecordingWriter
 from service.wire import Encodings, Keys, Role
 
-_log = structlog.get_logger("sim_rtc")
+_log = structlog.get_logger("rtc")
 
 _RETRY_S = 0.2
-"""Between two attempts to find the service's router."""
+"""Pause between two attempts to reach the service's router."""
 
-_CUT_OFF_S = 5.0
-"""Without a router, until a session is given up: zenoh itself reconnects within 1.6 s."""
+_MAX_TIME_WITHOUT_ROUTER_S = 5.0
+"""A session without a router is closed after this time. zenoh itself reconnects within 1.6 s."""
 
 _OPEN_TIMEOUT_MS = 1000
 _LEASE_MS = 2000
 _WAIT_BEFORE_DROP_US = 20_000
+"""Time that a full queue may hold up the publisher before a message is dropped."""
+
 _QUEUED_MESSAGES = 16
 _RETRY = {
     "period_init_ms": round(1000 * _RETRY_S),
@@ -32,11 +34,19 @@ _RETRY = {
     "period_max_ms": 1000,
 }
 _CACHE_S = 5.0
+"""Telemetry kept by the publisher, so that the service can request missed frames."""
+
 _HEARTBEAT_S = 0.2
+"""Period in which the publisher reports its last message, so that a lost one is noticed."""
 
 
 def open_session(router: Router, stopped: threading.Event) -> zenoh.Session | None:
-    """Open a session, waiting for the service's router until ``stopped``: then None."""
+    """Open a session with the service's router, waiting for it if necessary.
+
+    Returns
+    -------
+    The session, or None if ``stopped`` was set before the router could be reached.
+    """
     waiting = False
     while not stopped.is_set():
         try:
@@ -50,7 +60,7 @@ def open_session(router: Router, stopped: threading.Event) -> zenoh.Session | No
 
 
 def client_config(router: Router) -> zenoh.Config:
-    """Return the settings of a zenoh client of the service's router, as the wire page asks."""
+    """Return the zenoh configuration that the contract requires of a client."""
     settings: dict[str, object] = {
         "mode": "client",
         "connect/endpoints": [router.endpoint],
@@ -74,7 +84,7 @@ def client_config(router: Router) -> zenoh.Config:
 def frames_publisher(
     session: zenoh.Session, keys: Keys, batches_per_s: float
 ) -> zenoh.ext.AdvancedPublisher:
-    """Return the publisher of telemetry; the service can ask it for missed frames."""
+    """Return the publisher of telemetry; the service can request missed frames from it."""
     return zenoh.ext.declare_advanced_publisher(
         session,
         keys.frames,
@@ -99,35 +109,45 @@ def status_publisher(session: zenoh.Session, keys: Keys) -> zenoh.Publisher:
 
 
 class Lifeline:
-    """Whether a session still has a router.
+    """Detects that a session has lost its router for good.
 
-    When both ends have stood still for longer than the lease, zenoh's client may connect twice at
-    once. One of the connections stays open and unused, and the router takes no second one of the
-    same session (``MAX_LINKS``): its token is there, and nothing that it publishes arrives, for
-    ever. Only a new session, under a new name, ends that.
+    After both ends were suspended for longer than the lease, a zenoh client may connect twice at
+    the same time. One connection stays open and unused, and the router accepts no second one of
+    the same session (``MAX_LINKS``). The token is then visible, but nothing that the session
+    publishes arrives. Only a new session resolves this (eclipse-zenoh/zenoh#1886).
     """
 
-    text = f"no router for {_CUT_OFF_S:.0f} s: the session is closed and opened anew"
+    text = (
+        f"no router for {_MAX_TIME_WITHOUT_ROUTER_S:.0f} s: closing the session to open a new one"
+    )
 
     def __init__(self, now_s: float) -> None:
         self._seen_s = now_s
 
     def cut(self, session: zenoh.Session, now_s: float) -> bool:
-        """Return whether the session has been without a router for so long that it is given up."""
+        """Return whether the session has had no router for so long that it must be closed."""
         if session.info.routers_zid():
             self._seen_s = now_s
-        return now_s - self._seen_s > _CUT_OFF_S
+        return now_s - self._seen_s > _MAX_TIME_WITHOUT_ROUTER_S
 
 
 class Token:
-    """The RTC's liveliness token, which may go and come back while the ``with`` block lasts."""
+    """Liveliness token of the RTC, declared for the duration of a ``with`` block.
+
+    Parameters
+    ----------
+    session, keys
+        Open zenoh session, and the keys of the system.
+    on_change
+        Called with True when the token is declared and with False when it is withdrawn.
+    """
 
     def __init__(
-        self, session: zenoh.Session, keys: Keys, recorder: RecordingWriter | None
+        self, session: zenoh.Session, keys: Keys, on_change: Callable[[bool], None] | None = None
     ) -> None:
         self._session = session
         self._key = keys.alive(Role.RTC)
-        self._recorder = recorder
+        self._on_change = on_change
         self._token: zenoh.LivelinessToken | None = None
 
     def __enter__(self) -> Token:
@@ -138,11 +158,11 @@ class Token:
         self.show(visible=False)
 
     def show(self, *, visible: bool) -> None:
-        """Declare or withdraw the token, unless that is done already."""
+        """Declare or withdraw the token. Repeated calls have no effect."""
         if visible is (self._token is not None):
             return
-        if self._recorder is not None:
-            self._recorder.put(RecordedKind.LIVELINESS, bytes([visible]))
+        if self._on_change is not None:
+            self._on_change(visible)
         if self._token is None:
             self._token = self._session.liveliness().declare_token(self._key)
         else:

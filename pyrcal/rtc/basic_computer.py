@@ -1,0 +1,290 @@
+"""The bookkeeping of an RTC: session, matrices on their way, gains, dither, status."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pyrcal.rtc.dither import Dither, check_dither
+from pyrcal.rtc.identity import Identity, Reconstructor, new_session
+from pyrcal.rtc.replies import FinishedMeasurement
+from pyrcal.rtc.staging import Terms
+from service.wire import (
+    Command,
+    DitherRequest,
+    DitherStop,
+    FrameHeader,
+    Loop,
+    LoopRequest,
+    Reply,
+    Status,
+)
+
+Array32 = NDArray[np.float32]
+
+_MAX_DITHER_DURATION_S = 3600.0
+
+_DITHER_LEAD_S = 0.05
+"""Time from the acceptance of a dither to its first frame: the reply must arrive before it."""
+
+
+class BasicComputer:
+    """A :class:`Computer` that keeps the books of the contract; the program does the rest.
+
+    The program runs the loop in batches of frames::
+
+        dither_m = computer.begin_batch(n_frames)     # a new reconstructor is in use from here on
+        ...                                           # expose, reconstruct, command
+        header, rows = computer.end_batch(slopes, commands_m, dither_m)
+
+    Between the two calls it reads :attr:`reconstructor`, :attr:`gains`, :attr:`leak` and
+    :attr:`closed`. All other methods are called by the link, from other threads.
+
+    Parameters
+    ----------
+    identity
+        System, modal basis and sensor configuration.
+    matrix
+        The first control matrix, ``(n_controlled, n_slopes)``, metres of OPD per unit of slope.
+    gains
+        Integrator gain of each mode, ``(n_modes,)``; 0 for modes that are not controlled.
+    leak
+        Factor of the integrator per frame, 0 to 1.
+    frame_rate_hz
+        Frame rate.
+    delay_frames
+        Frames from an exposure to the first exposure with the command that answers it.
+    max_dither_m
+        Largest dither of a mode, metres of OPD RMS. 0 if the mirror cannot be dithered.
+    max_dither_modes
+        Largest number of modes dithered at the same time.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        matrix: ArrayLike,
+        *,
+        gains: ArrayLike,
+        leak: float,
+        frame_rate_hz: float,
+        delay_frames: float,
+        max_dither_m: float,
+        max_dither_modes: int = 8,
+    ) -> None:
+        self.identity = identity
+        self.gains = np.asarray(gains, dtype=np.float64)
+        """Gain of each mode, ``(n_modes,)``."""
+        self.leak = leak
+        """Factor of the integrator per frame."""
+        self.closed = True
+        """Whether the loop is closed. When it opens, the integrator must be set to zero."""
+        self.seq = 0
+        """Sequence number of the next frame."""
+        self._start_ns = time.time_ns()
+        self._session = new_session()
+        self._reconstructor = Reconstructor.own(
+            f"own-{self._start_ns}",
+            np.asarray(matrix, dtype=np.float32),
+            identity,
+            created_ns=self._start_ns,
+        )
+        self._n_next = len(self._reconstructor.matrix)
+        self._frame_rate_hz = frame_rate_hz
+        self._delay_frames = delay_frames
+        self._max_dither_m = max_dither_m
+        self._max_dither_modes = max_dither_modes
+        self._dither: Dither | None = None
+        self._staged: Reconstructor | None = None
+        self._swaps: list[tuple[str, int]] = []
+        self._lock = threading.Lock()
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes of the basis."""
+        return len(self.gains)
+
+    @property
+    def n_slopes(self) -> int:
+        """Number of slopes."""
+        return int(self._reconstructor.matrix.shape[1])
+
+    @property
+    def session(self) -> str:
+        """Session of the frames to come. It changes when the loop opens."""
+        return self._session
+
+    @property
+    def reconstructor(self) -> Reconstructor:
+        """The control matrix in use."""
+        return self._reconstructor
+
+    @property
+    def largest_matrix_bytes(self) -> int:
+        """Size of a control matrix for all modes."""
+        return 4 * self.n_modes * self.n_slopes
+
+    @property
+    def has_swapped(self) -> bool:
+        """Whether a swap has not been reported yet: call ``RtcLink.report_matrices``."""
+        return bool(self._swaps)
+
+    def begin_batch(self, n_frames: int) -> Array32:
+        """Begin the next frames: swap in a staged reconstructor, end a finished dither.
+
+        Returns
+        -------
+        The dither of these frames, ``(n_frames, n_modes)`` metres of OPD, zero without a dither.
+        """
+        with self._lock:
+            if self._staged is not None:
+                self._reconstructor, self._staged = self._staged, None
+                self._swaps.append((self._reconstructor.manifest.id, self.seq))
+            if self._dither is not None and self.seq >= self._dither.stop_seq:
+                self._dither = None
+            played = None if self._dither is None else self._dither.commands(self.seq, n_frames)
+        return np.zeros((n_frames, self.n_modes), dtype=np.float32) if played is None else played
+
+    def end_batch(
+        self, slopes: ArrayLike, commands_m: ArrayLike, dither_m: ArrayLike
+    ) -> tuple[FrameHeader, Array32]:
+        """Return header and rows of the frames just exposed, for ``RtcLink.publish_frames``.
+
+        Parameters
+        ----------
+        slopes
+            ``(n_frames, n_slopes)``.
+        commands_m
+            ``(n_frames, n_modes)`` metres of OPD on the mirror during each exposure, dither
+            included.
+        dither_m
+            What ``begin_batch`` has returned.
+        """
+        rows = np.hstack([slopes, commands_m, dither_m]).astype(np.float32)
+        with self._lock:
+            header = FrameHeader(
+                session=self._session,
+                seq0=self.seq,
+                n=len(rows),
+                t0_ns=self.time_ns(self.seq),
+                dt_ns=round(1e9 / self._frame_rate_hz),
+                n_slopes=self.n_slopes,
+                n_modes=self.n_modes,
+                dither=True,
+                cm_id=self._reconstructor.manifest.id,
+                basis_id=self.identity.basis_id,
+                config_id=self.identity.config_id,
+            )
+            self.seq += len(rows)
+        return header, rows
+
+    def time_ns(self, seq: int) -> int:
+        """Return the end of exposure of a frame, nanoseconds since the Unix epoch, UTC."""
+        return self._start_ns + round(seq * 1e9 / self._frame_rate_hz)
+
+    def status(self) -> Status:
+        """Return the present status, for ``RtcLink.publish_status``."""
+        with self._lock:
+            return Status(
+                session=self._session,
+                seq=self.seq - 1 if self.seq else None,
+                t_ns=self.time_ns(max(self.seq - 1, 0)),
+                loop=Loop.CLOSED if self.closed else Loop.OPEN,
+                frame_rate_hz=self._frame_rate_hz,
+                delay_frames=self._delay_frames,
+                gains=tuple(self.gains.tolist()),
+                leak=self.leak,
+                n_slopes=self.n_slopes,
+                n_modes=self.n_modes,
+                n_controlled=len(self._reconstructor.matrix),
+                cm_id=self._reconstructor.manifest.id,
+                basis_id=self.identity.basis_id,
+                config_id=self.identity.config_id,
+                dither=None if self._dither is None else self._dither.status,
+                max_dither_m=self._max_dither_m,
+                max_dither_modes=self._max_dither_modes,
+                magnitude=None,
+            )
+
+    def terms(self) -> Terms:
+        """Return what a new reconstructor must agree with at present."""
+        return Terms(
+            session=self._session,
+            identity=self.identity,
+            n_slopes=self.n_slopes,
+            n_controlled=tuple({len(self._reconstructor.matrix), self._n_next}),
+        )
+
+    def stage(self, reconstructor: Reconstructor) -> None:
+        """Accept a checked matrix; the next ``begin_batch`` swaps it in."""
+        with self._lock:
+            self._staged = reconstructor
+
+    def take_swaps(self) -> list[tuple[str, int]]:
+        """Return id and first frame of each matrix swapped in since the last call."""
+        with self._lock:
+            swaps, self._swaps = self._swaps, []
+        return swaps
+
+    def take_measured(self) -> tuple[FinishedMeasurement, ...]:
+        """Return no measurement. A program that measures matrices overrides this."""
+        return ()
+
+    def execute(self, command: Command) -> Reply:
+        """Execute a command and return the reply; a refusal carries its reason."""
+        with self._lock:
+            reason, start_seq = self._change(command)
+        return Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
+
+    def _change(self, command: Command) -> tuple[str, int | None]:
+        """Apply a command; return the reason of a refusal and the first frame of a dither."""
+        match command:
+            case DitherRequest():
+                return self._begin_dither(command)
+            case DitherStop():
+                self._dither = None
+            case LoopRequest():
+                return self._change_loop(command), None
+            case _:
+                return "unsupported: this RTC has no such command", None
+        return "", None
+
+    def _begin_dither(self, request: DitherRequest) -> tuple[str, int | None]:
+        if self._dither is not None:
+            return f"busy: dither {self._dither.request.id} plays", None
+        refusal = check_dither(
+            request,
+            n_modes=self.n_modes,
+            frame_rate_hz=self._frame_rate_hz,
+            max_amplitude_m=self._max_dither_m,
+            max_duration_s=_MAX_DITHER_DURATION_S,
+            max_modes=self._max_dither_modes,
+        )
+        if refusal:
+            return refusal, None
+        # The batch that is being exposed now was begun without the dither.
+        start_seq = self.seq + round(_DITHER_LEAD_S * self._frame_rate_hz)
+        self._dither = Dither(
+            request,
+            start_seq=start_seq,
+            n_modes=self.n_modes,
+            frame_rate_hz=self._frame_rate_hz,
+        )
+        return "", start_seq
+
+    def _change_loop(self, request: LoopRequest) -> str:
+        if request.gains is not None:
+            if len(request.gains) != self.n_modes:
+                return f"range: {len(request.gains)} gains, expected {self.n_modes}"
+            self.gains = np.array(request.gains)
+        if request.leak is not None:
+            self.leak = request.leak
+        self._n_next = request.n_controlled or self._n_next
+        if request.loop is Loop.OPEN and self.closed:
+            self._session, self._dither, self.closed = new_session(), None, False
+        elif request.loop is Loop.CLOSED:
+            self.closed = True
+        return ""

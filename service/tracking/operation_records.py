@@ -14,7 +14,7 @@ from service.wire import MatrixStrokes, MeasuredManifest, Pattern, Status
 
 
 class AcquisitionStage(StrEnum):
-    """How far an acquisition has come."""
+    """Stage of an acquisition."""
 
     IDLE = "idle"
     """None yet."""
@@ -74,12 +74,12 @@ class LoopFound:
     """Per frame."""
 
     held: bool
-    """Whether it was closed and no alarm said that it did not hold."""
+    """True if the loop was closed and no alarm reported that it failed to hold."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interruption:
-    """What an acquisition was at when it was cut off: the service ended, or the RTC vanished."""
+    """State of an acquisition that was interrupted by a restart or a vanished RTC."""
 
     doing: str
     """Stage, and the text of it."""
@@ -96,17 +96,17 @@ class Acquisition:
 
     stage: AcquisitionStage = AcquisitionStage.IDLE
     text: str = "none was needed"
-    """What it does, or how it ended and what to do."""
+    """What the acquisition is doing, or how it ended and what to do."""
 
     started_ns_utc: int = 0
     since_ns_utc: int = 0
-    """Since when it is in this stage."""
+    """Time at which the present stage began."""
 
     commanded: bool = False
-    """An operator asked for it: that allows its publications in every mode."""
+    """True if an operator ordered it, which permits its publications in every mode."""
 
     attempt: int = 0
-    """How often the loop has been opened for it."""
+    """Number of times the loop has been opened for it."""
 
     misses: int = 0
     """Windows in a row, of this stage or before a start, that led nowhere."""
@@ -127,7 +127,7 @@ class Acquisition:
     """More than so many were refused by the gate, or have slipped; None: not yet."""
 
     command: str | None = None
-    """Id of the change of the loop that was asked for in this stage; None: none was."""
+    """Id of the change of the loop that was requested in this stage; None if there was none."""
 
     matrix: str | None = None
     """Id of the reconstructor sent for it last; None: none was in this attempt."""
@@ -136,7 +136,7 @@ class Acquisition:
     """Id of the last one that was applied with the loop closed."""
 
     sent: bool = False
-    """Whether anything was sent: the RTC's own matrix is then no longer in use."""
+    """True if a matrix was sent, so that the RTC's own matrix is no longer in use."""
 
     windows: int = 0
     """Windows that had been accepted when the reconstructor in use was applied, or it was over."""
@@ -146,24 +146,25 @@ class Acquisition:
     sets the mode, or asks for one."""
 
     interruption: Interruption | None = None
-    """How it was left by the service before this one, or at a gap in the link; None: it was not."""
+    """State in which the previous service, or a gap in the link, left it; None if it was not
+    interrupted."""
 
     cause: str = ""
     """Id of the order or event that has begun it; empty: the service before this one did."""
 
     @property
     def uses_wide_capture(self) -> bool:
-        """Whether windows are of the open loop, from which α is found."""
+        """Return True if windows are open-loop windows, from which a distant α can be found."""
         return self.stage in {AcquisitionStage.COARSE, AcquisitionStage.CONFIRMING}
 
     @property
     def under_way(self) -> bool:
-        """Whether it is neither over nor idle."""
+        """Return True if the acquisition is neither finished nor idle."""
         return self.stage in UNDER_WAY
 
 
 class ProbationState(StrEnum):
-    """How far the probation of a matrix is that has been applied."""
+    """Stage of the probation of an applied matrix."""
 
     RUNNING = "running"
     """Telemetry is being compared with that of the matrix before."""
@@ -205,14 +206,14 @@ class Probation:
     """The matrix applied last, on probation: against the one before."""
 
     id: str
-    """Of the one on probation."""
+    """Id of the matrix on probation."""
 
     before: str
-    """Of the one that was in use before."""
+    """Id of the matrix that was in use before."""
 
     reference: str
-    """Of the one whose telemetry it is compared with: the one before, or the last that was not
-    found worse."""
+    """Id of the matrix whose telemetry is the reference: the previous one, or the last that was not
+    judged worse."""
 
     state: ProbationState
     text: str
@@ -223,19 +224,19 @@ class Probation:
     """The verdict comes by then, where telemetry does."""
 
     loop: Status | None = None
-    """As it was with the matrix before; None: it was not known."""
+    """Status of the loop with the previous matrix; None if unknown."""
 
     finding: ProbationFinding | None = None
     """The numbers that were compared; None: not yet, or there are none."""
 
     worse: str = ""
-    """What it did to the loop, where it made that worse; empty: it did not."""
+    """How the matrix made the loop worse; empty if it did not."""
 
     rollback: str | None = None
     """Id under which the matrix before was sent again; None: it was not."""
 
     opens: bool = False
-    """Whether the loop may be asked to open where it is lost and going back does not help."""
+    """True if opening the loop is permitted when the loop is lost and a rollback does not help."""
 
     @property
     def judges(self) -> str | None:
@@ -251,12 +252,12 @@ class Probation:
 
     @property
     def under_way(self) -> bool:
-        """Whether nothing else is to be sent meanwhile."""
+        """Return True if nothing else may be sent meanwhile."""
         return self.state in _ON_PROBATION
 
 
 class MeasureState(StrEnum):
-    """Where a measurement of an interaction matrix is, by the RTC alone or by random signs."""
+    """Stage of a measurement of an interaction matrix, by the RTC or by random signs."""
 
     WAITING = "waiting"
     """The service's own dither has to end first."""
@@ -293,7 +294,7 @@ _MEASURING = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoisyFinding:
-    """What came of random signs on all modes: a noisy interaction matrix."""
+    """Result of a measurement with random signs on all modes: a noisy interaction matrix."""
 
     n_slopes: int
     n_frames: int
@@ -325,7 +326,7 @@ class NoisyFinding:
     """End of its last frame, the RTC's clock."""
 
     sha256: str
-    """Of the matrix as C-ordered little-endian float32."""
+    """Checksum of the matrix as C-ordered little-endian float32."""
 
     @property
     def sigma(self) -> NDArray[np.float64] | None:
@@ -348,32 +349,34 @@ class MeasurementRecord(MatrixStrokes):
     """Repetitions averaged; None: the pattern has none."""
 
     window_s: float | None = None
-    """Of the windows that random signs are summed from."""
+    """Duration of the windows that random signs are summed over, seconds; None for other patterns.
+    """
 
     seed: int | None = None
-    """Of random signs, whose dither has the id of the matrix."""
+    """Seed of the random signs, whose dither has the id of the matrix; None for other patterns."""
 
     asked_ns_utc: int | None = None
-    """When the service asked for it; None: it did not."""
+    """Time at which the service requested it; None if the service did not."""
 
     start_seq: int | None = None
     """First frame that contained a stroke; None: not known."""
 
     closed_before: bool = False
-    """Whether the loop was closed when it was asked for."""
+    """True if the loop was closed when it was requested."""
 
     overdue_since_ns_utc: int | None = None
-    """Since when everything looks as if it were over, but no matrix has come."""
+    """Time since which the measurement appears finished although no matrix has arrived; None if it
+    does not."""
 
     reason: str = ""
     """Why there is no matrix, or what is missing."""
 
     created_ns_utc: int | None = None
-    """When it was measured, by the RTC's clock; None: it was not, or not yet."""
+    """Time of measurement, by the RTC's clock; None if it is not finished."""
 
     n_slopes: int | None = None
     double_pass: bool | None = None
-    """Whether the light saw the mirror twice: the matrix is then twice as large."""
+    """True if the light met the mirror twice, which doubles the matrix; None if unknown."""
 
     session: str | None = None
     """The RTC's session."""
@@ -381,13 +384,13 @@ class MeasurementRecord(MatrixStrokes):
     basis_id: str | None = None
     config_id: str | None = None
     sha256: str = ""
-    """Of the matrix as it travels, 64 lower-case hex digits."""
+    """Checksum of the matrix as transmitted, 64 lower-case hexadecimal digits."""
 
     finding: NoisyFinding | None = None
-    """What came of random signs; None: not finished, or another pattern."""
+    """Result of random signs; None if not finished, or for another pattern."""
 
     cause: str = field(default="", compare=False)
-    """Id of the order that has asked for it."""
+    """Id of the order that requested it."""
 
     @classmethod
     def sent(cls, manifest: MeasuredManifest) -> MeasurementRecord:
@@ -412,7 +415,7 @@ class MeasurementRecord(MatrixStrokes):
 
     @property
     def opens_loop(self) -> bool:
-        """Whether the loop is open while it is measured."""
+        """Return True if the loop is open during the measurement."""
         return self.pattern not in {None, Pattern.SINE}
 
     @property
@@ -432,12 +435,12 @@ class MeasurementRecord(MatrixStrokes):
 
     @property
     def under_way(self) -> bool:
-        """Whether the service waits for the matrix, or works on it."""
+        """Return True while the service waits for the matrix or processes it."""
         return self.state in _MEASURING
 
 
 class CommandState(StrEnum):
-    """What has become of a command to the RTC."""
+    """State of a command to the RTC."""
 
     ASKED = "asked"
     """The RTC has not answered yet."""
@@ -456,12 +459,12 @@ class LoopCommand:
 
     id: str
     text: str
-    """What was asked for."""
+    """Description of the command."""
 
     state: CommandState
     asked_ns_utc: int
     lasts_s: float = 0.0
-    """How long the RTC is busy with it, at its nominal rate; 0: it changes at once."""
+    """Time for which the RTC is busy with it at its nominal rate, seconds; 0 if it acts at once."""
 
     until_ns_utc: int = 0
     """Until when it is, once it has accepted; 0: not known."""
@@ -470,4 +473,4 @@ class LoopCommand:
     """Why it was refused, or has failed."""
 
     cause: str = field(default="", compare=False)
-    """Id of the order or event that has asked for it."""
+    """Id of the order or event that requested it."""

@@ -33,7 +33,7 @@ class Source(StrEnum):
 
 
 class Validity(StrEnum):
-    """Whether α may be relied on."""
+    """Validity of α: whether it may be used."""
 
     FRESH = "fresh"
     """σ is below half of the limit."""
@@ -49,13 +49,13 @@ class Validity(StrEnum):
 
 
 class Purpose(StrEnum):
-    """What telemetry may be void for."""
+    """Uses for which an interval of telemetry may be void."""
 
     MEASURE = "measure"
-    """As a measurement of α, in a dithered window or without one."""
+    """Measurement of α, with or without a dither."""
 
     PASSIVE = "passive"
-    """As a passive estimate: it is of two places at once."""
+    """Passive estimate. The interval contains telemetry of two registrations."""
 
     SETTLE = "settle"
     """To settle a doubt about α: it was taken before what cast the doubt."""
@@ -66,25 +66,25 @@ class VoidInterval:
     """Telemetry that began before a time is void."""
 
     until_ns_utc: int
-    """That time, by the RTC's clock."""
+    """End of the interval, by the RTC's clock."""
 
     because: str
-    """What was the matter."""
+    """Reason why the interval is void."""
 
     purpose: Purpose = Purpose.MEASURE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ValidityState:
-    """Whether α may be relied on, why, and until when."""
+    """Validity of α, its reason, and its end."""
 
     level: Validity = Validity.FRESH
     reason: str = ""
     """Why it is not fresh."""
 
     until_ns_utc: int | None = None
-    """When it goes stale if nothing else is measured, by the service's clock; None: it is not
-    valid, or never will go stale."""
+    """Time at which α becomes stale without a new measurement, by the service's clock. None if α is
+    not valid or never becomes stale."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,7 +103,7 @@ class PointedEstimate(TimedEstimate):
     """An estimate of α, and where the telescope pointed."""
 
     pointing: Pointing | None
-    """Of the telescope then; None: not known."""
+    """Pointing of the telescope at that time; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,7 +114,8 @@ class PreviousEstimate(PointedEstimate):
     """The window that entered next; None: it is not kept."""
 
     previous_estimate: PreviousEstimate | None = None
-    """Before the window before that; None: that was the first, or it is not kept."""
+    """Estimate before the previous window; None if that window was the first or its estimate is not
+    kept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,13 +143,13 @@ class PassiveBias(Bias):
 
 
 def without_previous(biases: tuple[PassiveBias, ...]) -> tuple[PassiveBias, ...]:
-    """Return biases without what was known before their last looks: it tells nothing of now."""
+    """Return the biases without what was known before their last updates: it is out of date."""
     return tuple(replace(bias, previous_estimate=None) for bias in biases)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KnownStretches:
-    """How well the anamorphosis in α is known; the numbers themselves are α's."""
+    """Accuracy of the anamorphosis in α; its values are part of α."""
 
     covariance: Array
     """``(2, 2)`` of both."""
@@ -164,16 +165,16 @@ class KnownStretches:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SuspectedJump(TimedEstimate):
-    """A window far from all before, held until the next one says which of them was right.
+    """A window far from all previous ones, held until the next window confirms or refutes it.
 
-    Where those before it have told the same place, it began with the first of them.
+    If earlier windows have found the same registration, the jump began with the first of them.
     """
 
     held_ns_utc: int
-    """When it was put aside, by the service's clock."""
+    """Time at which the window was put aside, by the service's clock."""
 
     text: str = ""
-    """How far out it lies, for its alarm."""
+    """Size of the deviation in words, for the alarm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -194,21 +195,21 @@ class Registration:
     """End of the last telemetry that entered the estimate, the RTC's clock."""
 
     arrived_ns_utc: int
-    """When that arrived, by the service's clock: age is judged by arrival, never by comparing
-    clocks."""
+    """Arrival time of that telemetry, by the service's clock. Age is measured by arrival times
+    only, because the RTC's clock may be wrong."""
 
     n_windows: int
     """Windows that entered the estimate since it began, jumped, went stale or was restored."""
 
     scatter: float = 1.0
-    """How much more windows scatter than they say, in variance, one beside the other: in bad seeing
-    a pyramid's gains swing. Allowed for where a window is asked whether the mirror has jumped."""
+    """Ratio of the variance between windows to the variance that they predict. In bad seeing the
+    optical gains of a pyramid fluctuate. The jump detection takes it into account."""
 
     window_ns_utc: int = 0
-    """When the last dithered window arrived, by the service's clock; 0: not known."""
+    """Arrival time of the last dithered window, by the service's clock; 0 if unknown."""
 
     window_began_ns_utc: int = 0
-    """When that window began, by the RTC's clock; 0: not known."""
+    """Start of that window, by the RTC's clock; 0 if unknown."""
 
     grown: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` variance that drift and flexure have added since ``t_ns_utc``, numeric units."""
@@ -217,22 +218,23 @@ class Registration:
     """Mean modulus of the measured complex gain of the dithered modes; None: not measured."""
 
     optical_gains: tuple[ModeGain, ...] = ()
-    """Of every mode that was dithered, in the order of the modes, bounded."""
+    """Optical gain of every mode that was dithered, in mode order, bounded in number."""
 
     biases: tuple[PassiveBias, ...] = ()
-    """Of the passive estimates that have told anything, in the order of the filter."""
+    """Biases of the passive estimates that have contributed, in the filter's order."""
 
     pointing: Pointing | None = None
-    """Of the telescope at ``t_ns_utc``; None: not known."""
+    """Pointing of the telescope at ``t_ns_utc``; None if unknown."""
 
     window_pointing: Pointing | None = None
-    """Of the telescope at the last dithered window; None: not known."""
+    """Pointing of the telescope during the last dithered window; None if unknown."""
 
     previous_estimate: PreviousEstimate | None = None
-    """Before the last window; None: that was the first, or it was the first after a jump."""
+    """Estimate before the last window; None if that window was the first, or the first after a
+    jump."""
 
     jumped_ns_utc: int | None = None
-    """When it was last found to have jumped, by the service's clock; None: it has not."""
+    """Time of the last jump found, by the service's clock; None if there was none."""
 
     suspected_jump: SuspectedJump | None = None
     """A jump that the next window confirms or denies; None: there is none."""
@@ -241,25 +243,27 @@ class Registration:
     """Why α may be somewhere else, until a dithered window decides; empty: no doubt."""
 
     doubt_voids: bool = True
-    """Whether α is invalid for that: a look at ordinary telemetry alone only asks for a window."""
+    """True if the suspected jump makes α invalid. A jump suspected from ordinary telemetry alone
+    only requests a dithered window."""
 
     validity: ValidityState = ValidityState()
-    """How much it is worth now."""
+    """Present validity of α."""
 
     restored_ns_utc: int | None = None
-    """When it was taken over from before a restart of the service; None: it is of this run."""
+    """Time at which α was restored from before a restart, by the service's clock; None if it was
+    measured since."""
 
     basis_id: str | None = None
-    """Of the modes it was measured with; None: not known."""
+    """Modal basis that α was measured with; None if unknown."""
 
     config_id: str | None = None
-    """Of the RTC's configuration; None: not known."""
+    """Sensor configuration that α was measured with; None if unknown."""
 
     nominal: Misregistration | None = None
-    """Where the law of pointing had the mirror when α was as it is here; None: there is no law."""
+    """Registration by the pointing law at the time of this α; None if there is no law."""
 
     stretches: KnownStretches | None = None
-    """How well its anamorphosis is known; None: that is not followed."""
+    """Accuracy of its anamorphosis; None if anamorphosis is not tracked."""
 
     def bias(self, block: BiasBlock) -> PassiveBias | None:
         """Return what is known of a bias; None: nothing is."""
@@ -289,7 +293,7 @@ class Registration:
 
     @property
     def usable(self) -> bool:
-        """Whether anything may be made or published from it without being asked for."""
+        """Return True if reconstructors may be computed and published from it without an order."""
         return self.validity.level is not Validity.INVALID
 
 
@@ -301,7 +305,7 @@ class HistoryEntry:
     """End of the telemetry."""
 
     measured: Misregistration
-    """What this measurement alone says; a passive one without the bias learnt."""
+    """Result of this measurement alone; for a passive one, without the learnt bias."""
 
     measured_sigma: Array
     """``(4,)`` its 1 σ from the data, numeric units."""
@@ -319,10 +323,10 @@ class HistoryEntry:
     """Residual power over what noise explains; 1: the model explains the data. NaN: not known."""
 
     source: Source = Source.LOCK_IN
-    """What it was made from."""
+    """Kind of measurement."""
 
     entered: bool = True
-    """False: it was too far out to be believed, and did not enter the estimate."""
+    """False if the measurement was rejected as an outlier and is not part of the estimate."""
 
     in_use: str | None = None
     """Id of the matrix in use when it was looked at; None: unknown."""
@@ -330,14 +334,14 @@ class HistoryEntry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawLeap:
-    """A leap of what the law of pointing is told, that may be a mistake."""
+    """A leap of the pointing law's input that may be an error."""
 
     to: Misregistration
-    """Where the law would have the mirror."""
+    """Registration by the law after the leap."""
 
     since_ns_utc: int
     worked_out_ns_utc: int
-    """When it leapt, and when it was told last, by the service's clock."""
+    """Time of the leap and of the last report, by the service's clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -345,22 +349,23 @@ class LawState:
     """The nominal registration by the law of pointing."""
 
     nominal: Misregistration | None = None
-    """Where it has the mirror now; None: there is no law, or nobody tells what it is of."""
+    """Present registration by the law; None if there is no law or its input is not reported."""
 
     worked_out_ns_utc: int = 0
-    """When that was worked out, by the service's clock."""
+    """Time at which it was computed, by the service's clock."""
 
     way: tuple[tuple[int, Misregistration], ...] = ()
-    """Where it had the mirror, and when by the RTC's clock: oldest first, bounded."""
+    """Previous registrations by the law with their times by the RTC's clock, oldest first, bounded
+    in number."""
 
     problem: str = ""
     """Why it is not followed, and what to do; empty: it is, or there is none."""
 
     leap: LawLeap | None = None
-    """None: what it is told is believed."""
+    """Leap that is not accepted yet; None if there is none."""
 
     pointing: Pointing | None = None
-    """Where the telescope pointed when the nominal registration was worked out."""
+    """Pointing for which the nominal registration was computed."""
 
 
 def moved(registration: Registration, step: Array) -> Registration:
@@ -428,28 +433,29 @@ class Offload:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveState:
-    """The passive estimate, from ordinary telemetry, beside the dithered one."""
+    """The passive estimate from ordinary telemetry, shown next to the dithered one."""
 
     alpha: Misregistration
-    """As read: the bias is in it."""
+    """α as estimated, its bias included."""
 
     sigma: Array
-    """``(4,)`` 1 σ of it as a reading of α, once the bias known is taken off; numeric units.
-    Infinite where it cannot tell."""
+    """``(4,)`` 1 σ as a measurement of α after the known bias is subtracted, numeric units.
+    Infinite where the telemetry contains no information."""
 
     misfit: float
-    """Residual power over what noise explains; 1: the model explains the telemetry. NaN: too young
-    to tell."""
+    """Residual power divided by the power that noise explains; 1 if the model explains the
+    telemetry. NaN if there is too little telemetry."""
 
     t_ns_utc: int
     consistent: bool
     """False when it disagrees with the current α by more than its own uncertainty allows."""
 
     text: str
-    """What the operator should know."""
+    """Explanation for the operator."""
 
     bias: Array = field(default_factory=lambda: np.zeros(4))
     """``(4,)`` what is known of its bias, numeric units; 0: nothing."""
 
     estimator: str = PASSIVE_BIAS.name
-    """Which estimate it is, by the name of its bias: of several the last is shown."""
+    """Name of the estimate's bias, which identifies it. The most recent of several estimates is
+    shown."""

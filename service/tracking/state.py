@@ -33,7 +33,7 @@ class Level(StrEnum):
     """Log levels."""
 
     DEBUG = "debug"
-    """Of every quiet minute: in no audit trail."""
+    """Once a minute while nothing happens; not in the audit trail."""
 
     INFO = "info"
     WARNING = "warning"
@@ -52,13 +52,14 @@ class LogEntry:
     text: str
 
     times: int = 1
-    """How often: a line that repeats within a minute is told once, and again with this count."""
+    """Number of occurrences. A line that repeats within a minute is logged once, and again with
+    this count."""
 
     last_ns_utc: int = 0
     """The last time, where it was more than once."""
 
     ranges: tuple[tuple[str, str], ...] = ()
-    """Of a line that was counted: the smallest and the largest of each number in its text."""
+    """Smallest and largest value of each number in the text of a counted line."""
 
     cause: str = ""
     """Id of the order or event that has led to it: what else that led to has the same; empty: of
@@ -80,15 +81,15 @@ class ObservatoryValue:
     """It counts before this."""
 
     by: str
-    """Who told it; empty: nobody said."""
+    """Name of whoever reported it; empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """Something that was asked for and came to nothing."""
+    """An order or request that had no result."""
 
     cause: str
-    """Id of the order or event that has asked for it."""
+    """Id of the order or event that caused it."""
 
     text: str
     """Why."""
@@ -114,13 +115,15 @@ class OperatorState:
     mode: Mode = Mode.PROPOSE
 
     settings_mode: Mode | None = None
-    """What the settings say while an operator has ordered another; None: ``mode`` is theirs."""
+    """Mode in the settings while an operator has ordered another; None if ``mode`` is that of the
+    settings."""
 
     stopped_because: str = ""
-    """Who has stopped everything, and why; empty: nobody, or it was released."""
+    """Who has stopped everything, and why; empty if nothing is stopped."""
 
     failures: tuple[Failure, ...] = ()
-    """What came to nothing, oldest first, bounded: whoever gave the order looks for its cause."""
+    """Failures, oldest first, bounded in number. The source of an order finds its own by the cause.
+    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -146,25 +149,27 @@ class AlphaState:
     """Why ordinary telemetry says nothing of α now; empty: it does, or was not looked at yet."""
 
     void_intervals: tuple[VoidInterval, ...] = ()
-    """Which telemetry is void, for what and why: in the order in which that was found, bounded."""
+    """Void intervals of telemetry with purpose and reason, in the order in which they were found,
+    bounded in number."""
 
     dither_due_since_ns_utc: int | None = None
-    """Since when a dithered window is wanted before anything else is believed; None: it is not."""
+    """Time since which a dithered window is needed before any other measurement is accepted; None
+    if none is needed."""
 
     dither_due_reason: str = ""
     """Why: what makes α doubtful."""
 
     pointing: Pointing | None = None
-    """Of the telescope, from the RTC's status or the observatory; None: nobody has told."""
+    """Pointing of the telescope, from the RTC's status or the observatory; None if not reported."""
 
     pointings: tuple[tuple[int, Pointing], ...] = ()
-    """Where it looked, and from when on by the RTC's clock: oldest first, bounded."""
+    """Previous pointings with their start by the RTC's clock, oldest first, bounded in number."""
 
     offload: Offload | None = None
-    """The last one asked for; None: none was, or α is corrected by the matrix alone."""
+    """Last offload requested; None if there was none or α is corrected by the matrix alone."""
 
     law: LawState = field(default_factory=LawState)
-    """Where the law of pointing has the mirror."""
+    """State of the pointing law."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,13 +181,13 @@ class WindowCounts:
     refused: int = 0
 
     run: int = 0
-    """How many of the last windows could be used one after the other; below 0: were refused."""
+    """Number of consecutive windows accepted; negative if they were rejected."""
 
     refused_because: str = ""
     """Why the last of those was; empty: none was yet."""
 
     outlying: int = 0
-    """Believable in themselves, but so far from all others that they were not believed."""
+    """Windows that were plausible by themselves but rejected as outliers."""
 
     refusal: LogEntry | None = None
     """The last one that was refused, and why, as the log has it; None: none was."""
@@ -205,35 +210,36 @@ class MatrixStates:
     """Id under which the RTC holds other numbers than were sent; None: it holds what it should."""
 
     hindrance: str = ""
-    """What keeps a reconstructor that is wanted from being made, and what to change; empty if
-    nothing does, or none is wanted."""
+    """Reason why a required reconstructor cannot be computed, and what to change; empty if there is
+    none."""
 
     applied_asked_ns_utc: int = 0
-    """When the RTC was last asked for the matrix it uses."""
+    """Time at which the RTC was last asked for the matrix it uses."""
 
     read_back_error: str = ""
-    """Why it could not be had; empty: it could, or was not asked for."""
+    """Reason why that matrix could not be read; empty if it could."""
 
     margin: GateVerdict | None = None
     """The gate's verdict on the matrix in use at the current α ± 3σ; None: not known yet."""
 
     assessment: Assessment | None = None
-    """What the matrix in use loses against a new one; None: not known yet."""
+    """Loss of the matrix in use compared with a new one; None if not computed yet."""
 
     making_since_ns_utc: int | None = None
-    """When the reconstructor now being computed was asked for; None: none is."""
+    """Time at which the reconstructor now being computed was requested; None if none is computed.
+    """
 
     judged_ns_utc: int | None = None
-    """When ``margin`` was last asked for."""
+    """Time at which ``margin`` was last requested."""
 
     no_making_before_ns_utc: int = 0
-    """Before when no reconstructor is computed again."""
+    """Time before which no further reconstructor is computed."""
 
     mode_proof: ModeProof = field(default_factory=ModeProof)
-    """Which modes have shown how they answer."""
+    """Modes whose response has been verified."""
 
     mode_limit: ModeLimit | None = None
-    """How many modes the gate lets be controlled; None: as many as are wanted."""
+    """Number of modes that the gate permits; None if it permits all that are requested."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -244,10 +250,10 @@ class Operations:
     """Finding α from nothing: under way, or how the last one ended."""
 
     probation: Probation | None = None
-    """Of the matrix applied last; None: none has been, in this run of the service."""
+    """Probation of the matrix applied last; None if none was applied since the service started."""
 
     measurements: tuple[MeasurementRecord, ...] = ()
-    """Of interaction matrices, oldest first, bounded."""
+    """Measurements of interaction matrices, oldest first, bounded in number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -255,7 +261,7 @@ class DitherState:
     """The dither, and what it has taught."""
 
     dither: Dither | None = None
-    """Requested or running; None: none, and a new one may be asked for."""
+    """Dither that is requested or running; None if there is none."""
 
     stopped: bool = False
     """An operator stopped it: the service does not start another by itself."""
@@ -267,10 +273,11 @@ class DitherState:
     """Dithers lost since the last window was accepted."""
 
     policy: DitherPolicyState = field(default_factory=DitherPolicyState)
-    """What the dither policy has learnt, and its account of why it dithers or does not."""
+    """What the dither policy has learnt, and its reason for the present dither or its absence."""
 
     no_dither_before_ns_utc: int = 0
-    """Before when none is asked for again: what cannot be had holds up nothing else."""
+    """Time before which no further dither is requested, so that a refused dither does not block
+    other work."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -290,13 +297,14 @@ class LoopState:
     """Vibration lines in the slopes, lowest first."""
 
     holds: bool = False
-    """Whether telemetry says that the loop leaves little of what it follows."""
+    """True if the telemetry shows that the loop suppresses what it follows."""
 
     command: LoopCommand | None = None
     """The last change of the loop that was asked of the RTC; None: none was."""
 
     close_since_ns_utc: int | None = None
-    """Since when the loop should close again after a measurement that was given up; None: no."""
+    """Time since which the loop should be closed again after an aborted measurement; None if it
+    need not."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -304,13 +312,13 @@ class AlarmStates:
     """Alarms that last, and what is kept of those before."""
 
     active: tuple[Alarm, ...] = ()
-    """Those that last."""
+    """Alarms that are active."""
 
     records: tuple[AlarmRecord, ...] = ()
-    """What is kept of alarms that last, went unseen or are muted."""
+    """Records of alarms that are active, unacknowledged or muted."""
 
     observatory_values: tuple[ObservatoryValue, ...] = ()
-    """Values that operators' own rules ask for, as they were told last."""
+    """Last reported values for the operators' own alarm rules."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -337,7 +345,7 @@ class TrackerState:
         return next((r for r in reversed(self.matrices.reconstructors) if r.id == matrix_id), None)
 
     def failure(self, cause: str) -> str:
-        """Return why what this order or event has asked for came to nothing; empty: it did not."""
+        """Return the reason why an order or event had no result; empty if it had one."""
         failures = reversed(self.operator.failures)
         return next((failure.text for failure in failures if failure.cause == cause), "")
 
@@ -347,7 +355,10 @@ class TrackerState:
 
     @property
     def on_probation(self) -> bool:
-        """Whether nothing is sent unasked: a matrix is on probation, or being rolled back."""
+        """Return True if a matrix is on probation or being rolled back.
+
+        Nothing is sent without an order meanwhile.
+        """
         return self.operations.probation is not None and self.operations.probation.under_way
 
     @property
@@ -399,14 +410,14 @@ class Orders:
     """None: that of the settings holds."""
 
     settings_mode: Mode | None = None
-    """What the settings said then; where they say something else now, they have the last word."""
+    """Mode of the settings at that time. If the settings have changed since, the new ones apply."""
 
     dither_stopped: bool = False
     stopped: str = ""
-    """Who has stopped everything, and why; empty: nobody."""
+    """Who has stopped everything, and why; empty if nothing was stopped."""
 
     seen: tuple[AlarmRecord, ...] = ()
-    """What operators have seen of alarms, and what nobody has seen."""
+    """Alarms that operators have acknowledged, and alarms that nobody has acknowledged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -417,7 +428,7 @@ class Saved:
     """The ``{system}`` of the wire."""
 
     saved_ns_utc: int
-    """When, by the service's clock."""
+    """Time of saving, by the service's clock."""
 
     session: str | None
     """The RTC's; None: none was there."""
@@ -426,7 +437,7 @@ class Saved:
     """Id of the matrix the RTC multiplied with; None: unknown."""
 
     pointing: Pointing | None
-    """Of the telescope; None: nobody had told."""
+    """Pointing of the telescope; None if not reported."""
 
     registration: Registration | None
     """Without the window that may be waiting for another: that one will not come. None: an
@@ -442,12 +453,12 @@ class Saved:
     """The last demand to move the mirror's image, with all before it; None: there was none."""
 
     void_intervals: tuple[VoidInterval, ...] = ()
-    """Which telemetry is void, for what and why."""
+    """Void intervals of telemetry with purpose and reason."""
 
     mode_proof: ModeProof | None = None
-    """Which modes have shown how they answer, in ``session``; None: none has."""
+    """Modes whose response was verified in ``session``; None if there are none."""
 
     @property
     def tells_of_alpha(self) -> bool:
-        """Whether it says what α was, or why it is not known."""
+        """Return True if it contains α, or the reason why α is unknown."""
         return self.registration is not None or self.acquisition is not None

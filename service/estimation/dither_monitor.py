@@ -1,9 +1,9 @@
-"""Measure the dither in the frames, and the slopes' answer to it.
+"""Measure the dither in the telemetry, and the response of the slopes to it.
 
-The telemetry has the dither's part of every command in columns of its own, and modes outside the
-loop move by nothing else. Once a second the strength of each mode, on its line, is compared with
-what was asked for, and the power of the slopes on the lines with what a mirror that obeys would
-make of it; the noise of that is read off beside the lines.
+The telemetry contains the dither part of every command in separate columns, and modes outside the
+loop move by nothing else. Once a second the amplitude of each mode at its frequency is compared
+with the request, and the power of the slopes at these frequencies with the response of a mirror
+that follows. Noise is measured next to the lines.
 """
 
 from __future__ import annotations
@@ -25,33 +25,35 @@ from service.estimation.windows import ExpectedDither
 Array = NDArray[Any]
 
 CHECK_S = 1.0
-"""Of frames that hold the dither, between two findings."""
+"""Duration of dithered frames between two results."""
 
 MIN_FRAMES = 50
 
 LOUDER, WEAKER = 1.25, 0.5
-"""Of what was asked for: a mode that is beyond is named."""
+"""A mode is reported if its amplitude relative to the request is outside this range."""
 
 AMPLIFIED = 3.0
-"""Times what its column says a mode may carry that the loop has just begun to control: its status
-tells so up to a second later than the frames show it."""
+"""Tolerated ratio of a mode's amplitude to its dither column if the loop has just begun to control
+the mode: the status reports this up to a second after the frames show it."""
 
 STRAY = 0.2
-"""Share of what was asked for in all that modes not asked for may carry together."""
+"""Fraction of the requested amplitude that all other modes together may have."""
 
 _NAMED = 4
 
 _GLANCED = 8
-"""Slopes of a frame that tell whether all need be compared."""
+"""Number of slopes per frame that are compared first, to decide if all must be."""
 
 SIDES_HZ = (-11, -7, -3, 3, 7, 11)
-"""Where the noise of the slopes is measured, relative to a line; whole periods of a second."""
+"""Frequencies at which the noise of the slopes is measured, relative to a line; whole periods per
+second."""
 
 UNANSWERED = 0.03
 """Share of the power expected below which, by 3 σ, nothing has moved: an optical gain of 0.17."""
 
 REPEATED = 0.02
-"""Share of frames with the very slopes of the frame before: these are frozen, and tell nothing."""
+"""Fraction of frames identical to the previous one above which the slopes count as frozen and are
+not used."""
 
 _nothing = partial(np.zeros, (), np.float32)
 
@@ -65,10 +67,11 @@ class DitherMeasurement:
 
     asked_m: float
     text: str
-    """What is otherwise than it was asked for; empty: nothing."""
+    """Difference from the request in words; empty if there is none."""
 
     unanswered: str | None = None
-    """How the slopes do not answer it; empty: they do; None: there is too little light to tell."""
+    """Description of a missing response of the slopes; empty if they respond, None if there is too
+    little light to decide."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,37 +95,38 @@ class DitherMonitor:
     """The frame those are followed by."""
 
     slopes: Array = field(default_factory=_nothing)
-    """``(2 * n_heard * (1 + n_sides), n_slopes)`` slopes times cosines, then sines, on and beside
-    each line heard."""
+    """``(2 * n_lines * (1 + n_sides), n_slopes)`` sums of slopes times cosines, then sines, on and
+    next to each line."""
 
     n_repeated: int = 0
     """Frames with the very slopes of the frame before."""
 
     doubted: bool = False
-    """Whether the second before held what the loop may have made of modes outside it."""
+    """True if the second before contained what the loop may have made of modes outside it."""
 
     powers: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the slopes on the lines, its variance, and what is expected, summed until it can be told
-    whether they answer."""
+    """Power of the slopes on the lines, its variance, and the expected power, summed until the
+    response can be decided."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DitherWatch(Detector):
-    """Whether the dither that should be there is in the frames, as strong as it was asked for."""
+    """Checks that the requested dither is in the frames with the requested amplitude."""
 
     resets = Change.GONE | Change.RATE | Change.LOOP | Change.DITHER
 
     monitor: DitherMonitor | None = None
-    """Of how strong it is on the mirror; None: there is none, or none that can be read."""
+    """Measurement of its amplitude on the mirror; None if there is no dither or it cannot be
+    measured."""
 
     measurement: DitherMeasurement | None = None
-    """What the last second of frames held of it; None: too few have come."""
+    """Result of the last second of frames; None if there are too few."""
 
     seen_seq: int = 0
     """Up to here the frames held it, or it need not have been there."""
 
     silent_s: float = 0.0
-    """For how long the last frames should have held it and did not."""
+    """Duration for which frames that should contain the dither do not, seconds."""
 
     @classmethod
     @override
@@ -146,7 +150,7 @@ class DitherWatch(Detector):
 
     @override
     def update(self, frames: FrameContext) -> DitherWatch:
-        """Return it after one more block; what stands answers nothing."""
+        """Return the detector after one more block; frozen slopes are no missing response."""
         block, dither, watch = frames.block, frames.loop.dither, self
         if watch.monitor is not None:
             monitor, found = measure_block(watch.monitor, block)
@@ -229,7 +233,7 @@ def _demodulated(
 
 
 def _add_slopes(monitor: DitherMonitor, slopes: Array, first_seq: int) -> DitherMonitor:
-    """Add slopes to the sums on and beside the lines."""
+    """Add slopes to the sums on and next to the lines."""
     asked = monitor.asked
     lines = np.array(asked.frequency_hz)[asked.audible]
     if not len(lines):
@@ -253,9 +257,9 @@ def _repeated(slopes: Array) -> int:
 
 
 def _powers(monitor: DitherMonitor) -> tuple[float, float, float]:
-    """Return the power on the lines beyond the noise, its variance, and what is expected.
+    """Return the power on the lines above the noise, its variance, and the expected power.
 
-    What earlier seconds have told is in it, where that was too little for a verdict.
+    Earlier seconds are included if they were not sufficient for a decision.
     """
     asked, heard, before = monitor.asked, monitor.asked.audible, monitor.powers
     if not heard or monitor.n_repeated > REPEATED * monitor.n_frames:
@@ -319,7 +323,7 @@ def _found(monitor: DitherMonitor) -> tuple[DitherMeasurement, bool]:
 def _outside_tolerance(
     asked: ExpectedDither, carried: Array, wanted: Array, reported_m: Array
 ) -> list[str]:
-    """Return which of the modes asked for are too strong, too weak, or at another frequency."""
+    """Return requested modes with a wrong amplitude or frequency."""
     ratio, said = carried / wanted, []
     for k in np.flatnonzero((ratio > LOUDER) | (ratio < WEAKER))[:_NAMED]:
         found = f"mode {asked.modes[k]} carries {1e9 * carried[k]:.3g} nm"

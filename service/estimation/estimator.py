@@ -1,8 +1,8 @@
-"""The protocols of streaming estimators and detectors.
+"""Protocols of streaming estimators and detectors.
 
-An estimator is a frozen record that returns itself anew. The bank that feeds all of them
-(``service.runtime.estimator_bank``) knows none by name: each says what it begins anew for, of which
-frames it wants nothing, and what it says of a block to those that come after it.
+An estimator is an immutable record whose ``update`` returns the next record. The bank that feeds
+all estimators (``service.runtime.estimator_bank``) knows none of them by name: each declares which
+changes reset it, which frames it skips, and what it reports about a block to those that follow it.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from service.wire import Status
 
 
 class Change(Flag):
-    """What has changed about telemetry since the block, or the status, before."""
+    """Changes of the telemetry since the previous block or status."""
 
     GONE = auto()
-    """No RTC is there any more, or nobody knows whose telemetry it is."""
+    """There is no RTC, or it is not known whose telemetry this is."""
 
     SESSION = auto()
     RATE = auto()
     """The frame rate, or the first RTC has come."""
 
     LOOP = auto()
-    """The loop is another than the one with which the open window and all sums were begun."""
+    """The loop differs from the one with which the open window and all sums began."""
 
     STATUS = auto()
-    """The loop is another than the status before told: gains may creep away from those of sums."""
+    """The loop differs from that of the previous status: slowly drifting gains are found only in
+    comparison with the sums."""
 
     DITHER = auto()
     OPEN = auto()
@@ -46,11 +47,11 @@ class Change(Flag):
     """Another matrix multiplied the slopes of this block than those of the one before."""
 
     STANDSTILL = auto()
-    """The slopes stand; said of every block: what came just before is no measurement either."""
+    """The slopes are frozen. Set for every such block; the frames before it are not used either."""
 
 
 class Mark(Flag):
-    """What an estimator says of a block to those after it."""
+    """What an estimator reports about a block to those that follow it."""
 
     STANDS = auto()
     """The slopes are no measurement."""
@@ -68,11 +69,11 @@ UNMARKED = Mark(0)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopContext:
-    """What all estimators are told of the loop whose telemetry they see."""
+    """The loop whose telemetry the estimators receive."""
 
     description: Description
     rtc: Status | None = None
-    """As its last status has it."""
+    """Last status of the RTC."""
 
     in_loop: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     """Modes it moves by itself; empty: it is open."""
@@ -81,7 +82,7 @@ class LoopContext:
     """Controlled modes that have no gain."""
 
     edge: EdgeWatch | None = None
-    """How its outer ring is watched; None: too few modes are controlled."""
+    """Parameters for watching the outer ring; None if too few modes are controlled."""
 
     matrices: tuple[tuple[str, NDArray[np.float32]], ...] = ()
     """Reconstructors by id, oldest first, bounded."""
@@ -99,7 +100,7 @@ class LoopContext:
     """Frames before this one may have been made by another loop, or by no measurement."""
 
     settled_seq: int = 0
-    """By this one the loop has settled after that."""
+    """Frame from which the loop has settled after that change."""
 
     def terms(self, cm_id: str | None) -> ClosedLoop | None:
         """Return the loop that a matrix closes; None: it is open, not known, or another's."""
@@ -120,19 +121,20 @@ class FrameContext:
     loop: LoopContext
     rtc: Status
     terms: ClosedLoop | None
-    """The loop that the block's matrix closes; None: it is open, or nobody knows."""
+    """The loop closed by the block's matrix; None if it is open or unknown."""
 
     lines_hz: tuple[float, ...]
-    """Of the dither that plays: what stands there is no vibration, nor anybody's noise."""
+    """Lines of the present dither, which are neither vibrations nor noise."""
 
     marks: Mark = UNMARKED
-    """What those before have said of it."""
+    """Marks set by the estimators before this one."""
 
     @property
     def moving(self) -> FrameBlock:
-        """The block without what stands in controlled modes that have no gain.
+        """Return the block without the constant part of controlled modes that have no gain.
 
-        An integrator without leak keeps it for ever; a mode that never moves tells nothing.
+        An integrator without leak keeps it for ever, and a mode that never moves contains no
+        information.
         """
         block, still = self.block, self.loop.still
         if not len(still):
@@ -148,7 +150,7 @@ class Streaming:
     __slots__ = ()
 
     resets: ClassVar[Change] = NOTHING
-    """What it begins anew for; all else leaves it as it is."""
+    """Changes that reset the estimator; all others leave it as it is."""
 
     unless: ClassVar[Mark] = UNMARKED
     """Blocks that are marked so are not for it."""
@@ -178,7 +180,7 @@ class Streaming:
 
     @property
     def marks(self) -> Mark:
-        """What it says of the last block to those after it."""
+        """Return its marks on the last block."""
         return UNMARKED
 
 
@@ -189,7 +191,7 @@ class Detector(Streaming):
 
     @property
     def conditions(self) -> tuple[str | None, ...]:
-        """What is the matter, and what to do, of each of its alarms; None: nothing."""
+        """Return for each of its alarms what is wrong and what to do, or None."""
         return ()
 
     def vet(self, window: Telemetry, loop: LoopContext) -> tuple[Self, str | None]:
@@ -198,7 +200,7 @@ class Detector(Streaming):
 
 
 class Estimator(Streaming):
-    """Estimates α: from windows that end as a dither allows, or from sums that are asked for."""
+    """Estimates α, from windows that end with a dither or from sums on request."""
 
     __slots__ = ()
 
@@ -208,9 +210,9 @@ class Estimator(Streaming):
     def close(
         self, loop: LoopContext, marks: Mark, *, has_windows: bool
     ) -> tuple[Self, Self | str | None]:
-        """Return it begun anew, and the sums to be fitted, or why there are none; None: not yet.
+        """Return the reset estimator with the sums to fit; None if no estimate is due.
 
-        ``marks`` are those of the last block; ``has_windows``: dithered windows have told of α
-        just now.
+        In place of the sums it may return the reason why there are none. ``marks`` are those of the
+        last block; ``has_windows`` is True if dithered windows have recently measured α.
         """
         return self, None

@@ -54,34 +54,34 @@ def in_words(waiting_for: tuple[Prerequisite, ...]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Snapshot:
-    """Everything a reader may want to know at one moment."""
+    """State of the service at one moment, for all readers."""
 
     tracker: TrackerState
-    """What is known of registration and reconstructors."""
+    """Registration, reconstructors, operations and alarms."""
 
     policy: Policy
     """The user's numbers that the service goes by."""
 
     link: LinkStatistics
-    """What has passed on the link."""
+    """Statistics of the link."""
 
     now_ns: int
-    """When the snapshot was taken: the service's clock, nanoseconds since the Unix epoch."""
+    """Time of the snapshot by the service's clock, nanoseconds since the Unix epoch."""
 
     started_ns: int
-    """When the service started, on the same clock."""
+    """Start of the service by the same clock."""
 
     ready: bool
-    """Whether it can do its work."""
+    """True if the service can do its work."""
 
     ready_reason: str
-    """What it waits for, or that it waits for nothing."""
+    """What the service waits for, or that it waits for nothing."""
 
     waiting_for: tuple[Prerequisite, ...] = ()
     """Whom the service waits for and what they should do, what hinders most first."""
 
     worker_load: WorkerLoad = field(default_factory=WorkerLoad)
-    """What the work costs."""
+    """Processor time and memory of the worker."""
 
     archive_failures: int = 0
     """Attempts to write that the disk has refused."""
@@ -90,15 +90,15 @@ class Snapshot:
     """Lines of the audit trail that are not on the disk yet."""
 
     instrument_remarks: tuple[str, ...] = ()
-    """What the instrument file leaves out or assumes: petals that no mode can move, a stroke that
-    nobody has given."""
+    """Remarks on the instrument file: assumptions and missing values, such as petals that no mode
+    can move."""
 
     stalled: str = ""
-    """Which part of the service stands still, and for how long; empty: none does."""
+    """Part of the service that has stopped responding, and for how long; empty if there is none."""
 
     @property
     def uptime_s(self) -> float:
-        """Since the service started."""
+        """Time since the service started, seconds."""
         return (self.now_ns - self.started_ns) / 1e9
 
     @property
@@ -109,7 +109,7 @@ class Snapshot:
 
     @property
     def permitted(self) -> Mapping[str, Permission]:
-        """Which orders may be given now, by name; one that may not says why, and what to do."""
+        """Orders by name, each with its permission; a refusal has the reason and what to do."""
         return permissions(self.tracker, self.policy, self.now_ns)
 
     @property
@@ -120,7 +120,7 @@ class Snapshot:
 
     @property
     def alarms(self) -> tuple[AlarmStatus, ...]:
-        """Those that last, in the order in which they were raised."""
+        """Active alarms, in the order in which they were raised."""
         raised = self.tracker.alarms.active
         return tuple(
             AlarmStatus(record=record_of(self.tracker, a), definition=a.definition) for a in raised
@@ -133,12 +133,12 @@ class Snapshot:
 
     @property
     def muted_alarms(self) -> tuple[AlarmRecord, ...]:
-        """Those that are muted, whether they last or not."""
+        """Muted alarms, whether active or not."""
         return muted_records(self.tracker)
 
     @property
     def worst_severity(self) -> Severity | None:
-        """Of all alarms that last or ended unseen; null: none."""
+        """Highest severity of active and unacknowledged alarms; null if there are none."""
         return worst_severity(self.tracker)
 
     @property
@@ -213,20 +213,20 @@ class Alpha:
 
     @property
     def age_s(self) -> float:
-        """Since the last telemetry that entered it arrived, seconds."""
+        """Age of the last telemetry that entered the estimate, by its arrival, seconds."""
         return (self.snapshot.now_ns - self.registration.arrived_ns_utc) / 1e9
 
     @property
     def window_age_s(self) -> float | None:
-        """Since the last dithered window arrived, seconds; null: not known."""
+        """Age of the last dithered window, by its arrival, seconds; null if unknown."""
         window_ns = self.registration.window_ns_utc
         return (self.snapshot.now_ns - window_ns) / 1e9 if window_ns else None
 
     @property
     def suspected(self) -> Misregistration | None:
-        """Place in the last window, too far away to be believed before another confirms it.
+        """Registration of the last window if a jump is suspected; null otherwise.
 
-        Null: no jump is suspected.
+        It is too far away to be accepted before another window confirms it.
         """
         return (
             None
@@ -248,7 +248,7 @@ class Alpha:
 
     @property
     def _bias(self) -> PassiveBias | None:
-        """Of the estimate that is shown; one that was made of something else before is no more."""
+        """Bias of the estimate that is shown; None if it was made by another estimator since."""
         biases, shown = self.registration.biases, self.snapshot.tracker.alpha.passive
         if shown is None:
             return biases[0] if biases else None
@@ -283,10 +283,10 @@ class ModeGainTable:
     """Empty: the table is only what is expected at 1 arcsec of seeing."""
 
     optical_gain: list[float]
-    """Of each mode: how much of the model's response the sensor shows."""
+    """Ratio of the sensor's response to the model's, for each mode."""
 
     relative_sigma: list[float]
     """1 σ of each as a share of it; it grows away from the measured modes."""
 
     factor: list[float]
-    """By which to multiply one loop gain for all modes: mean 1, 0.5 to 2."""
+    """Factor for one loop gain of all modes, for each mode: mean 1, range 0.5 to 2."""

@@ -28,7 +28,7 @@ LONGEST_VALUE_S = 86_400.0
 LONGEST_TEXT = 200
 
 Value = bool | float | str
-"""What operators' own rules compare."""
+"""Type of a value that operators' own alarm rules compare."""
 
 Positive = Annotated[float, Gt(0.0)]
 Count = Annotated[int, Ge(1)]
@@ -48,10 +48,10 @@ class Instruction:
     }
 
     reason: Annotated[str, MaxLen(500)] = ""
-    """Why it is asked for; kept in the audit trail."""
+    """Reason of the order, for the audit trail."""
 
     by: Annotated[str, MaxLen(100)] = ""
-    """Who asks; empty: known by the address alone."""
+    """Name of whoever gives the order; empty if only the address is known."""
 
     def __post_init__(self) -> None:
         """Refuse what would act on the terminal it is shown on.
@@ -68,7 +68,7 @@ class Instruction:
 
     @property
     def signed(self) -> str:
-        """Who asks, and why, for the log."""
+        """Return name and reason of the order, for the log."""
         why = f" ({self.reason})" if self.reason else ""
         return f"by {self.by or 'an operator'}{why}"
 
@@ -152,7 +152,7 @@ class OfMatrix(Instruction):
     """The matrix that an order is about."""
 
     id: str
-    """Of the matrix; one to come was never used before."""
+    """Id of the matrix. A new one must never have been used before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,7 +218,7 @@ class Measure(MeasureChoice):
     """Have the RTC measure an interaction matrix."""
 
     id: str
-    """Of the matrix to come; never used before."""
+    """Id of the future matrix; must never have been used before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,7 +240,7 @@ class NoisyChoice(RandomSigns):
     """0-based basis indices, none twice, or "controlled" or "all"."""
 
     duration_s: Annotated[float, Gt(0.0), Le(LONGEST_NOISY_S)] | None = None
-    """Of telemetry; the RTC's time."""
+    """Duration of telemetry by the RTC's time, seconds."""
 
     @override
     def __post_init__(self) -> None:
@@ -253,7 +253,7 @@ class MeasureNoisy(NoisyChoice):
     """Measure a noisy interaction matrix, loop closed."""
 
     id: str
-    """Of the matrix to come, and of its dither; never used before."""
+    """Id of the future matrix and of its dither; must never have been used before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -280,7 +280,8 @@ class ReportedValue(Instruction):
     """A number, a text, or true or false, as the rule compares it."""
 
     for_s: Annotated[float, Gt(0.0), Le(LONGEST_VALUE_S)] = 60.0
-    """How long it counts, seconds: then it is not known, until it is told again."""
+    """Duration for which the value is valid, seconds. Afterwards it is unknown until it is reported
+    again."""
 
     @override
     def __post_init__(self) -> None:
@@ -294,7 +295,7 @@ class SetValue(ReportedValue):
     """Report a value for operators' own rules."""
 
     name: str
-    """As the rules have it."""
+    """Name of the value in the rules."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -305,7 +306,7 @@ class ModeGroup:
     """0-based basis index of the first mode."""
 
     last: BasisMode
-    """Of the last one; it belongs to the group."""
+    """Last mode of the group; it belongs to the group."""
 
     def __post_init__(self) -> None:
         """Refuse a range that ends before it begins."""
@@ -365,13 +366,15 @@ class Ramp(Instruction):
     """
 
     groups: Annotated[tuple[ModeGroup, ...], Len(1, MAX_GROUPS)] | None = None
-    """In the order they are tried; None: tip and tilt, to mode 99, the other controlled ones."""
+    """Groups in the order in which they are tuned. None for tip and tilt, then modes up to 99, then
+    the other controlled ones."""
 
     gains: Annotated[tuple[Positive, ...], Len(1, 100)] | None = None
     """Tried in this order on every group; None: 0.1 to 0.6."""
 
     step_s: Annotated[float, Gt(0.0), Le(60.0)] | None = None
-    """How long each gain is tried, at the nominal frame rate, settling included; None: 1."""
+    """Duration of each gain value at the nominal frame rate, settling included, seconds. None for 1
+    s."""
 
     @override
     def __post_init__(self) -> None:
@@ -423,12 +426,12 @@ class AcknowledgeAlarm(SeenAlarm):
     """Say that an alarm is known of; it stays for as long as it lasts."""
 
     name: str
-    """Of the alarm."""
+    """Name of the alarm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MuteTime(Instruction):
-    """For how long an alarm is not to be shown."""
+    """Duration for which an alarm is muted."""
 
     for_s: Annotated[float, Gt(0.0), Le(LONGEST_MUTE_S)]
     """Seconds, at most twelve hours."""
@@ -439,7 +442,7 @@ class MuteAlarm(MuteTime):
     """Hide an alarm for a time; it is still counted."""
 
     name: str
-    """Of the alarm."""
+    """Name of the alarm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -447,7 +450,7 @@ class UnmuteAlarm(Instruction):
     """Show an alarm again."""
 
     name: str
-    """Of the alarm."""
+    """Name of the alarm."""
 
 
 Command = (

@@ -51,10 +51,11 @@ class RepublishMatrix(Caused):
     source: str
     why: str
     judged: bool = True
-    """Ask the gate; False: nobody has asked for it, and what the gate said of the earlier holds."""
+    """True to have the gate check the matrix; False if nobody requested it and the gate's earlier
+    verdict holds."""
 
     anyway: bool = False
-    """An operator wants it even where the gate refuses it."""
+    """True if an operator wants it even if the gate rejects it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,10 +71,10 @@ class JudgeProposal(Caused):
 
     id: str
     gains: tuple[float, ...]
-    """Of the modes it commands."""
+    """Gains of the modes it commands."""
 
     wanted: bool = True
-    """Somebody asked for it to be sent; False: the service would by itself."""
+    """True if it was requested to be sent; False if the service sends it on its own initiative."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +92,7 @@ class FetchMatrix(Caused):
     """Ask the RTC for the matrix it uses."""
 
     id: str | None
-    """By its status; None: its status does not say."""
+    """Id of the dither in its status; None if the status has none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,7 +130,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionStarted:
-    """The RTC started anew: its windows, commands and staged matrices are void."""
+    """The RTC began a new session: its windows, commands and staged matrices are void."""
 
     session: str
 
@@ -144,10 +145,10 @@ class ServicesMet:
     """Other services of this system came or went."""
 
     drives: bool
-    """Whether this service drives the RTC; otherwise it stands by."""
+    """True if this service drives the RTC, False if it is on standby."""
 
     others: tuple[str, ...]
-    """In words, the first one first."""
+    """The other services in words, the first one first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,7 +161,7 @@ class ConditionChanged:
     """The condition has ended."""
 
     t_ns_utc: int = 0
-    """End of the telemetry that told, the RTC's clock; 0: it was not telemetry."""
+    """End of the telemetry concerned, by the RTC's clock; 0 if it was not telemetry."""
 
     @classmethod
     def detect(
@@ -196,7 +197,7 @@ class WindowFitted:
 
     estimate: LockInEstimate | RandomEstimate
     began_ns_utc: int = 0
-    """Begin of the window, the RTC's clock; 0: not told."""
+    """Start of the window, by the RTC's clock; 0 if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -205,7 +206,7 @@ class WideCaptureFitted:
 
     found: WideCaptureEstimate
     began_ns_utc: int = 0
-    """Begin of the window, the RTC's clock; 0: not told."""
+    """Start of the window, by the RTC's clock; 0 if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,7 +225,7 @@ class PassiveFitted:
     """End of the telemetry it is of."""
 
     began_ns_utc: int = 0
-    """Begin of it, the RTC's clock; 0: not told."""
+    """Start of the telemetry, by the RTC's clock; 0 if unknown."""
 
     loop: tuple[float, ...] = ()
     """``estimation.loop.loop_numbers`` of the loop it is of; empty: not known."""
@@ -244,16 +245,16 @@ class MatrixMade:
 
     record: ReconstructorRecord
     wanted: bool
-    """An operator asked for this very matrix: no further approval is needed."""
+    """True if an operator ordered this very matrix, so that it needs no approval."""
 
     anyway: bool = False
     """Not the gate's either: it has been in use, and its reason says what the gate says."""
 
     asked_modes: int | None = None
-    """Modes it should have had; None: nobody asked for a number."""
+    """Number of modes requested; None if no number was requested."""
 
     why_fewer: str = ""
-    """Why it has fewer than were asked for: the gate's words."""
+    """Reason for a smaller number of modes, as the gate gave it; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -272,16 +273,18 @@ class ModesRecognised:
     """Modes that it controls and that could not be recognised: they prove nothing."""
 
     text: str
-    """What an operator should know of it."""
+    """Remark for the operator."""
 
     response: float | None = None
-    """Median response of its modes over the drawing's; None: none was recognised."""
+    """Median response of its modes divided by the model's; None if no mode was recognised."""
 
     uneven: str = ""
-    """Which modes answer by far stronger or weaker than their neighbours; empty: none."""
+    """Modes whose response differs strongly from that of their neighbours; empty if there are none.
+    """
 
     alpha: Misregistration | None = None
-    """Registration that best explains the RTC's own matrix; None if the matrix does not tell it."""
+    """Registration that best explains the RTC's own matrix; None if the matrix does not determine
+    it."""
 
     weights: tuple[float, ...] = ()
     """Weight of each mode of the basis for the measurement of α, by how well the model explains
@@ -303,13 +306,13 @@ class MarginJudged:
     id: str
     verdict: GateVerdict
     alpha: Misregistration | None = None
-    """The registration it was judged at; None: not told."""
+    """Registration at which it was judged; None if unknown."""
 
     expected: ExpectedGain | None = None
-    """What a new one would win; None: not computed."""
+    """Gain expected from a new matrix; None if not computed."""
 
     judged: Judged | None = None
-    """What the verdict is of; None: not told."""
+    """Conditions of the verdict; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -320,7 +323,7 @@ class ProposalJudged:
     verdict: GateVerdict
     judged: Judged
     wanted: bool = True
-    """As it was in what asked for the verdict."""
+    """Value of ``wanted`` in the request for the verdict."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -337,7 +340,7 @@ class DitherSilent:
 
     id: str
     silent_s: float
-    """By the frames' own time."""
+    """Duration without a dither, by the frames' own time, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -350,7 +353,7 @@ class DitherMeasured:
 
     asked_m: float
     text: str
-    """What is otherwise; empty: nothing."""
+    """Difference from the request in words; empty if there is none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -428,5 +431,5 @@ def new_id(name: str, now_ns: int) -> str:
 
 
 def kebab(kind: type) -> str:
-    """Return the name of a kind of command or event, as it stands in ids: ``set-mode``."""
+    """Return the name of a kind of command or event in kebab case, as used in ids: ``set-mode``."""
     return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()

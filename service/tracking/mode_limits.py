@@ -1,4 +1,4 @@
-"""How many modes may be controlled for now, and modes in words."""
+"""Limits on the number of controlled modes, and descriptions of modes for people."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNEVEN, HEALTHY = 1.6, 1.3
-"""A mode that answers so many times as the modes beside it, or one over that, is named, where it
-certainly is beyond what healthy ones do; it may be controlled."""
+"""A mode whose response differs from that of its neighbours by the first factor or its inverse is
+reported if it certainly exceeds the second, which healthy modes do not exceed. It may still be
+controlled."""
 
 PERHAPS_UNEVEN = 1.45
 """From here on another window is asked."""
 
 CERTAIN = 3.0
-"""1 σ by which a ratio must lie beyond a limit to be certainly there."""
+"""A ratio is certainly beyond a limit if it exceeds it by this many σ."""
 
 NEIGHBOURS = 10
-"""Modes that one is compared with; a window of no more tells nothing of it."""
+"""Number of neighbours that a mode is compared with. A window with fewer dithered modes is not
+compared."""
 
 FARTHEST = 2 * NEIGHBOURS
 """Modes away that one of them may be: others have another optical gain."""
 
 MAX_WINDOWS = 3
-"""That compare a mode, before it is let be though none of them was certain."""
+"""Number of windows that compare a mode before it is accepted without a certain result."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +35,7 @@ class ModeLimit:
     """More modes than these gate, RTC or operator would not have; they are tried again later."""
 
     n_modes: int
-    """As many as may be controlled for now."""
+    """Number of modes that may be controlled at present."""
 
     since_ns_utc: int
     until_ns_utc: int
@@ -43,7 +45,7 @@ class ModeLimit:
     """From one to the other; doubled each time the limit is found again."""
 
     reason: str
-    """What was said of more: the words of the gate, the RTC or the operator."""
+    """Reason why more modes are not permitted, as the gate, the RTC or the operator gave it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,11 +62,11 @@ class ModeAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeRatio:
-    """How a mode answers beside its neighbours, where that is not as healthy ones do."""
+    """Response of a mode relative to its neighbours, if it differs from that of healthy modes."""
 
     mode: int
     ratio: float
-    """Its response over the median of the modes beside it, the mean of all windows."""
+    """Response divided by the median response of its neighbours, averaged over all windows."""
 
     sigma: float
     """1 σ of that."""
@@ -83,12 +85,12 @@ class ModeRatio:
 
     @property
     def stands_out(self) -> bool:
-        """Whether it may be uneven, and is certainly not like the others."""
+        """Return True if the mode may be uneven and certainly differs from the others."""
         return self._beyond(PERHAPS_UNEVEN) and self._certainly_beyond(1.0)
 
     @property
     def certain(self) -> bool:
-        """Whether it is uneven, as more than one window has it."""
+        """Return True if more than one window shows that the mode is uneven."""
         beyond = self._beyond(UNEVEN) and self._certainly_beyond(HEALTHY)
         return self.n_windows > 1 and beyond
 
@@ -101,16 +103,17 @@ class ModeRatio:
 
     @property
     def undecided(self) -> bool:
-        """Whether another window should tell."""
+        """Return True if another window must decide."""
         return self.stands_out and not self.certain and self.n_windows < MAX_WINDOWS
 
 
 def compare(
     modes: NDArray[np.intp], gains: NDArray[np.float64], sigma: NDArray[np.float64]
 ) -> dict[int, ModeRatio]:
-    """Return how each mode of one window answers beside those next to it in the basis.
+    """Compare the response of each mode in one window with those of its neighbours in the basis.
 
-    Optical gains change slowly from mode to mode; with few modes in a window nobody can tell.
+    Optical gains change slowly with the mode number. With few modes in a window there is nothing to
+    compare with.
     """
     found: dict[int, ModeRatio] = {}
     if len(modes) <= NEIGHBOURS:
@@ -134,7 +137,7 @@ def add_ratios(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeProof:
-    """Which modes have been seen to answer as the instrument file says, apart from any matrix."""
+    """Modes whose response was verified against the model, independently of any matrix."""
 
     proven: frozenset[int] = frozenset()
     """Seen in a dithered window: the sign, and the size within a factor of its neighbours'."""
@@ -149,28 +152,29 @@ class ModeProof:
     """Modes of the RTC's own matrix that could not be recognised in it."""
 
     answers: tuple[ModeAnswer, ...] = ()
-    """Of those contrary or suspected, in order."""
+    """Modes with a wrong or suspect response, in order."""
 
     uneven: frozenset[int] = frozenset()
-    """Certainly far stronger or weaker than the modes beside them, by two windows and more."""
+    """Modes with a response certainly far above or below that of their neighbours, in at least two
+    windows."""
 
     doubtful: tuple[ModeRatio, ...] = ()
-    """Perhaps so, in order: not proven before other windows have told."""
+    """Modes that may be uneven, in order. They are not verified before further windows decide."""
 
     compared: frozenset[int] = frozenset()
-    """Seen beside enough others to tell."""
+    """Modes that were dithered next to enough others for a comparison."""
 
     own_uneven: str = ""
-    """Which modes are so by the RTC's own matrix; empty: none."""
+    """Modes that are uneven in the RTC's own matrix, in words; empty if there are none."""
 
     shown: frozenset[int] = frozenset()
-    """Modes that a dither was asked for to see; empty: what it has shown is known."""
+    """Modes that the present dither verifies; empty if its result is known."""
 
     shown_ns_utc: int = 0
-    """When that was."""
+    """Time of that request."""
 
     n_tries: int = 0
-    """How often in a row that has told nothing of any of them."""
+    """Number of consecutive requests without a result for any of their modes."""
 
     session: str = ""
     """Session of the RTC in which the service before this one has seen it; empty: this one has."""
@@ -188,8 +192,8 @@ class ModeProof:
     matrix was read."""
 
     own_response_ratio: float | None = None
-    """Median over its modes of the response that the RTC's own matrix tells, over the drawing's;
-    None: no matrix has told."""
+    """Median over its modes of the response in the RTC's own matrix divided by the model's; None if
+    no matrix was read."""
 
     @property
     def n_proven(self) -> int:
@@ -198,7 +202,7 @@ class ModeProof:
 
     @property
     def contrary_modes(self) -> tuple[int, ...]:
-        """Modes that a dither has shown to answer otherwise: none of them is controlled anew."""
+        """Return the modes that a dither has found wrong; none of them is newly controlled."""
         return tuple(sorted(self.contrary))
 
 

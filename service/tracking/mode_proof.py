@@ -1,9 +1,9 @@
-"""Which modes have been seen to answer as the instrument file says.
+"""Verification of modes: their response must agree with the instrument file.
 
-A mode whose sign, place or size is another than the file says makes any loop diverge that begins
-to control it. The RTC's own matrix tells how those modes answer that it controls. All others are
-dithered once before a matrix commands them: many at a time, for no more is asked of each than its
-sign and its rough size.
+If the sign, order or size of a mode is wrong in the file, any loop that begins to control it
+diverges. The RTC's own matrix verifies the modes that it controls. Every other mode is dithered
+once before a matrix commands it. Many modes are dithered together, because only the sign and the
+rough size of each response is needed.
 """
 
 from __future__ import annotations
@@ -49,32 +49,34 @@ MIN_RESPONSE = 0.1
 """Slopes over the model's of any mode that a pyramid sees."""
 
 SIGNIFICANT = 4.0
-"""1 σ of a response by which it must lie on one side of a limit to be told."""
+"""A response lies on one side of a limit if it does so by this many σ."""
 
 MAX_AT_ONCE = 100
 """Modes that are shown together: each has a line of its own, and shares the budget."""
 
 MAX_BESIDE = 40
-"""Modes that weak lines show beside the first dither."""
+"""Largest number of modes that weak lines verify during the first dither."""
 
 FEWER = 4
-"""Divides that number after each dither that has told nothing: fewer modes are stronger."""
+"""Divisor of that number after each dither without a result: fewer modes get larger amplitudes."""
 
 CLOSEST_STEPS = 5
-"""Between two lines, in periods of the window: four tell them apart, rounding takes up to one."""
+"""Smallest spacing of two lines in inverse window lengths. Four separate them; rounding takes up to
+one."""
 
 TOLD_WITHIN_S = 15.0
-"""For what a dither has shown, from when it was asked for, besides the window itself."""
+"""Time for a result after a dither was requested, in addition to the window itself."""
 
 TRIES = 3
-"""That tell nothing, before modes are left alone for a while."""
+"""Number of dithers without a result after which modes are not tried for a while."""
 
 
 def proven_modes(state: TrackerState) -> frozenset[int]:
-    """Return the modes that are known to answer as the instrument file says.
+    """Return the modes whose response is known to agree with the instrument file.
 
-    Those of the matrix in use are, whatever a dither says of one: the RTC's own tells them, of the
-    service's only proven ones are controlled, and the loop runs with them.
+    The modes of the matrix in use count as verified even if a dither contradicts one of them. The
+    loop runs with them: the RTC's own matrix verifies its modes, and the service controls verified
+    modes only.
     """
     return state.matrices.mode_proof.proven | _controlled(state)
 
@@ -138,9 +140,10 @@ def awaits_proof(context: StepContext, rtc: Status) -> bool:
 
 
 def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[int, ...]:
-    """Return the modes that the next window should show; empty: none, or not now.
+    """Return the modes that the next window should verify; empty if there are none, or not now.
 
-    Where few are missing, modes that tell of α are added: a window must still measure it.
+    If few are missing, modes with much information on α are added, because the window must still
+    measure it.
     """
     state, registration = context.state, context.registration
     busy = state.on_probation or state.matrices.making_since_ns_utc is not None
@@ -164,9 +167,9 @@ def modes_to_show(context: StepContext, rtc: Status, window_s: float) -> tuple[i
 
 
 def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) -> list[int]:
-    """Return the free modes that weak lines show beside the first dither of those that tell of α.
+    """Return the free modes that weak lines verify during the first dither for α.
 
-    None beside one whose window was refused: few lines are found again soonest.
+    After a rejected window there are none: a dither with few lines is recovered soonest.
     """
     chosen = context.policy.mode_information is not None
     idle = context.operator.mode is Mode.HOLD or context.windows.run < 0
@@ -177,7 +180,7 @@ def modes_beside(context: StepContext, rtc: Status, telling: tuple[int, ...]) ->
 
 
 def _to_compare(context: StepContext, rtc: Status, shown: list[int]) -> list[int]:
-    """Return the modes beside those that may be uneven, and those that were never compared."""
+    """Return the neighbours of possibly uneven modes, and modes that were never compared."""
     state, proof = context.state, context.matrices.mode_proof
     controlled, odd = _controlled(state), proof.contrary | proof.suspected
     healthy = [m for m in range(rtc.n_modes) if m not in odd and m not in shown]
@@ -219,7 +222,7 @@ def lines_clear(context: StepContext, rtc: Status, window_s: float) -> tuple[flo
 
 
 def note_shown(context: StepContext, modes: tuple[int, ...]) -> None:
-    """Note that a dither has been asked for to see these modes."""
+    """Record that a dither was requested to verify these modes."""
     proof = context.matrices.mode_proof
     if (
         context.state.alarm(alarms.WORKER_BEHIND) is None
@@ -348,16 +351,16 @@ def restore_proof(context: StepContext, proof: ModeProof, session: str) -> None:
 
 
 def forget_session(context: StepContext) -> None:
-    """Believe nothing of what modes have shown in the session before: another RTC may be there.
+    """Discard what modes have shown in the previous session, because the RTC may be another.
 
-    What was restored waits for the RTC's status, which says whose it is.
+    Restored results wait for the RTC's status, which identifies the session.
     """
     if not context.matrices.mode_proof.session:
         context.matrices = replace(context.matrices, mode_proof=ModeProof())
 
 
 def believe_restored(context: StepContext, rtc: Status) -> None:
-    """Believe what the service before has seen of this RTC in this session; forget it of others."""
+    """Accept the results restored from before a restart if they are of this RTC and session."""
     proof = context.matrices.mode_proof
     if not proof.session:
         return
@@ -387,7 +390,7 @@ def _classify(
 
 
 def _limit_to_proven(context: StepContext, rtc: Status, bad: frozenset[int]) -> None:
-    """Control none of the modes that answer otherwise for a while, where one of them did anew."""
+    """Stop controlling modes with a wrong response for a while if one of them was newly found."""
     in_the_way = _contrary_in_the_way(context, rtc)
     if in_the_way and bad & shunned_modes(context.state):
         text = _contrary_in_words(context.matrices.mode_proof, in_the_way)
@@ -395,7 +398,7 @@ def _limit_to_proven(context: StepContext, rtc: Status, bad: frozenset[int]) -> 
 
 
 def contrary_text(context: StepContext) -> str | None:
-    """Return which modes that are to be controlled answer otherwise than the file says, or None."""
+    """Return a description of the modes to be controlled that contradict the file, or None."""
     if context.rtc is None:
         return context.alarm_text(alarms.MODES_CONTRARY)
     in_the_way = _contrary_in_the_way(context, context.rtc)
@@ -470,10 +473,9 @@ def give_up_unseen(context: StepContext, rtc: Status) -> None:
 
 
 def _missing_modes(context: StepContext, rtc: Status) -> list[int]:
-    """Return the modes that are wanted now, and that nobody has seen to answer.
+    """Return the modes that are needed now and not verified yet.
 
-    Those that one window has accused come first, whatever is wanted: an accusation is named, or it
-    is none.
+    Modes that one window has found wrong come first, so that the finding is confirmed or refuted.
     """
     proof, wanted = context.matrices.mode_proof, _wanted_modes(context, rtc)
     doubted = {one.mode for one in proof.doubtful} - _controlled(context.state)

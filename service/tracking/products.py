@@ -65,7 +65,7 @@ class Judged(ControlLaw):
     """
 
     session: str
-    """Of the RTC."""
+    """Session of the RTC."""
 
     alpha: Misregistration
     sigma: NDArray[np.float64]
@@ -80,13 +80,13 @@ class ReconstructorRecord:
     """Never reused."""
 
     state: MatrixState
-    """Where it is on its way."""
+    """State of the matrix."""
 
     n_modes: int
     """Modes it commands: the first ones of the basis."""
 
     created_ns_utc: int
-    """When it was computed."""
+    """Time of computation."""
 
     alpha: Misregistration | None = None
     """The registration it was computed for; None when the service did not make it."""
@@ -98,25 +98,26 @@ class ReconstructorRecord:
     """The reconstructor in use when it was computed, or the one a rollback copies."""
 
     sha256: str = ""
-    """Of the matrix as it travels, 64 lower-case hex digits."""
+    """Checksum of the matrix as transmitted, 64 lower-case hexadecimal digits."""
 
     condition_number: float | None = None
-    """Of the interaction matrix it inverts."""
+    """Condition number of the interaction matrix that it inverts."""
 
     gate: GateVerdict | None = None
     """The stability gate's latest verdict; None: not judged yet."""
 
     judged: Judged | None = None
-    """What that verdict is of, in this run of the service; None: nobody knows any more."""
+    """Conditions of that verdict, in this run of the service; None if they are unknown."""
 
     optical_gains: tuple[ModeGain, ...] = ()
-    """Measured when it was made, for the table of loop gains beside it; never folded in."""
+    """Optical gains measured when it was made, for the table of loop gains. They are never
+    multiplied into the matrix."""
 
     reason: str = ""
     """Why it is in this state: the RTC's or the operator's words."""
 
     published_ns_utc: int | None = None
-    """When it was sent; None: never."""
+    """Time at which it was sent; None if it was not."""
 
     applied_frame_seq: int | None = None
     """First frame whose slopes it multiplied; None: not applied, or before this service came."""
@@ -129,7 +130,7 @@ class ReconstructorRecord:
 
     @property
     def is_rtcs(self) -> bool:
-        """Whether its numbers are the RTC's own, brought by it or sent again."""
+        """Return True if its numbers are the RTC's own matrix."""
         return self.alpha is None
 
     @property
@@ -141,19 +142,19 @@ class ReconstructorRecord:
 
     @property
     def on_its_way(self) -> bool:
-        """Whether it was sent, and the RTC has not said what became of it."""
+        """Return True if it was sent and the RTC has not acknowledged or rejected it."""
         return self.state in _ON_ITS_WAY
 
     @property
     def was_used(self) -> bool:
-        """Whether it is in use, or was until another took its place."""
+        """Return True if it is in use, or was until another replaced it."""
         return self.state in _USED
 
     @classmethod
     def brought(cls, manifest: Manifest) -> ReconstructorRecord:
-        """Return what is known of a matrix the RTC brought with it.
+        """Return the record of a matrix that the RTC brought with it.
 
-        Its manifest may name an α, but nobody here can vouch for it.
+        Its manifest may name an α, which the service cannot verify.
         """
         return cls(
             id=manifest.id,
@@ -185,21 +186,21 @@ class Assessment:
     """Loss of the reconstructor in use against a new one, at one registration."""
 
     id: str
-    """Of the reconstructor in use then."""
+    """Id of the reconstructor in use at that time."""
 
     alpha: Misregistration
     """The registration it was computed for."""
 
     expected: ExpectedGain
     t_ns_utc: int
-    """When it came, by the service's clock."""
+    """Arrival time, by the service's clock."""
 
 
 class ModeSet(StrEnum):
     """Modes by what they are, instead of by index."""
 
     CONTROLLED = "controlled"
-    """Those in the loop."""
+    """Modes in the loop."""
 
     ALL = "all"
-    """Those of the basis."""
+    """Modes of the basis."""

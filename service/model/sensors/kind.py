@@ -1,7 +1,8 @@
-"""A kind of sensor: its table in an instrument file, its optics, its light.
+"""The interface of a kind of sensor: its table in an instrument file, its optics, its light.
 
-Whoever needs something of the sensor asks here; only the folder of a kind knows which one it is.
-What a kind does not have, it need not mention. Quick to import: mathematics come with the answers.
+All code that needs something specific to a sensor asks here; only the folder of a kind knows which
+kind it is. A kind omits what it does not have. Mathematics is imported inside the methods, because
+this module is loaded when a command line starts.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ if TYPE_CHECKING:
     from service.model.slopes import SlopeRecipe
 
     Term = float | NDArray[np.float64]
-    """Of the variance of slopes: one for all, or ``(n_signals,)``."""
+    """Variance of slopes: one value for all, or ``(n_signals,)``."""
 
 
 class SensorTable(Protocol):
-    """What ``[wfs]`` says whatever the kind: a dataclass that pydantic can read."""
+    """The part of ``[wfs]`` that every kind has: a dataclass that pydantic can read."""
 
     @property
     def n_subapertures(self) -> int:
@@ -45,20 +46,20 @@ class SensorTable(Protocol):
 
 
 class WorkingPoint:
-    """What the residual of a loop makes of the source; only the kind that found it looks inside."""
+    """Effect of a loop's residual on the source; its content is private to its kind."""
 
     __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Signals that are there, but tell something else than the model."""
+    """Signals that exist but do not measure what the model computes."""
 
     subapertures: NDArray[np.bool_]
     """``(n, n)`` [y, x], in the axes of conventions.md."""
 
     reason: str
-    """What they are, and the key that says so."""
+    """Description of the signals, with the key that excludes them."""
 
 
 class SensorKind(ABC):
@@ -68,17 +69,17 @@ class SensorKind(ABC):
     """``wfs.kind`` of an instrument file."""
 
     table: ClassVar[type[Any]]
-    """What ``[wfs]`` is read into, a ``SensorTable``."""
+    """Type of the ``[wfs]`` table, a ``SensorTable``."""
 
     unknown: ClassVar[Mapping[str, float | None]] = {}
-    """Keys of it that may be "unknown", and what is taken until a measured matrix tells; None where
-    a key that is not given means the same."""
+    """Keys that may be "unknown", with the value assumed until a measured matrix determines it;
+    None if a missing key means the same."""
 
     signals: ClassVar[tuple[SignalKind, ...]]
-    """What its subapertures give."""
+    """Kinds of signals of its subapertures."""
 
     normalised: ClassVar[bool] = False
-    """Whether signals are divided by a flux, by which one ``slopes.normalisation`` says."""
+    """True if signals are divided by a flux; ``slopes.normalisation`` selects which."""
 
     loses_gain: ClassVar[bool] = False
     """Whether it answers less the larger the residual wavefront is."""
@@ -88,7 +89,7 @@ class SensorKind(ABC):
     against 8 a pyramid's is biased by 0.02 % of a subaperture and 0.004 % of magnification."""
 
     edge_slips: ClassVar[bool] = False
-    """Whether it can take the mirror's edge for one a fringe away, and hold it there."""
+    """True if the sensor can lock on a mirror edge that is displaced by one wavelength."""
 
     def as_read(self, written: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return ``[wfs]`` as it is to be held against the table.
@@ -255,10 +256,10 @@ class SensorKind(ABC):
         return 1
 
     def fitted_key(self, sensor: Any) -> str | None:  # noqa: ANN401 - its own
-        """Return the key of a number that a measured matrix tells beside α, by its logarithm.
+        """Return the key of a sensor parameter that is fitted together with α, by its logarithm.
 
-        It is fitted with the registration, so that a wrong one in the file does not move α; None:
-        there is none.
+        Fitting it keeps a wrong value in the file from biasing α. None if there is no such
+        parameter.
         """
         return None
 
@@ -275,9 +276,9 @@ class SensorKind(ABC):
         """Return its class in AOT files, and the fields that only this class is given."""
 
     def image_sigma_subap(self, instrument: Instrument) -> float | None:
-        """Return how far each of several pupil images may lie beside its place, 1 σ, subapertures.
+        """Return the prior 1 σ of the position of each pupil image, in subapertures.
 
-        None if the sensor has one image of the pupil, or the file says where each of several lies.
+        None if the sensor has one pupil image, or if the file states the positions.
         """
         return None
 
@@ -344,7 +345,7 @@ class SensorKind(ABC):
         return None
 
     def light(self, instrument: Instrument) -> Light | CannotTell:
-        """Return how an instrument's light tells of the pupil, or that it does not."""
+        """Return what an instrument's light says of the pupil, or why it says nothing."""
         from service.model.sensors.sensor import CannotTell
 
         return CannotTell(reason=f"the light of a {self.name} does not tell where the pupil lies")

@@ -1,9 +1,9 @@
-"""A sensor with its pupil, its response to small wavefronts and its light, whatever its kind.
+"""A sensor with its pupil, its response to small wavefronts and its light, for any kind.
 
-Signals stand plane by plane, each plane over all valid subapertures in row-major order of the mask:
-Sx, then Sy, or whatever planes ``SignalKind`` has. In which order an RTC lists them, and how its
-axes lie, ``service.model.slopes`` says. Nobody outside holds the sensor's Jacobian K: ``apply`` may
-make it row by row of subapertures, and never have it whole.
+Signals are ordered plane by plane, each plane over all valid subapertures in row-major order of the
+mask: Sx, then Sy, or the planes of ``SignalKind``. ``service.model.slopes`` converts to the RTC's
+order and axes. The sensor's Jacobian K is never held as a whole: ``apply`` may compute it row by
+row of subapertures.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class RowsElsewhere:
     """A function of rows as what it is made from; all can be pickled."""
 
     parts: tuple[object, ...]
-    """What all matrices of a model have in common: instrument, modes. Sent once."""
+    """What all matrices of a model share: instrument, modes. It is sent to a cluster once."""
 
     prepare: Callable[..., Any]
     """Makes of the parts what is kept for the next matrix, too."""
@@ -64,7 +64,7 @@ _ROW_CHUNK = 512
 
 
 class Response(Protocol):
-    """What the sensor makes of small wavefronts, its image of the pupil at one place."""
+    """Response of the sensor to small wavefronts, for one position of its pupil image."""
 
     @property
     def light(self) -> NDArray[np.float64]:
@@ -79,8 +79,8 @@ class Response(Protocol):
     def apply(self, shapes: Shapes) -> Array:
         """Return the signals ``(n_signals, n_shapes)`` of wavefronts ``(n_points, n_shapes)``.
 
-        Wavefronts are in metres of OPD, at the lit points of the pupil. Local ones stand on the
-        right of a product like any others.
+        Wavefronts are in metres of OPD at the illuminated points of the pupil. Local ones are
+        multiplied like any others.
         """
 
     def with_shift_rates(self, shapes: Shapes) -> tuple[Array, Array, Array]:
@@ -99,7 +99,7 @@ class SeveralImages(Protocol):
 
 
 class Sensor(Protocol):
-    """A sensor with its pupil, as finely as somebody wants it."""
+    """A sensor with its pupil, at a given sampling."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -111,9 +111,9 @@ class Sensor(Protocol):
 
     @property
     def keeps_gradient(self) -> bool:
-        """Whether a response keeps what it has once found for the shapes that come next.
+        """Return True if the response caches intermediate results for further shapes.
 
-        Where it does not, shapes are better asked for together.
+        If it does not, it is cheaper to request all shapes together.
         """
 
     def at(self, shift: tuple[float, float]) -> Response:
@@ -125,7 +125,7 @@ class Sensor(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Work:
-    """What a computation takes, known before it begins."""
+    """Cost of a computation, estimated before it begins."""
 
     memory_bytes: float
     """At its largest, shapes and signals not counted."""
@@ -136,7 +136,7 @@ class Work:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fineness:
-    """How finely a sensor is computed, and by whom."""
+    """Sampling of the sensor, and where it is computed."""
 
     n_nodes: int = 3
     """Quadrature nodes along a side of a subaperture."""
@@ -151,15 +151,16 @@ class Fineness:
     """Spreads rows over threads."""
 
     kept_bytes: float = KEPT_BYTES
-    """What a response may keep for the shapes that come next; one that needs more keeps nothing."""
+    """Memory that a response may use to cache results for further shapes. A response that needs
+    more caches nothing."""
 
     arrays: Arrays = NUMPY
-    """What computes rows of a pyramid; sparse lenslets are SciPy's."""
+    """Array library for the rows of a pyramid; sparse lenslets use SciPy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PupilPosition:
-    """Where the image of the pupil lies."""
+    """Position of the pupil image."""
 
     at: tuple[float, float]
     """x and y of their centre from that of the sensor's grid, subapertures."""
@@ -170,7 +171,7 @@ class PupilPosition:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImageOffsets:
-    """How far each of several pupil images lies from its place on the pixel grid."""
+    """Displacement of each of several pupil images from its place on the pixel grid."""
 
     subap: NDArray[np.float64]
     """``(4, 2)`` along x and y, subapertures, of the images at -x -y, +x -y, -x +y, +x +y; their
@@ -185,7 +186,7 @@ class CannotTell:
     """The map does not say; a value, because it may well happen."""
 
     reason: str
-    """What was found, and what would help."""
+    """Description of what was found, and what would help."""
 
 
 class Light(Protocol):
@@ -193,7 +194,7 @@ class Light(Protocol):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the counts."""
+        """Shape of the counts."""
 
     def counts_of(self, flux: bytes) -> NDArray[Any]:
         """Return the counts that a status carries.

@@ -13,7 +13,7 @@ from cacao_bridge.settings import Settings, load_index, load_modes
 from pyrcal.rtc.identity import Identity, Reconstructor
 from service.errors import ConfigurationError
 from service.files.bundle import RECONSTRUCTOR, Place, read_bundle, why_not
-from service.wire import checked_id
+from service.wire import validate_id
 
 
 def apply(settings: Settings, path: Path) -> str:
@@ -29,7 +29,7 @@ def apply(settings: Settings, path: Path) -> str:
         If a stream that it needs is not there, or has another size.
     """
     bundle = read_bundle(path)
-    name = checked_id(bundle.id, f"the bundle {path}")
+    name = validate_id(bundle.id, f"the bundle {path}")
     index, modes, wire = load_index(settings), load_modes(settings), settings.wire
     parts = Parts(settings, index)
     place = Place(

@@ -86,7 +86,7 @@ def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
     session = link.open_session(endpoint)
     end_s = time.monotonic() + wait_s
     try:
-        while not (found := link.tokens(session, Keys.every_alive(Role.RTC))):
+        while not (found := link.tokens(session, Keys.all_alive(Role.RTC))):
             if time.monotonic() >= end_s:
                 return []
             time.sleep(0.2)

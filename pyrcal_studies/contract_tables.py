@@ -35,7 +35,7 @@ from service.wire import (
     StateMessage,
     Status,
 )
-from service.wire.codec import FourNumbers, may_be_absent, names_of
+from service.wire.codec import RegistrationNumbers, field_names, optional_keys
 from service.wire.matrices import MATRIX_LIMIT
 
 Row = tuple[str, str, str, str, str, str]
@@ -64,7 +64,7 @@ MESSAGES: Final[dict[str, type]] = {
 PARTS: Final[dict[str, type]] = {
     "status-dither": DitherRequest,
     "pointing": Pointing,
-    "alpha": FourNumbers,
+    "alpha": RegistrationNumbers,
 }
 """Maps inside of messages."""
 
@@ -128,7 +128,7 @@ def _rows(name: str, record: type) -> Iterator[Row]:
     bases = reversed(record.__mro__[:-1])
     texts = {key: text for base in bases for key, text in described(base).items()}
     known = {field.name: field.type for field in _info(record)}
-    for key in names_of(record):
+    for key in field_names(record):
         kind = known[key]
         if key == "request":
             continue
@@ -137,7 +137,7 @@ def _rows(name: str, record: type) -> Iterator[Row]:
             yield _DTYPE
             continue
         nil = "yes" if _optional(kind) else "no"
-        if key in may_be_absent(record):
+        if key in optional_keys(record):
             nil = "may be absent" if nil == "no" else "yes, or absent"
         yield (
             f"`{key}`",

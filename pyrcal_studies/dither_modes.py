@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.config import load_instrument
 from service.config.policy import policy_of
 from service.config.settings import Settings
-from service.control.dither import SPAN, information, most_informative
+from service.control.dither import N_MODES_ABOVE_LOOP, compute_information, select_informative_modes
 from service.model.interaction import RtcInteractionModel
 from service.model.misregistration import PARAMETERS
 from service.model.modes import modal_basis
@@ -34,7 +34,7 @@ def main() -> None:
     instrument = load_instrument("flao-lbt")
     basis = modal_basis(instrument)
     model = RtcInteractionModel(instrument, basis, pupil_sampling=3, detector_nodes=3)
-    known = information(model.linearise(instrument.start))
+    known = compute_information(model.linearise(instrument.start))
     wanted = policy_of(Settings()).dither_sigma
     rng = np.random.default_rng(0)
     rows = [
@@ -42,8 +42,8 @@ def main() -> None:
         "|---|---|---|---|---|---|---|",
     ]
     for first in FIRST:
-        above = np.arange(first, min(first + SPAN, len(known)))
-        own = most_informative(known, range(first, int(above[-1]) + 1), N_LINES, wanted)
+        above = np.arange(first, min(first + N_MODES_ABOVE_LOOP, len(known)))
+        own = select_informative_modes(known, range(first, int(above[-1]) + 1), N_LINES, wanted)
         spread = above[np.linspace(0, len(above) - 1, 2 * N_LINES + 1)[1::2].astype(int)]
         sets = [rng.choice(above, N_LINES, replace=False) for _ in range(N_SETS)]
         chosen = _sigma(known, np.array(own))

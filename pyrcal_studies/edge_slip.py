@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.gate import edge_motion_m
+from service.control.gate import compute_edge_motion_m
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.estimation.description import Actuators, edge_watch
@@ -104,7 +104,7 @@ def foreseen(case: Case, gain: float, model: InteractionModel) -> tuple[float, f
     actuators = actuators_of(model.instrument)
     outer = actuators.strokes[actuators.outer]
     loop = ControlLoop(gains=gains, leak=case.leak, delay_frames=2.0, frame_rate_hz=1.0)
-    motion = edge_motion_m(matrix, coupling, gains, outer, loop)
+    motion = compute_edge_motion_m(matrix, coupling, gains, outer, loop)
     return float(pole_radius(eigenvalues, leak=case.leak).max()), motion
 
 

@@ -20,7 +20,7 @@ from service.model.sensors.kind import SensorKind
 from service.model.sensors.registry import KINDS
 from service.tracking.alarms import ALARMS
 from service.wire import Keys
-from service.wire.access import Rights, rights_of
+from service.wire.access import Rights, list_rights
 
 Schema = Mapping[str, Any]
 
@@ -109,7 +109,7 @@ def access() -> str:
         "| --- | --- | --- |",
         *(
             f"| {role} | {words[right]} | {_below(keys, getattr(rights, right))} |"
-            for role, rights in rights_of(keys).items()
+            for role, rights in list_rights(keys).items()
             for right in words
             if getattr(rights, right)
         ),

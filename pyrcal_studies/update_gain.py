@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
+from service.control.expected_gain import (
+    ExpectedGain,
+    Sky,
+    estimate_slope_noise,
+    expected_gain,
+    extrapolate_variance_m2,
+)
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
 from service.files import parse_alpha
@@ -104,12 +110,12 @@ def predicted(
     instrument, turbulence = model.instrument, model.instrument.modes
     r0_m = fried_parameter_m(SEEING_ARCSEC)
     stronger = (turbulence.r0_m / r0_m) ** (5 / 3)
-    noise = noise_of_star(
+    noise = estimate_slope_noise(
         instrument, magnitude=float(given.mag), frame_rate_hz=1000.0, n_valid=model.n_slopes // 2
     )
     sky = Sky(
         variance_m2=model.basis.variance_m2 * stronger,
-        beyond_m2=beyond_m2(model.basis.variance_m2) * stronger,
+        beyond_m2=extrapolate_variance_m2(model.basis.variance_m2) * stronger,
         crossing_hz=given.wind / instrument.diameter_m,
         slope_noise=noise,
     )

@@ -19,7 +19,7 @@ from pyrcal_studies.campaign.observatory import Observatory
 from pyrcal_studies.campaign.system_measures import wavefront_rms_nm
 from service.config import load_instrument, load_settings
 from service.config.policy import policy_of
-from service.control.gate import FORGIVING_LEAK
+from service.control.gate import MAX_SLIP_SAFE_LEAK
 from service.runtime.worker import Compute, OpticsWorker
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -79,8 +79,8 @@ def leak(given: argparse.Namespace, bench: OpticsWorker) -> None:
     """Print what becomes of the modes while the leak is too weak for so many, and after."""
     night = night_of(given, [], {}, bench)
     night.advance(given.seconds / 4)
-    night.command(cmd.SetLoop(leak=FORGIVING_LEAK))
-    sys.stdout.write(f"{night.time_s:6.1f} s: the operator sets a leak of {FORGIVING_LEAK}\n")
+    night.command(cmd.SetLoop(leak=MAX_SLIP_SAFE_LEAK))
+    sys.stdout.write(f"{night.time_s:6.1f} s: the operator sets a leak of {MAX_SLIP_SAFE_LEAK}\n")
     night.advance(3 * given.seconds / 4)
     _tell(night)
     radii = np.array([swap.radius for swap in night.swaps if swap.radius is not None])

@@ -17,7 +17,7 @@ from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
 from service.files.whole import write_whole
-from service.wire import checked_id, checksum
+from service.wire import checksum, validate_id
 
 Provenance = str | int | float | bool | NDArray[Any]
 """What an HDF5 attribute can hold."""
@@ -215,7 +215,7 @@ class Store(Folder, Generic[Record]):
         WireError
             If the id is not one.
         """
-        checked_id(record.id, f"a {self.noun} to be stored")
+        validate_id(record.id, f"a {self.noun} to be stored")
         path, found = self.path_of(record.id), checksum(matrix)
         self._check_numbers(record, "a matrix", matrix, shape)
         if found != (sha256 or found):

@@ -233,8 +233,8 @@ def link_security(zenoh: ZenohTable, system: str) -> LinkSecurity:
         known = {"dictionary_file": _users_file(zenoh.users)}
         told[USERS] = {**_own_user(zenoh.users), **known}
     if not zenoh.connect:
-        named_by = "usernames" if zenoh.tls is None else "cert_common_names"
-        told["access_control"] = access_control(Keys(system), names, named_by=named_by)
+        subject_kind = "usernames" if zenoh.tls is None else "cert_common_names"
+        told["access_control"] = access_control(Keys(system), names, subject_kind=subject_kind)
     return LinkSecurity(
         zenoh=told,
         roles={name: str(role) for role, every in names.items() for name in every},

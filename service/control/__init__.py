@@ -1,1 +1,1 @@
-"""From registration to reconstructor: inversion, stability, gate. Pure numerics."""
+"""From registration to reconstructor: dither design, inversion, stability, gate; numerics only."""

@@ -1,13 +1,14 @@
-"""Choose a dither: modes, amplitude, length of windows, lines.
+"""Choice of a dither: modes, amplitude, length of windows, frequencies.
 
-**Which**: a mode whose waves are long answers a mirror that is far out of place almost as it
-should, so that steps lead home from afar; one whose waves are short says precisely where the
-mirror is once it is near. Near registration all modes see a shift equally well, but one of high
-azimuthal order tells a rotation twice as well as its neighbours, and one of high radial order the
-magnification. The loop is the other way round: far from registration it holds a few modes at most.
+**Modes.** Far from registration the response to a mode of low spatial frequency still resembles
+the model, so a fit converges from there. Near registration a mode of high spatial frequency is
+more precise. All modes then determine a shift equally well, but one of high azimuthal order
+determines a rotation twice as well as its neighbours, and one of high radial order the
+magnification. Without a known registration the loop is stable with a few modes at most.
 
-**How much and how often**: as little as keeps α as well known as it must be, by how precise a
-window of dither is. A table says so to begin with, then what the windows show.
+**Amplitude and interval.** The dither is as weak and as rare as the required σ of α allows. The
+precision κ of a window, ``σ = κ / (A sqrt(T))`` for a dither of RMS A over T seconds, is taken
+from a table at first and then from the windows themselves.
 """
 
 from __future__ import annotations
@@ -23,22 +24,25 @@ from service.model.interaction import Linearisation
 
 Array = NDArray[np.float64]
 
-STRENGTH = 2.0
-"""Of a burst: its own σ is the one asked for over this, where the budget allows."""
+BURST_PRECISION_RATIO = 2.0
+"""Required σ over the σ of one burst alone, if the budget allows it."""
 
-NEARLY_BEST = 1.1
-"""Where the walk is too fast for what is asked: σ may be this much above the best there is."""
+MAX_SIGMA_RATIO = 1.1
+"""Largest σ over the smallest that the budget allows, if α drifts too fast for the required σ."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DitherRequirement:
-    """The σ asked of the dither, and its budget."""
+    """Required σ of α, and the budget of the dither.
+
+    Numeric units are subapertures for the shifts, radians, and a ratio.
+    """
 
     sigma: Array
-    """``(4,)`` 1 σ of α to be kept at all times, numeric units, model error not included."""
+    """``(4,)`` largest 1 σ of α at any time, numeric units, model error not included."""
 
     drift_rate: Array
-    """``(4,)`` random walk σ after one second, numeric units: the flexure."""
+    """``(4,)`` 1 σ of the random walk of α after one second (flexure), numeric units."""
 
     budget_m: float
     """Largest RMS of all lines together on the mirror, metres OPD; never exceeded."""
@@ -47,48 +51,50 @@ class DitherRequirement:
     """Telemetry of one burst, in one window or several, seconds."""
 
     window_sigma: Array = field(default_factory=lambda: np.full(4, np.inf))
-    """``(4,)`` 1 σ that one window may have where it follows on the last without pause."""
+    """``(4,)`` largest 1 σ of one window of a dither without pauses, numeric units."""
 
     longest_s: float = np.inf
-    """From one burst to the next, whatever α does meanwhile, seconds."""
+    """Longest interval between the starts of two bursts, however stable α is, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Schedule:
-    """A dither of one burst every ``interval_s``."""
+    """Dither with one burst every ``interval_s``."""
 
     total_m: float
     """RMS of all lines together, metres OPD."""
 
     interval_s: float
-    """From the start of a burst to the start of the next; ``window_s``: no pause."""
+    """Interval between the starts of two bursts, seconds; without pauses it is ``window_s``."""
 
     sigma: Array
-    """``(4,)`` 1 σ of α just before each burst, which is when it is worst, numeric units."""
+    """``(4,)`` 1 σ of α just before each burst, which is its maximum, numeric units."""
 
     sufficient: bool
-    """Whether that is what was asked for; otherwise the budget is spent and it is the best."""
+    """True if the required σ is met; else the whole budget is used and σ is close to the best."""
 
 
-def schedule(precision: Array, requirement: DitherRequirement) -> Schedule:
-    """Return the schedule that keeps ``demand.sigma`` within the budget.
+def compute_schedule(precision: Array, requirement: DitherRequirement) -> Schedule:
+    """Return the weakest schedule that keeps ``requirement.sigma`` within the budget.
 
     ``precision`` ``(4,)`` is κ of ``σ = κ / (A sqrt(T))``, in numeric units times m sqrt(s), as
-    measured on the last windows. A burst of σ² = R every Δ seconds holds a random walk of rate q
-    at ``P² - q²Δ P - q²Δ R = 0`` before each update, so ``Δ = P² / (q² (P + R))``. Weak dither
-    often costs less than strong dither seldom, but leaves no pauses and no estimate that stands
-    alone: a burst is made ``STRENGTH`` times as precise as asked, which costs
-    ``sqrt(1 + STRENGTH²)`` of the least possible. Where the walk leaves no pause, the dither is no
-    stronger than brings σ within ``NEARLY_BEST`` of the best the budget could buy.
+    measured on the last windows. Bursts with σ² = R every Δ seconds keep a random walk of rate q
+    at a variance P before each update with ``P² - q²Δ P - q²Δ R = 0``, the steady state of a
+    Kalman filter. So ``Δ = P² / (q² (P + R))``.
+
+    Frequent weak bursts cost less than rare strong ones, but leave no pauses, and no burst is a
+    useful estimate by itself. Each burst is therefore made ``BURST_PRECISION_RATIO`` times as
+    precise as required, at ``sqrt(1 + BURST_PRECISION_RATIO²)`` times the least possible cost. If
+    α drifts too fast for any pause, the dither is no stronger than needed for a σ within
+    ``MAX_SIGMA_RATIO`` of the smallest that the budget allows.
     """
-    total_m = min(
-        _amplitude(precision, requirement, requirement.sigma / STRENGTH), requirement.budget_m
-    )
+    burst_sigma = requirement.sigma / BURST_PRECISION_RATIO
+    total_m = min(_amplitude(precision, requirement, burst_sigma), requirement.budget_m)
     interval_s = min(_longest_interval(precision, requirement, total_m), requirement.longest_s)
     if interval_s < requirement.window_s:
         interval_s = requirement.window_s
-        total_m = _without_pause(precision, requirement)
-    before = _variance_before(precision, requirement, total_m, interval_s)
+        total_m = _continuous_amplitude(precision, requirement)
+    before = _variance_before_update(precision, requirement, total_m, interval_s)
     return Schedule(
         total_m=total_m,
         interval_s=interval_s,
@@ -97,18 +103,20 @@ def schedule(precision: Array, requirement: DitherRequirement) -> Schedule:
     )
 
 
-def burst_s(
+def choose_burst_s(
     precision: Array, requirement: DitherRequirement, lengths_s: tuple[float, ...]
 ) -> float:
-    """Return the shortest burst that alone is as precise as asked, on the whole budget.
+    """Return the shortest burst that reaches the required σ alone, on the whole budget, seconds.
 
-    Of ``lengths_s``, shortest first. One in which α walks further than the noise of its estimate is
-    no use: the filter follows α better than that.
+    The burst is one of ``lengths_s``, which are in rising order. If none reaches it, the longest
+    useful one is returned.
     """
     for length_s, longer_s in pairwise(lengths_s):
         noise = precision**2 / (requirement.budget_m**2 * length_s)
         if np.all(noise <= requirement.sigma**2):
             return length_s
+        # A burst in which α drifts further than the noise of the estimate gains nothing over two
+        # shorter ones: the filter follows the drift, a fit over the burst averages it.
         lacking = noise > requirement.sigma**2
         walk = requirement.drift_rate**2 * longer_s
         if np.all(walk[lacking] > (noise * length_s / longer_s)[lacking]):
@@ -116,14 +124,15 @@ def burst_s(
     return lengths_s[-1]
 
 
-def window_s(
+def choose_window_s(
     precision: Array, requirement: DitherRequirement, usable: Array, lengths_s: tuple[float, ...]
 ) -> float:
-    """Return the shortest window in which the dither, on the whole budget, stands out of the noise.
+    """Return the shortest window whose estimate is not biased by noise, seconds.
 
-    Of ``lengths_s``, shortest first. Beyond a σ of ``usable`` ``(4,)`` in one window the noise in
-    the regressors biases the fit; many short windows tell as much as a long one otherwise, sooner,
-    and a lost frame or a changed matrix costs less of them.
+    The window is one of ``lengths_s``, which are in rising order; the whole budget is assumed. If
+    the σ of one window exceeds ``usable`` ``(4,)``, the noise in the regressors biases the fit.
+    Otherwise short windows are as precise together as a long one, they give the first estimate
+    sooner, and a lost frame or a swapped matrix costs less telemetry.
     """
     noise = [precision**2 / (requirement.budget_m**2 * length) for length in lengths_s]
     return next(
@@ -132,17 +141,17 @@ def window_s(
 
 
 def _amplitude(precision: Array, requirement: DitherRequirement, sigma: Array) -> float:
-    """Return the dither of which one window has no more than this ``sigma`` in any parameter."""
+    """Return the RMS of a dither of which one burst reaches ``sigma`` in all parameters, metres."""
     return float(np.max(precision / (sigma * np.sqrt(requirement.window_s))))
 
 
 def _longest_interval(precision: Array, requirement: DitherRequirement, total_m: float) -> float:
-    wanted = requirement.sigma**2
+    required = requirement.sigma**2
     noise = precision**2 / (total_m**2 * requirement.window_s)
-    return float(np.min(wanted**2 / (requirement.drift_rate**2 * (wanted + noise))))
+    return float(np.min(required**2 / (requirement.drift_rate**2 * (required + noise))))
 
 
-def _variance_before(
+def _variance_before_update(
     precision: Array, requirement: DitherRequirement, total_m: float, interval_s: float
 ) -> Array:
     walk = requirement.drift_rate**2 * interval_s
@@ -150,19 +159,21 @@ def _variance_before(
     return np.asarray(0.5 * (walk + np.sqrt(walk**2 + 4.0 * walk * noise)))
 
 
-def _without_pause(precision: Array, requirement: DitherRequirement) -> float:
-    """Return the weakest dither that, without pause, holds what is asked for or nearly the best.
+def _continuous_amplitude(precision: Array, requirement: DitherRequirement) -> float:
+    """Return the RMS of the weakest dither without pauses that is precise enough, metres.
 
-    Each of its windows tells what one alone must.
+    The filtered σ is the required one, or within ``MAX_SIGMA_RATIO`` of the best possible. The σ
+    of each window is at most ``requirement.window_sigma``.
     """
-    best = _variance_before(precision, requirement, requirement.budget_m, requirement.window_s)
-    allowed = np.maximum(requirement.sigma**2, NEARLY_BEST**2 * best)
-    noise = allowed**2 / (requirement.drift_rate**2 * requirement.window_s) - allowed
-    of_window = np.minimum(np.sqrt(noise), requirement.window_sigma)
-    return min(_amplitude(precision, requirement, of_window), requirement.budget_m)
+    budget_m, window_s = requirement.budget_m, requirement.window_s
+    best = _variance_before_update(precision, requirement, budget_m, window_s)
+    allowed = np.maximum(requirement.sigma**2, MAX_SIGMA_RATIO**2 * best)
+    noise = allowed**2 / (requirement.drift_rate**2 * window_s) - allowed
+    window_sigma = np.minimum(np.sqrt(noise), requirement.window_sigma)
+    return min(_amplitude(precision, requirement, window_sigma), budget_m)
 
 
-def clear_of(
+def place_lines(
     wanted_hz: tuple[float, ...],
     avoid_hz: tuple[float, ...],
     *,
@@ -170,11 +181,12 @@ def clear_of(
     step_hz: float,
     range_hz: tuple[float, float],
 ) -> tuple[float, ...] | None:
-    """Return dither lines as near to the wanted ones as vibrations allow, or None.
+    """Return dither frequencies as close to ``wanted_hz`` as vibrations allow; None if impossible.
 
-    Every line keeps ``clearance_hz`` from all of ``avoid_hz`` and from its fellows, no line is the
-    sum or difference of others (``f_i + f_j - f_k``, by ``step_hz`` times four), and each is a
-    multiple of ``step_hz`` so that a window holds whole periods.
+    Every line keeps ``clearance_hz`` from all of ``avoid_hz`` and from the other lines. No line is
+    within four ``step_hz`` of an intermodulation product ``f_i + f_j - f_k`` of others. Each line
+    is a multiple of ``step_hz``, so that a window holds whole periods and lines do not leak into
+    each other.
     """
     low, high = (np.ceil(range_hz[0] / step_hz), np.floor(range_hz[1] / step_hz))
     grid = step_hz * np.arange(low, high + 1)
@@ -186,7 +198,7 @@ def clear_of(
             float(f)
             for f in by_distance
             if all(abs(f - t) >= clearance_hz for t in taken)
-            and not _coincides(float(f), chosen, 4.0 * step_hz)
+            and not _is_intermodulation(float(f), chosen, 4.0 * step_hz)
         )
         found = next(free, None)
         if found is None:
@@ -195,11 +207,12 @@ def clear_of(
     return tuple(chosen)
 
 
-def _coincides(frequency: float, chosen: list[float], within_hz: float) -> bool:
-    """Return whether a line falls on a third-order product of those chosen, or makes one of them.
+def _is_intermodulation(frequency: float, chosen: list[float], within_hz: float) -> bool:
+    """Return True if a line and those chosen have an intermodulation product on one of them.
 
-    The pyramid is odd in the wavefront to lowest order, so products of three lines are what it
-    adds. Those chosen are clear of one another's.
+    The response of a pyramid is odd in the wavefront. The lowest order of its nonlinearity is the
+    third, which adds lines at ``f_i + f_j - f_k``. The chosen lines are clear of their own
+    products already, so only products that involve the new line, or fall on it, are checked.
     """
     lines = (*chosen, frequency)
     for first, second in combinations_with_replacement(lines, 2):
@@ -217,132 +230,151 @@ def _coincides(frequency: float, chosen: list[float], within_hz: float) -> bool:
     return False
 
 
-SPAN = 100
-"""Modes above the controlled ones that are looked at: further up, models of mirrors differ more."""
+N_MODES_ABOVE_LOOP = 100
+"""Number of modes above the controlled ones that may be dithered.
+
+Further up in the basis the models of mirrors differ more from the mirrors themselves.
+"""
 
 
-def information(linearisation: Linearisation) -> Array:
-    """Return the information of each mode on α, ``(n_modes, 4, 4)``, per metre² and unit noise.
+def compute_information(linearisation: Linearisation) -> Array:
+    """Return the Fisher information of each mode on α, ``(n_modes, 4, 4)``, per m² and unit noise.
 
-    The Fisher information of white slope noise, a free gain of the mode taken out:
-    ``J^T J`` with ``J_k = (I - P) dD/dα_k``, P the projection on the mode's own response.
+    The slope noise is white with σ = 1. The gain of each mode (optical gain) is a free parameter
+    of the fit, so only changes of shape count: ``J^T J`` with ``J_k = (I - P) dD/dα_k``, where P
+    projects on the mode's own response.
     """
     response, derivatives = linearisation.matrix, linearisation.derivatives
     n_modes = response.shape[1]
-    norm = _sums(response, response)
-    along = np.array([_sums(response, derivative) for derivative in derivatives])
+    norm = _column_products(response, response)
+    along = np.array([_column_products(response, derivative) for derivative in derivatives])
     full = np.empty((n_modes, len(derivatives), len(derivatives)))
     for k, one in enumerate(derivatives):
         for j, other in enumerate(derivatives[: k + 1]):
-            full[:, k, j] = full[:, j, k] = _sums(one, other)
+            full[:, k, j] = full[:, j, k] = _column_products(one, other)
     return np.asarray(full - np.einsum("km,lm->mkl", along, along) / norm[:, None, None])
 
 
-def _sums(one: NDArray[np.float32], other: NDArray[np.float32]) -> Array:
-    """Return the products of every two columns, ``(n_modes,)``."""
+def _column_products(one: NDArray[np.float32], other: NDArray[np.float32]) -> Array:
+    """Return the scalar product of each pair of equal columns, ``(n_modes,)``."""
     return np.asarray(np.einsum("sm,sm->m", one, other), dtype=np.float64)
 
 
-def most_informative(
+def select_informative_modes(
     information: Array, candidates: Sequence[int], n: int, wanted: Array
 ) -> tuple[int, ...]:
-    """Return the ``n`` modes that together come closest to every wanted σ ``(4,)``.
+    """Return the ``n`` modes whose common information comes closest to every wanted σ ``(4,)``.
 
-    Of all sets the one whose worst ratio of σ to ``wanted`` is smallest, found by exchange: from
-    evenly spread modes, each in turn gives way to the best other candidate until none does.
+    The set minimises the largest ratio of σ to ``wanted``. It is found by exchange: starting from
+    evenly spread candidates, each mode in turn is replaced by the best other one until no
+    exchange is better. Trying all sets is out of the question: 100 candidates have 4e6 sets of 4.
     """
     pool = [mode for mode in candidates if mode < len(information)]
     if len(pool) <= n:
         return tuple(pool)
     scaled = information * np.outer(wanted, wanted)
     chosen = [pool[k] for k in np.linspace(0, len(pool) - 1, n).round().astype(int)]
-    cost, improving = float(_worst(scaled[chosen].sum(axis=0))), True
+    cost, improving = float(_worst_variance_ratio(scaled[chosen].sum(axis=0))), True
     while improving:
         improving = False
         for place in range(n):
             kept = chosen[:place] + chosen[place + 1 :]
             others = [mode for mode in pool if mode not in kept]
-            costs = _worst(scaled[kept].sum(axis=0) + scaled[others])
+            costs = _worst_variance_ratio(scaled[kept].sum(axis=0) + scaled[others])
             best = int(np.argmin(costs))
             if costs[best] < cost * (1.0 - 1e-6):
                 chosen, cost, improving = [*kept, others[best]], float(costs[best]), True
     return tuple(sorted(chosen))
 
 
-def _worst(scaled: Array) -> Array:
-    """Return the largest variance of α over what is wanted, of sets ``(..., 4, 4)``.
-
-    A set that is blind to a combination of parameters has an enormous one.
-    """
+def _worst_variance_ratio(scaled: Array) -> Array:
+    """Return the largest ratio of variance to the wanted one, of sets ``(..., 4, 4)``."""
     power = np.diagonal(scaled, axis1=-2, axis2=-1)
     unit = np.sqrt(power[..., :, None] * power[..., None, :])
+    # The small diagonal keeps a set that is blind to a combination of parameters invertible; its
+    # variance is then enormous, and the exchange leaves it.
     correlation = scaled / unit + 1e-12 * np.eye(scaled.shape[-1])
     variances = np.diagonal(np.linalg.inv(correlation), axis1=-2, axis2=-1) / power
     return np.asarray(variances.max(axis=-1))
 
 
-MAX_LINES = 8
-FEWEST_LINES = 3
-"""Modes dithered at once: two fix neither four parameters nor whether they are right."""
+# --- dither of the open loop, for the acquisition of an unknown registration
 
-LINE_BAND = (0.2, 0.4)
-"""Of the frame rate: wind biases slower lines, and near half the rate there is no room beside."""
+MAX_LINES = 8
+"""Largest number of modes dithered at once with the loop open."""
+
+MIN_LINES = 3
+"""Smallest number; two modes neither determine four parameters nor show whether they agree."""
+
+LINE_BAND_RATIO = (0.2, 0.4)
+"""Range of dither frequencies over the frame rate.
+
+Below it turbulence carried by the wind biases the response; towards half the frame rate no room
+is left for the noise to be measured on both sides of a line.
+"""
 
 CLEARANCE_HZ = 21.0
-"""Between two lines: the noise is measured within 20 Hz of each."""
+"""Smallest distance between two lines; the noise of each is measured within 20 Hz of it."""
 
-FIRST_CLOSED = 150
-"""Modes a loop is first closed on: those a registration known to some per cent will carry."""
+FIRST_LOOP_MODES = 150
+"""Number of modes with which the loop is first closed.
+
+Such a loop is stable with a registration that is known to a few per cent.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Band:
-    """A band of modes that is dithered with the loop open."""
+    """Range of modes that is dithered with the loop open."""
 
     first: int
-    """Lowest mode, of a basis in which modes get finer."""
+    """Lowest mode, of a basis in order of rising spatial frequency."""
 
     last: int
+    """Highest mode, included."""
+
     floor: NDArray[np.float64]
-    """``(4,)`` 1 σ of the model's error with the loop open, numeric units: the response that an
-    uncorrected wavefront leaves is not the model's."""
+    """``(4,)`` 1 σ of the model error with the loop open, numeric units. The uncorrected wavefront
+    changes the response of the sensor, which the model does not contain."""
 
 
-SMOOTH = Band(
+COARSE_BAND = Band(
     first=0,
     last=28,
     floor=np.array([0.06, 0.06, np.deg2rad(0.25), 0.025]),
 )
-"""Leads from anywhere in the range."""
+"""Modes of low spatial frequency, with which a fit converges from the whole search range."""
 
-FINER = Band(
+FINE_BAND = Band(
     first=36,
     last=99,
     floor=np.array([0.02, 0.02, np.deg2rad(0.06), 0.008]),
 )
-"""Confirms with other modes, three times as precisely."""
+"""Other modes of higher spatial frequency, which confirm the first fit three times as precisely."""
 
 
-def modes_of(band: Band, n_modes: int, n_lines: int) -> tuple[int, ...]:
-    """Return the modes to dither, spread over a band; a short basis shares what it has.
+def spread_modes(band: Band, n_modes: int, n_lines: int) -> tuple[int, ...]:
+    """Return modes to dither, spread evenly over a band.
 
-    The bands of ``SMOOTH`` and ``FINER`` have no mode in common however short the basis is, as
-    long as it has twice as many modes as lines.
+    For a basis shorter than ``FINE_BAND`` both bands are scaled down together. They have no mode in
+    common as long as the basis has twice as many modes as there are lines, so that the second fit
+    remains independent of the first.
     """
-    scale = min(1.0, (n_modes - 1) / FINER.last)
+    scale = min(1.0, (n_modes - 1) / FINE_BAND.last)
     first, last = np.ceil(scale * band.first), np.floor(scale * band.last)
     spread = np.round(np.linspace(first, last, n_lines)).astype(int)
     return tuple(int(mode) for mode in np.unique(spread))
 
 
-def lines_of(frame_rate_hz: float, window_s: float, n_max: int) -> tuple[float, ...]:
-    """Return as many dither lines as the band has room for, at most ``most``; maybe too few.
+def spread_lines(frame_rate_hz: float, window_s: float, n_max: int) -> tuple[float, ...]:
+    """Return as many dither frequencies as fit into the band, at most ``n_max``.
 
-    Each is a whole number of periods of a window, and none is what the pyramid makes of others.
+    Empty if fewer than ``MIN_LINES`` fit. Each has a whole number of periods in a window, and none
+    is an intermodulation product of others.
     """
-    low, high = (share * frame_rate_hz for share in LINE_BAND)
-    for n_lines in range(min(n_max, MAX_LINES), FEWEST_LINES - 1, -1):
-        found = clear_of(
+    low, high = (share * frame_rate_hz for share in LINE_BAND_RATIO)
+    for n_lines in range(min(n_max, MAX_LINES), MIN_LINES - 1, -1):
+        found = place_lines(
             tuple(np.linspace(low, high, n_lines + 1)[:-1].tolist()),
             (),
             clearance_hz=CLEARANCE_HZ,
@@ -356,7 +388,7 @@ def lines_of(frame_rate_hz: float, window_s: float, n_max: int) -> tuple[float, 
 
 TABLE_MAGNITUDES = np.array([7.0, 10.0, 12.5])
 
-TABLE = (
+PRECISION_TABLE = (
     np.array(
         [
             [0.019, 0.019, np.deg2rad(0.084), 0.0042],
@@ -366,24 +398,29 @@ TABLE = (
     )
     * 1e-9
 )
-"""``(n_magnitudes, 4)`` κ of ``σ = κ / (A sqrt(T))``, numeric units times m sqrt(s), of four modes
-on the diffractive telescope at 1 kHz: of what the design study and docs/results/night.md found,
-the larger."""
+"""``(n_magnitudes, 4)`` κ of ``σ = κ / (A sqrt(T))``, numeric units times m sqrt(s).
+
+Measured with four modes on the simulated diffractive telescope at 1 kHz: the larger of the values
+of the design study and of docs/results/night.md.
+"""
 
 MEMORY_WINDOWS = 8.0
-"""Windows after which what was learnt is worth 1/e: fewer scatter, more are slow when the seeing
-changes."""
+"""Number of windows after which the weight of a measured precision is 1/e.
 
-RATIO_RANGE = (0.05, 20.0)
-"""Of a single window over the table: beyond it is the window that is odd."""
+With fewer the estimate scatters; with more it follows a change of the seeing too slowly.
+"""
+
+PRECISION_RATIO_RANGE = (0.05, 20.0)
+"""Range of the precision of one window over that of the table; a window beyond it is an outlier."""
 
 
-def tabulated(magnitude: float | None) -> Array:
-    """Return κ ``(4,)`` for a star before any window has been seen; None: the faintest row.
+def look_up_precision(magnitude: float | None) -> Array:
+    """Return κ ``(4,)`` of a star from the table, for use before the first window.
 
-    The noise of a faint star goes on growing as it does between the last two rows.
+    An unknown magnitude counts as the faintest row. Beyond it κ is extrapolated from the last two
+    rows, because the noise of a faint star keeps growing.
     """
-    m, logs = TABLE_MAGNITUDES, np.log(TABLE)
+    m, logs = TABLE_MAGNITUDES, np.log(PRECISION_TABLE)
     star = m[-1] if magnitude is None else max(float(magnitude), m[0])
     row = min(int(np.searchsorted(m, star, side="right")) - 1, len(m) - 2)
     share = (star - m[row]) / (m[row + 1] - m[row])
@@ -391,28 +428,28 @@ def tabulated(magnitude: float | None) -> Array:
     return kappa
 
 
-def measured_ratio(
+def compute_precision_ratio(
     covariance: Array, total_m: float, window_s: float, magnitude: float | None
 ) -> Array:
-    """Return the κ ``(4,)`` that one window shows, over that of the table.
+    """Return κ ``(4,)`` of one window over κ of the table.
 
     Parameters
     ----------
     covariance
-        ``(4, 4)`` of the window's estimate, from its own data, numeric units.
+        ``(4, 4)`` covariance of the window's estimate, from its own scatter, numeric units.
     total_m
-        RMS of all lines together as they were on the mirror, metres OPD.
+        RMS of all lines together as measured on the mirror, metres OPD.
     window_s
         Length of the window, seconds.
     magnitude
-        Of the star; None: not known.
+        Magnitude of the star; None if unknown.
     """
     kappa = np.sqrt(np.diag(covariance)) * total_m * np.sqrt(window_s)
-    return np.asarray(np.clip(kappa / tabulated(magnitude), *RATIO_RANGE))
+    return np.asarray(np.clip(kappa / look_up_precision(magnitude), *PRECISION_RATIO_RANGE))
 
 
-def forgetting_mean(mean: Array | None, n_windows: int, ratio: Array) -> Array:
-    """Return the quadratic mean of the ratios after one more, ``n_windows`` having gone before."""
+def update_mean_ratio(mean: Array | None, n_windows: int, ratio: Array) -> Array:
+    """Return the forgetting quadratic mean of ``n_windows`` ratios after one more, ``(4,)``."""
     if mean is None or n_windows == 0:
         return ratio
     share = max(1.0 / (n_windows + 1), 1.0 / MEMORY_WINDOWS)

@@ -1,22 +1,24 @@
-"""Calibration gain, optical gain and passes, kept apart.
+"""Calibration gains and optical gains of the modes.
 
-Three factors stand between the model's D and what a sensor shows, and none may hide in another:
+Three factors relate the response of the sensor to the model's D. They are kept apart, because each
+has another cause and goes somewhere else:
 
-- the **calibration gain** belongs to the measured matrix: how much larger the mirror's stroke is
-  than the model's, mode by mode. It is constant, on either side of 1, and goes into D:
-  ``D_tuned = D diag(g)``, the paper's last step.
-- the **optical gain** belongs to the sky: a pyramid in residual turbulence answers less than in
-  a flat wavefront. It is at most 1, changes with the seeing, and goes into the loop gains: the
-  table of them stands beside a reconstructor and is never folded into it.
-- **passes** belong to the scene: by day the light meets the mirror twice and every slope doubles.
-  It is stated, never part of D.
+- the **calibration gain** is the stroke of the mirror over that of the model, mode by mode. It is
+  constant, above or below 1, and goes into D: ``D_tuned = D diag(g)``, the last step of Heritier
+  et al. 2018.
+- the **optical gain** is the response of a pyramid in residual turbulence over that in a flat
+  wavefront. It is at most 1, changes with the seeing, and goes into the loop gains. Its table is
+  published with a reconstructor and never multiplied into it.
+- the **number of passes** is 2 if the light is reflected by the mirror twice, as with a daytime
+  source, so that every slope doubles. It is a setting and never part of D.
 
-The optical gain of every mode comes from that of a few. A pyramid in a residual of structure
-function D responds as behind an incoherent source of mutual coherence ``exp(-D/2)``: the logarithm
-of a mode's optical gain is the strength of the residual times a shape that the modulation and the
-mode's spatial frequency fix. The shape is read off the diffractive telescope
-(docs/results/optical_gain.md); its strength, a common factor and a smooth departure are found from
-the modes that were dithered, as a Gaussian process whose uncertainty grows away from them.
+The optical gain of all modes is inferred from that of the few that were dithered. A pyramid in a
+residual with structure function D responds as to an incoherent source of mutual coherence
+``exp(-D/2)``. The logarithm of a mode's optical gain is therefore the strength of the residual
+times a shape that depends on the modulation and the mode's spatial frequency. The shape was
+measured on the simulated diffractive telescope (docs/results/optical_gain.md). The strength, a
+common factor and a smooth departure from the shape are fitted as a Gaussian process, whose
+uncertainty grows with the distance from the dithered modes.
 """
 
 from __future__ import annotations
@@ -32,27 +34,27 @@ from service.errors import ModelError
 
 Array = NDArray[np.float64]
 
-_NEIGHBOURS = 25
-"""Measured modes whose median stands for one that was not measured."""
+_N_NEIGHBOURS = 25
+"""Number of nearest measured modes whose median gain is given to a mode without measurement."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CalibrationGains:
-    """Measured over modelled response, for every mode of the basis."""
+    """Measured over modelled response of every mode of the basis."""
 
     values: Array
-    """``(n_basis,)`` measured over the model's, passes divided out; near 1."""
+    """``(n_basis,)`` measured over modelled response in single pass; near 1."""
 
     measured: NDArray[np.bool_]
-    """``(n_basis,)`` whether the mode was measured; the others take their neighbours' median."""
+    """``(n_basis,)`` True for modes that were measured; others have the median of neighbours."""
 
     @classmethod
     def of_modes(
         cls, gains: NDArray[Any], modes: NDArray[np.intp], n_basis: int
     ) -> CalibrationGains:
-        """Extend the gains ``(n,)`` of the measured ``modes`` to a basis of ``n_basis``.
+        """Extend the gains ``(n,)`` of the measured ``modes`` to a basis of ``n_basis`` modes.
 
-        Beyond the reference the mirror is taken to answer as at the nearest measured modes.
+        A mode that was not measured has the median gain of the nearest measured ones.
 
         Raises
         ------
@@ -83,10 +85,15 @@ class CalibrationGains:
         return cls(values=values, measured=measured)
 
     def tuned(self, interaction_matrix: NDArray[Any]) -> NDArray[Any]:
-        """Return ``D diag(g)``: the model's columns with the stroke the mirror really has.
+        """Return ``D diag(g)``, the model's matrix scaled to the measured stroke of each mode.
 
-        ``interaction_matrix`` is ``(n_slopes, n_modes)``, the first modes of the basis, of a
-        single pass; so is the result.
+        ``interaction_matrix`` ``(n_slopes, n_modes)`` has the first modes of the basis in single
+        pass; so has the result.
+
+        Raises
+        ------
+        ModelError
+            If the matrix has more modes than the gains.
         """
         n_modes = interaction_matrix.shape[1]
         if n_modes > len(self.values):
@@ -100,7 +107,7 @@ class CalibrationGains:
 
 def _nearby_median(mode: int, known: NDArray[np.intp], gains: Array) -> float:
     """Return the median gain of the measured modes nearest in number."""
-    nearest = np.argsort(np.abs(known - mode), kind="stable")[:_NEIGHBOURS]
+    nearest = np.argsort(np.abs(known - mode), kind="stable")[:_N_NEIGHBOURS]
     return float(np.median(gains[nearest]))
 
 
@@ -108,89 +115,100 @@ REFERENCE_MODES = (0, 12, 20, 36, 64, 112, 150, 195, 257, 340, 449, 501, 593)
 REFERENCE_GAINS = (
     0.516, 0.511, 0.504, 0.502, 0.543, 0.578, 0.608, 0.628, 0.648, 0.681, 0.710, 0.722, 0.787,
 )  # fmt: skip
-"""Optical gains of FLAO's modes at 1" of seeing: the shape."""
+"""Optical gains of FLAO's ``REFERENCE_MODES`` at 1" of seeing, which define the shape.
+
+Measured on the simulated diffractive telescope (docs/results/optical_gain.md).
+"""
 
 STRENGTH_SIGMA = 0.5
-"""1 σ of the residual's strength before anything is measured: 1 is the reference's."""
+"""Prior 1 σ of the strength of the residual; the reference has strength 1."""
 
 COMMON_SIGMA = 0.05
-"""Of a factor common to all modes: the mirror's stroke, the model's absolute scale."""
+"""Prior 1 σ of a factor common to all modes: mirror stroke, absolute scale of the model."""
 
 SHAPE_SIGMA = 0.06
-"""Of a smooth departure from the shape, far from any measured mode."""
+"""Prior 1 σ of a smooth departure from the shape, far from any measured mode."""
 
 SHAPE_SCALE = 0.7
-"""Over which such a departure changes, in units of the logarithm of the mode's number."""
+"""Correlation length of that departure, in the natural logarithm of the mode number."""
 
-MIN_SIGMA = 0.02
-"""Of one measured mode, relative: the response is not diagonal."""
+MIN_RELATIVE_SIGMA = 0.02
+"""Smallest relative 1 σ of a measured gain, because the response of the sensor is not diagonal."""
 
-TWO_PASSES_ABOVE = 1.1
-"""A median above this is light that met the mirror twice: twice an optical gain."""
+MAX_SINGLE_PASS_GAIN = 1.1
+"""Largest median optical gain in single pass; above it the light has met the mirror twice."""
 
-FACTOR_BOUNDS = (0.5, 2.0)
-"""No mode's loop gain is changed by more than these against the mean of all."""
+GAIN_FACTOR_RANGE = (0.5, 2.0)
+"""Range of a mode's loop gain over the mean of all modes."""
 
-GATE_SIGMA = 2.0
-GATE_SWING = 0.05
-"""Relative swing of the gain with the seeing, from one window to the next."""
+GATE_GAIN_SIGMAS = 2.0
+"""Number of σ above the estimated optical gain at which the gate requires stability."""
+
+GAIN_SWING = 0.05
+"""Relative 1 σ of the change of the optical gain with the seeing between two windows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeGain:
-    """The optical gain of one mode, followed over the windows that dithered it."""
+    """Optical gain of one mode, averaged over the windows in which it was dithered."""
 
     mode: int
     """0-based basis index."""
 
     gain: float
-    """Modulus of the sensor's response over the model's."""
+    """Modulus of the measured over the modelled response."""
 
     sigma: float
-    """1 σ of it at ``t_ns_utc``."""
+    """1 σ of ``gain`` at ``t_ns_utc``."""
 
     scatter: float
-    """1 σ of a single window, as the windows themselves scattered."""
+    """1 σ of a single window, from the scatter of the windows."""
 
     t_ns_utc: int
-    """End of the last window that held this mode."""
+    """End of the last window in which the mode was dithered, ns since the Unix epoch, UTC."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GainTable:
-    """The optical gain of the first modes of the basis, and what loop gains undo it."""
+    """Optical gains of the first modes of the basis, and the loop gains that compensate them."""
 
     optical_gain: Array
-    """``(n_modes,)`` how much of the model's response the sensor shows; up to 2 by day."""
+    """``(n_modes,)`` measured over modelled response; up to 2 in double pass."""
 
     relative_sigma: Array
-    """``(n_modes,)`` 1 σ of it, as a share of it."""
+    """``(n_modes,)`` 1 σ of ``optical_gain``, relative."""
 
     @property
     def factors(self) -> Array:
-        """``(n_modes,)`` by which to multiply one loop gain for all: mean 1, bounded."""
+        """Factors ``(n_modes,)`` on a common loop gain, of mean 1 before they are clipped."""
         inverse = 1.0 / self.optical_gain
-        return np.asarray(np.clip(inverse / inverse.mean(), *FACTOR_BOUNDS))
+        return np.asarray(np.clip(inverse / inverse.mean(), *GAIN_FACTOR_RANGE))
 
     @property
     def highest(self) -> Array:
-        """``(n_modes,)`` optical gain that a loop must bear: two σ up, with the seeing's swing."""
-        sigma = np.hypot(self.relative_sigma, GATE_SWING)
-        return np.asarray(self.optical_gain * np.exp(GATE_SIGMA * sigma))
+        """Optical gain ``(n_modes,)`` with which a loop must be stable: 2 σ and the swing above."""
+        sigma = np.hypot(self.relative_sigma, GAIN_SWING)
+        return np.asarray(self.optical_gain * np.exp(GATE_GAIN_SIGMAS * sigma))
 
     def loop_gains(self, in_effect: float) -> Array:
-        """Return ``(n_modes,)`` integrator gains that act as about ``in_effect`` on every mode."""
+        """Return integrator gains ``(n_modes,)`` whose product with the optical gain is uniform.
+
+        The product is about ``in_effect`` for every mode.
+        """
         mean = in_effect * float(np.mean(1.0 / self.optical_gain))
         return np.asarray(mean * self.factors)
 
 
 def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
-    """Return the table of the first ``n_modes`` modes; nothing measured: what is expected.
+    """Return the optical gains of the first ``n_modes`` modes, inferred from the measured ones.
+
+    The posterior of the Gaussian process of the module's docstring. Without measurements it is the
+    prior, the reference at 1" of seeing.
 
     Raises
     ------
     ModelError
-        If a gain is not a positive number.
+        If a gain is not positive, or a σ is negative.
     """
     modes = np.array([gain.mode for gain in measured], dtype=np.intp)
     found = np.array([gain.gain for gain in measured])
@@ -201,13 +219,18 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
             "positive numbers"
         )
     everywhere = np.arange(n_modes)
-    passes = 2.0 if len(found) and np.median(found) > TWO_PASSES_ABOVE else 1.0
-    expected, covariance = _expected(everywhere) + np.log(passes), _covariance(everywhere, modes)
-    variance = np.diag(_covariance(everywhere, everywhere)).copy()
+    passes = 2.0 if len(found) and np.median(found) > MAX_SINGLE_PASS_GAIN else 1.0
+    expected, covariance = (
+        _reference_log_gain(everywhere) + np.log(passes),
+        _prior_covariance(everywhere, modes),
+    )
+    variance = np.diag(_prior_covariance(everywhere, everywhere)).copy()
     if len(modes):
-        noise = (spread / found) ** 2 + MIN_SIGMA**2
-        weights = np.linalg.solve(_covariance(modes, modes) + np.diag(noise), covariance.T).T
-        expected = expected + weights @ (np.log(found) - np.log(passes) - _expected(modes))
+        noise = (spread / found) ** 2 + MIN_RELATIVE_SIGMA**2
+        weights = np.linalg.solve(_prior_covariance(modes, modes) + np.diag(noise), covariance.T).T
+        expected = expected + weights @ (
+            np.log(found) - np.log(passes) - _reference_log_gain(modes)
+        )
         variance -= np.einsum("ij,ij->i", weights, covariance)
     return GainTable(
         optical_gain=np.exp(expected),
@@ -215,14 +238,14 @@ def gain_table(measured: Sequence[ModeGain], n_modes: int) -> GainTable:
     )
 
 
-def _expected(modes: NDArray[np.intp]) -> Array:
-    """Return the logarithm of the reference's optical gain of these modes."""
+def _reference_log_gain(modes: NDArray[np.intp]) -> Array:
+    """Return the logarithm of the reference's optical gain of these modes, interpolated."""
     place = np.log1p(np.array(REFERENCE_MODES))
     return np.asarray(np.interp(np.log1p(modes), place, np.log(REFERENCE_GAINS)))
 
 
-def _covariance(one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
-    """Return the prior covariance of the logarithms, ``(len(one), len(other))``."""
-    strength = STRENGTH_SIGMA**2 * np.outer(_expected(one), _expected(other))
+def _prior_covariance(one: NDArray[np.intp], other: NDArray[np.intp]) -> Array:
+    """Return the prior covariance of log optical gains, ``(len(one), len(other))``."""
+    strength = STRENGTH_SIGMA**2 * np.outer(_reference_log_gain(one), _reference_log_gain(other))
     apart = (np.log1p(one)[:, None] - np.log1p(other)) / SHAPE_SCALE
     return np.asarray(strength + COMMON_SIGMA**2 + SHAPE_SIGMA**2 * np.exp(-0.5 * apart**2))

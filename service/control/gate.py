@@ -1,12 +1,15 @@
-"""The stability gate: refuse a matrix that may be unstable.
+"""Stability gate: accept or refuse a reconstructor before it is sent to the RTC.
 
-It asks two things of a loop, over the whole range in which α may be. Its poles must stay inside
-the unit circle with a margin. And slope noise must not move the outer ring of the mirror too far:
-poles do not see that the outermost actuators, half in the dark, are driven by noise. Where an
-excursion reaches a quarter of the wavelength the pyramid may lose the edge to the next fringe, and
-a loop without leak never brings it back. On the diffractive telescope every such loop slipped above
-300 nm per unit of slope noise, one at 201 nm and none below (docs/results/edge_slip.md), while pole
-radii said nothing.
+A reconstructor has to pass two tests over the whole range α ± 3σ.
+
+**Poles.** All closed-loop poles must be inside the unit circle with a margin.
+
+**Edge slip.** Slope noise must not move the outermost ring of actuators too far. These actuators
+are hardly illuminated, so noise drives them, which pole radii do not show. If such a motion
+reaches a quarter of the wavelength, a pyramid may lock the edge of the mirror on the next fringe,
+and a loop without leak never recovers. On the simulated diffractive telescope every loop without
+leak slipped above 300 nm per unit of slope noise, one at 201 nm, and none below
+(docs/results/edge_slip.md).
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.control.loop import ControlLoop, loop_modes
+from service.control.loop import ControlLoop, find_eigenmodes
 from service.model.interaction import Linearisation
 from service.model.misregistration import Misregistration
 
@@ -25,49 +28,52 @@ Array = NDArray[np.float64]
 Coupling = NDArray[np.float32]
 Symmetric = NDArray[np.floating]
 
-NEAR = 0.02
-"""Where everything is within the bound the largest radius is sought no closer than this: each point
-costs as much as all bounds together."""
+RADIUS_TOLERANCE = 0.02
+"""Accuracy of the largest pole radius of an accepted reconstructor.
 
-ROUNDING = 1e-3
-"""Of eigenvalues in single precision, and of a radius between two points of a border."""
+The eigenvalues of one registration cost as much as the bounds of all of them, so registrations
+that cannot raise the result by more than this are skipped.
+"""
 
-_BORDER = 24
-"""Points on each side of a rectangle."""
+EIGENVALUE_TOLERANCE = 1e-3
+"""Relative error of eigenvalues in single precision; also of a radius between two border points."""
 
-_MANY = 1000
-"""Modes from which on a proven bound is cheaper than all eigenvalues."""
+_N_SIDE_POINTS = 24
+"""Number of points on each side of the rectangle on whose border the pole radius is evaluated."""
+
+_N_MODES_FOR_BOUNDS = 1000
+"""Number of modes from which a proven bound is cheaper than all eigenvalues."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateVerdict:
-    """Whether a reconstructor would hold the loop, over the whole range α may be in."""
+    """Verdict of the gate on a reconstructor, over the whole range of α."""
 
     accepted: bool
     """True only if every pole, everywhere within α ± 3σ, stays inside the bound."""
 
     worst_pole_radius: float
-    """Largest closed-loop pole radius found; 1 is the edge of stability. Of what is accepted no
-    pole is beyond the bound, and none more than ``NEAR`` above this."""
+    """Largest closed-loop pole radius; 1 is the edge of stability. If the reconstructor is
+    accepted, the true maximum is below the bound and at most 0.02 above this value."""
 
     aligned_pole_radius: float
-    """The same for a perfect reconstructor at these gains: nothing can do better."""
+    """Pole radius of a perfect reconstructor at these gains, the smallest that is possible."""
 
     bound: float
     """Largest radius that would have been accepted."""
 
     n_points: int
-    """Registrations tried."""
+    """Number of registrations considered."""
 
     reason: str
-    """What the operator should know, and do when it was refused."""
+    """Explanation for the operator; with what to do if the reconstructor was refused."""
 
     edge_motion_m: float | None = None
-    """Largest RMS motion of an outer actuator for slope noise of 1, metres; None: not known."""
+    """Largest RMS motion of an outer actuator for slope noise of 1, metres; None if unknown."""
 
     @property
     def unstable(self) -> bool:
-        """Whether a loop grows somewhere: 1 is the edge of stability."""
+        """True if some loop within α ± 3σ has a pole on or outside the unit circle."""
         return self.worst_pole_radius >= 1.0
 
 
@@ -80,45 +86,63 @@ def judge(
     *,
     bound: float,
 ) -> GateVerdict:
-    """Return whether the loop would hold everywhere within α ± 3σ.
+    """Return the verdict on a reconstructor for all registrations within α ± 3σ.
 
-    Tries the estimate and the ends of the axes of its 3σ ellipsoid, eight, or twelve where the
-    anamorphosis is followed: ``covariance`` ``(4, 4)`` or ``(6, 6)`` includes the model-error
-    floor, and ``linearisation`` has as many derivatives. The bound is never tighter than half-way
-    between the aligned loop and the edge of stability, or a slow loop could never be served at all.
-    A loop that is stable must not let its outer ring slip either (:func:`edge_motion_m`); as many
-    modes as hold already may move it a little more, or the noise of α would cost modes. Modes
-    without gain are not in the loop, and have no say: their command only fades.
+    The loop is evaluated at α and at both ends of the axes of the 3σ ellipsoid.
+
+    Parameters
+    ----------
+    reconstructor
+        ``(n_controlled, n_slopes)``.
+    linearisation
+        The model's D(α) with its derivatives.
+    registration
+        Estimate of α.
+    covariance
+        Covariance of α, model error included: ``(4, 4)``, or ``(6, 6)`` with anamorphosis.
+    loop
+        The loop in which the reconstructor will run.
+    bound
+        Largest pole radius to accept. If a perfect reconstructor in a slow loop already comes
+        close to it, the limit is half-way between its radius and 1.
     """
+    # The limit of edge motion is a round figure. A loop that runs with as many modes and does not
+    # slip may exceed it slightly; otherwise the noise of α would take modes away at every update.
     holds = len(reconstructor) == loop.n_holding
-    reconstructor, linearisation, loop = _moving(reconstructor, linearisation, loop)
+    reconstructor, linearisation, loop = _drop_modes_without_gain(
+        reconstructor, linearisation, loop
+    )
     n = len(reconstructor)
     centre = reconstructor @ linearisation.matrix_at(registration)[:, :n]
     rates = linearisation.rates[: len(covariance)]
-    covariance = covariance[: len(rates), : len(rates)]  # of a matrix that knows no stretch
+    # A linearisation without stretches has four derivatives, even if six parameters are tracked.
+    covariance = covariance[: len(rates), : len(rates)]
     slopes = [reconstructor @ rate[:, :n] for rate in rates]
     gains = (loop.gains * loop.optical_gain).astype(np.float32)
     steps = _ellipsoid_ends(covariance).astype(np.float32)
     aligned = float(loop.pole_radius(gains).max())
     bound = max(bound, (1.0 + aligned) / 2)
     worst = _worst_pole(centre, np.array(slopes), steps, gains, loop, min(bound, 1.0))
-    stable = _verdict(worst, aligned, bound, 1 + 2 * len(steps))
+    stable = _make_verdict(worst, aligned, bound, 1 + 2 * len(steps))
     if loop.outer is None or not stable.accepted:
         return stable
-    motion_m = edge_motion_m(reconstructor, centre, gains.astype(float), loop.outer, loop)
-    slippery = why_slippery(motion_m, loop.leak, holds=holds)
+    motion_m = compute_edge_motion_m(reconstructor, centre, gains.astype(float), loop.outer, loop)
+    refusal = check_edge_motion(motion_m, loop.leak, holds=holds)
     return replace(
         stable,
-        accepted=slippery is None,
-        reason=slippery or stable.reason,
+        accepted=refusal is None,
+        reason=refusal or stable.reason,
         edge_motion_m=motion_m,
     )
 
 
-def _moving(
+def _drop_modes_without_gain(
     reconstructor: NDArray[np.float32], linearisation: Linearisation, loop: ControlLoop
 ) -> tuple[NDArray[np.float32], Linearisation, ControlLoop]:
-    """Return what is left of them without the modes that have no gain; all have none: all."""
+    """Return the arguments restricted to modes with a gain, or unchanged if no mode has one.
+
+    A mode without gain is not in the loop: its command only decays with the leak.
+    """
     modes = np.flatnonzero(loop.gains)
     if len(modes) in {0, len(loop.gains)}:
         return reconstructor, linearisation, loop
@@ -128,7 +152,7 @@ def _moving(
         derivatives=linearisation.derivatives[:, :, modes],
         stretches=None if linearisation.stretches is None else linearisation.stretches[:, :, modes],
     )
-    return reconstructor[modes], linearisation, loop.of(modes)
+    return reconstructor[modes], linearisation, loop.select_modes(modes)
 
 
 def _worst_pole(
@@ -141,95 +165,103 @@ def _worst_pole(
 ) -> float:
     """Return the largest pole radius at the centre and at both ends of every step.
 
-    Points are tried in the order of what :func:`_ceilings` says they may reach at most. The rest is
-    left out when none of it can matter: it stays within the limit, and no more than ``NEAR`` above
-    what was found; or one was found beyond the limit. Of many modes a point's own ceiling, lower
-    than that of a sum, is asked before all of its eigenvalues.
+    The points are taken in falling order of the upper bounds from :func:`_bound_radii`. The search
+    ends when a radius exceeds ``limit``, or when no remaining point can exceed it or be more than
+    ``RADIUS_TOLERANCE`` above the largest radius so far.
     """
     moves = np.tensordot(steps, slopes, axes=1)
     ends = [np.zeros_like(centre), *moves, *-moves]
-    ceilings = _ceilings(centre, moves, gains, loop)
+    upper_bounds = _bound_radii(centre, moves, gains, loop)
     worst = 0.0
-    for k in np.argsort(-ceilings):
-        enough = max(worst, min(limit, worst + NEAR))
-        if worst > limit or ceilings[k] <= enough:
+    for k in np.argsort(-upper_bounds):
+        irrelevant = max(worst, min(limit, worst + RADIUS_TOLERANCE))
+        if worst > limit or upper_bounds[k] <= irrelevant:
             break
-        there = centre + ends[k]
-        if worst > 0.0 and len(there) >= _MANY:
-            own, *_ = _ceilings(there, moves[:0], gains, loop)
-            if own <= enough:
+        coupling = centre + ends[k]
+        if worst > 0.0 and len(coupling) >= _N_MODES_FOR_BOUNDS:
+            # The bound of the sum itself is tighter than the sum of two bounds, and for many modes
+            # it is still much cheaper than all eigenvalues.
+            own, *_ = _bound_radii(coupling, moves[:0], gains, loop)
+            if own <= irrelevant:
                 continue
-        radii = loop.pole_radius(np.linalg.eigvals(gains[:, None] * there))
+        radii = loop.pole_radius(np.linalg.eigvals(gains[:, None] * coupling))
         worst = max(worst, float(radii.max()))
     return worst
 
 
-def _ceilings(
+def _bound_radii(
     centre: Coupling, moves: Coupling, gains: Coupling, loop: ControlLoop
 ) -> NDArray[np.float64]:
-    """Return radii that no pole exceeds: at the centre, and at both ends of every move.
+    """Return upper bounds of the pole radius at the centre and at both ends of every move.
 
-    Eigenvalues of ``g R D`` are those of ``B = √g R D √g``. They lie in a rectangle about its
-    numerical range: real parts between the extreme eigenvalues of ``(B + B^T) / 2``, imaginary
-    ones within the norm of ``(B - B^T) / 2``; of a sum of two it is at most the sum of both. The
-    largest pole of a region lies on its border, for a spectral radius is subharmonic.
+    The eigenvalues of ``g R D`` are those of ``B = √g R D √g``. They are inside a rectangle around
+    the numerical range of B: real parts between the extreme eigenvalues of ``(B + B^T) / 2``,
+    imaginary parts within the norm of ``(B - B^T) / 2``. The rectangle of a sum of two matrices is
+    within the sum of their rectangles. The pole radius is a subharmonic function of the eigenvalue,
+    so its maximum over a rectangle is on the border.
     """
-    if gains.min() < 0.0:
+    if gains.min() < 0.0:  # √g does not exist
         return np.full(1 + 2 * len(moves), np.inf)
     root = np.sqrt(gains)
-    own, *parts = (_extent(root[:, None] * part * root) for part in (centre, *moves))
+    own, *parts = (_bound_numerical_range(root[:, None] * part * root) for part in (centre, *moves))
     extents = [own, *(own + part for part in parts)]
     extents += [own + np.array([-high, -low, turn]) for low, high, turn in parts]
-    return np.array([_largest_on_border(extent, loop) for extent in extents])
+    return np.array([_largest_radius_on_border(extent, loop) for extent in extents])
 
 
-def _extent(matrix: Coupling) -> NDArray[np.float64]:
-    """Return least and largest real part and largest imaginary part of the numerical range.
+def _bound_numerical_range(matrix: Coupling) -> NDArray[np.float64]:
+    """Return smallest and largest real part and largest imaginary part of the numerical range.
 
-    Of many modes they are bounds, about ``ROUNDING`` further out.
+    For many modes these are bounds that are wider by about ``EIGENVALUE_TOLERANCE``.
     """
     even, odd = (matrix + matrix.T) / 2, (matrix - matrix.T) / 2
     square = odd.T @ odd
-    if len(matrix) < _MANY:
-        (low, high), (_, most) = _ends(even), _ends(square)
-    else:  # Lanczos hardly finds the least of a square: it takes thousands of steps
-        (low, high), most = _proven_ends(even), _proven_largest(square)
+    if len(matrix) < _N_MODES_FOR_BOUNDS:
+        (low, high), (_, most) = _extreme_eigenvalues(even), _extreme_eigenvalues(square)
+    else:  # the smallest eigenvalue of a square is not needed and costs Lanczos thousands of steps
+        (low, high), most = _bound_eigenvalues(even), _bound_largest_eigenvalue(square)
     turn = np.sqrt(max(most, 0.0))
-    slack = ROUNDING * max(abs(low), abs(high), turn)
+    slack = EIGENVALUE_TOLERANCE * max(abs(low), abs(high), turn)
     return np.array([low - slack, high + slack, turn + slack], dtype=np.float64)
 
 
-def _ends(symmetric: Symmetric) -> tuple[float, float]:
-    """Return the least and the largest eigenvalue."""
+def _extreme_eigenvalues(symmetric: Symmetric) -> tuple[float, float]:
+    """Return the smallest and the largest eigenvalue."""
     values = np.linalg.eigvalsh(symmetric)
     return float(values[0]), float(values[-1])
 
 
-def _proven_ends(symmetric: Symmetric) -> tuple[float, float]:
-    """Return what no eigenvalue is below, and none above."""
-    return -_proven_largest(-symmetric), _proven_largest(symmetric)
+def _bound_eigenvalues(symmetric: Symmetric) -> tuple[float, float]:
+    """Return a lower bound of all eigenvalues and an upper one."""
+    return -_bound_largest_eigenvalue(-symmetric), _bound_largest_eigenvalue(symmetric)
 
 
-def _proven_largest(symmetric: Symmetric) -> float:
-    """Return what no eigenvalue exceeds, at a tenth of the cost of all of them.
+def _bound_largest_eigenvalue(symmetric: Symmetric) -> float:
+    """Return a proven upper bound of all eigenvalues, at a tenth of the cost of computing them.
 
-    Lanczos guesses the largest. That none lies beyond is proven: the matrix that is left of so many
-    times the identity has a Cholesky factor. A guess that is too low is raised until it has, up to
-    the largest sum of a row's sizes, which needs no proof.
+    Lanczos iterations estimate the largest eigenvalue, but may miss it. An estimate λ is proven by
+    a Cholesky factorisation of ``λ I - A``, which exists only if no eigenvalue of A exceeds λ. If
+    it fails, λ is raised, at most to the largest absolute row sum (Gershgorin), which needs no
+    proof.
     """
-    surely = float(np.abs(symmetric).sum(axis=0).max())
+    row_sum = float(np.abs(symmetric).sum(axis=0).max())
     typical = float(np.linalg.norm(symmetric)) / len(symmetric) ** 0.5
     start = np.random.default_rng(0).standard_normal(len(symmetric)).astype(symmetric.dtype)
     try:
         largest = float(
             scipy.sparse.linalg.eigsh(
-                symmetric, k=1, which="LA", v0=start, tol=ROUNDING, return_eigenvectors=False
+                symmetric,
+                k=1,
+                which="LA",
+                v0=start,
+                tol=EIGENVALUE_TOLERANCE,
+                return_eigenvectors=False,
             )[0]
         )
     except scipy.sparse.linalg.ArpackError:
-        return surely
-    margin: float = ROUNDING * max(abs(largest), typical)
-    while largest + margin < surely:
+        return row_sum
+    margin: float = EIGENVALUE_TOLERANCE * max(abs(largest), typical)
+    while largest + margin < row_sum:
         rest = -symmetric
         rest[np.diag_indices_from(rest)] += largest + margin
         try:
@@ -238,28 +270,28 @@ def _proven_largest(symmetric: Symmetric) -> float:
             margin *= 2.0
         else:
             return largest + margin
-    return surely
+    return row_sum
 
 
-def _largest_on_border(extent: NDArray[np.float64], loop: ControlLoop) -> float:
+def _largest_radius_on_border(extent: NDArray[np.float64], loop: ControlLoop) -> float:
     low, high, turn = extent
-    along, up = np.linspace(low, high, _BORDER), np.linspace(0.0, turn, _BORDER)
+    along, up = np.linspace(low, high, _N_SIDE_POINTS), np.linspace(0.0, turn, _N_SIDE_POINTS)
     border = np.concatenate([along + 1j * turn, low + 1j * up, high + 1j * up])
     radii = loop.pole_radius(border)
-    return float(radii.max()) + ROUNDING
+    return float(radii.max()) + EIGENVALUE_TOLERANCE
 
 
 def _ellipsoid_ends(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return one end of each of the 3σ axes, a row each; the other is its negative.
+    """Return one end of each axis of the 3σ ellipsoid, one per row; the other is its negative.
 
-    The axes are those of the correlation matrix, so that units play no part.
+    The axes are those of the correlation matrix, so that they do not depend on units.
     """
     sigma = np.sqrt(np.diag(covariance))
     power, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     return np.asarray(3.0 * (axes * np.sqrt(np.maximum(power, 0.0))).T * sigma)
 
 
-def _verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateVerdict:
+def _make_verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateVerdict:
     if worst >= 1.0:
         reason = (
             f"unstable: worst pole radius {worst:.3f} within 3 sigma; use fewer modes, a lower "
@@ -282,21 +314,27 @@ def _verdict(worst: float, aligned: float, bound: float, n_points: int) -> GateV
     )
 
 
-LIMIT_M = 195e-9
-"""Largest motion of an outer actuator per unit of slope noise that a loop without leak bears."""
+MAX_EDGE_MOTION_M = 195e-9
+"""Largest motion of an outer actuator per unit of slope noise in a loop without leak, metres.
 
-HELD_LIMIT_M = 199e-9
-"""The same of a loop that runs and holds with as many modes. No loop has slipped that close: the
-limit is a round figure, and to turn back for a nanometre of it costs 24 nm of wavefront where 45
-modes become 30."""
+The smallest motion with a slip was 201 nm (docs/results/edge_slip.md).
+"""
 
-FORGIVING_LEAK = 0.99
-"""A leak as strong as this brings a slipped segment back within a tenth of a second."""
+MAX_HELD_EDGE_MOTION_M = 199e-9
+"""The same for a loop that runs with as many modes and does not slip.
 
-_N_FREQUENCIES = 256
+No loop slipped so close to 195 nm, which is a round figure. To refuse a matrix for a nanometre
+cost 24 nm of wavefront error where 45 modes became 30.
+"""
+
+MAX_SLIP_SAFE_LEAK = 0.99
+"""Largest leak factor with which a slipped segment recovers, within a tenth of a second."""
+
+_N_NOISE_FREQUENCIES = 256
+"""Number of frequencies in the mean over half of the unit circle."""
 
 
-def edge_motion_m(
+def compute_edge_motion_m(
     reconstructor: NDArray[np.float32],
     coupling: NDArray[np.float32],
     gains: Array,
@@ -305,39 +343,41 @@ def edge_motion_m(
 ) -> float:
     """Return the largest RMS motion of an outer actuator for white slope noise of 1, metres.
 
-    ``coupling`` ``(n, n)`` is R D(α); ``gains`` ``(n,)`` is integrator times optical gain;
-    ``outer`` is as a ``ControlLoop`` has it. In the eigenbasis of ``g R D = V Λ V^-1`` the command
-    answers noise by
-    ``H_i = z^-d / (1 - leak z^-1 + λ_i z^-d)``, so that its covariance is ``V (N o <H H*>) V*``
-    with ``N`` that of ``V^-1 g R n`` and the mean taken over the unit circle.
+    ``coupling`` ``(n, n)`` is R D(α), ``gains`` ``(n,)`` integrator gain times optical gain, and
+    ``outer`` the field of :class:`ControlLoop`. In the eigenbasis of ``g R D = V Λ V^-1`` the
+    transfer function from noise to command is ``H_i = z^-d / (1 - leak z^-1 + λ_i z^-d)``. The
+    covariance of the command is ``V (N o <H H*>) V*``, with N that of ``V^-1 g R n`` and the mean
+    taken over the unit circle.
     """
-    eigenvalues, vectors = loop_modes(gains[:, None] * coupling.astype(float))
+    eigenvalues, vectors = find_eigenmodes(gains[:, None] * coupling.astype(float))
     commanded = gains[:, None] * reconstructor.astype(float)
-    # V^-1 S V^-H of the real n by n S: the slopes are many, and complex they would cost most of all
+    # N = V^-1 S V^-H from the real (n, n) S. There are more slopes than modes, so the product with
+    # complex V^-1 would be the most expensive step if it came first.
     driven = commanded @ commanded.T
-    seen = outer[:, : len(gains)]
+    ring = outer[:, : len(gains)]
     if vectors is not None:
         driven = np.linalg.solve(vectors, np.linalg.solve(vectors, driven).conj().T)
-        seen = seen @ vectors
-    turns = np.pi * (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
+        ring = ring @ vectors
+    turns = np.pi * (np.arange(_N_NOISE_FREQUENCIES) + 0.5) / _N_NOISE_FREQUENCIES
     delayed = np.exp(-1j * turns * loop.delay_frames)[:, None]
     response = delayed / (1.0 - loop.leak * np.exp(-1j * turns)[:, None] + eigenvalues * delayed)
-    # conjugate pairs of eigenvalues make the other half of the circle the conjugate of this one
-    covariance = driven * (response.T @ response.conj() / _N_FREQUENCIES)
-    power = np.einsum("ai,ai->a", seen @ covariance, seen.conj()).real
+    # Half of the circle is enough: eigenvalues come in conjugate pairs, so that the other half is
+    # the complex conjugate of this one.
+    covariance = driven * (response.T @ response.conj() / _N_NOISE_FREQUENCIES)
+    power = np.einsum("ai,ai->a", ring @ covariance, ring.conj()).real
     return loop.noise * float(np.sqrt(power.max()))
 
 
-def why_slippery(motion_m: float, leak: float, *, holds: bool = False) -> str | None:
-    """Return why a loop with this motion of its edge must not be closed, or None.
+def check_edge_motion(motion_m: float, leak: float, *, holds: bool = False) -> str | None:
+    """Return the reason to refuse a loop whose edge moves by ``motion_m``, None if there is none.
 
-    ``holds``: it is closed already with as many modes and these gains, and does not slip.
+    ``holds`` is True if the loop runs already with as many modes and these gains and does not slip.
     """
-    limit_m = HELD_LIMIT_M if holds else LIMIT_M
-    if motion_m <= limit_m or leak <= FORGIVING_LEAK:
+    limit_m = MAX_HELD_EDGE_MOTION_M if holds else MAX_EDGE_MOTION_M
+    if motion_m <= limit_m or leak <= MAX_SLIP_SAFE_LEAK:
         return None
     return (
-        f"its outer ring would slip: {motion_m * 1e9:.0f} nm of motion per unit of slope noise, "
-        f"{limit_m * 1e9:.0f} at most without a leak of {FORGIVING_LEAK}; use fewer modes, a lower "
-        "gain or more leak"
+        f"its outer ring would slip: noise moves it by {motion_m * 1e9:.0f} nm per unit of slope "
+        f"noise, the limit is {limit_m * 1e9:.0f} nm; use fewer modes, a lower gain, or a leak of "
+        f"{MAX_SLIP_SAFE_LEAK} or less"
     )

@@ -155,7 +155,7 @@ class Outbox:
             if offer is None:
                 raise UnknownIdError("nothing to offer")
             return offer.commit
-        index = None if part is None else wire.chunk_index(part, "a query")
+        index = None if part is None else wire.parse_chunk_index(part, "a query")
         return self.answer(keys.matrix_id_of(key), index, now_s)
 
     def _forget(self, now_s: float) -> None:

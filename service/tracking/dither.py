@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.control.dither import forgetting_mean, measured_ratio
+from service.control.dither import compute_precision_ratio, update_mean_ratio
 from service.estimation.lockin import LockInEstimate
 from service.estimation.random_dither import RandomEstimate
 from service.tracking import alarms, dither_plan, mode_proof
@@ -229,11 +229,11 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
     if len(estimate.modes) > N_LINES:
         return  # not the modes that tell most of α
     if estimate.dither_m > 0.0:
-        ratio = measured_ratio(
+        ratio = compute_precision_ratio(
             estimate.covariance, estimate.dither_m, estimate.window_s, rtc.magnitude
         )
         n_windows = 0 if before is None else before.n_windows
-        mean = forgetting_mean(None if before is None else before.ratio, n_windows, ratio)
+        mean = update_mean_ratio(None if before is None else before.ratio, n_windows, ratio)
         precision = Precision(ratio=mean, n_windows=n_windows + 1)
         _set_policy(context, replace(context.dither_policy, precision=precision))
 

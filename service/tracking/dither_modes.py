@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from service.control.dither import SPAN, most_informative
-from service.control.loop import amplification
+from service.control.dither import N_MODES_ABOVE_LOOP, select_informative_modes
+from service.control.loop import compute_amplification
 from service.tracking.policy import Policy
 from service.wire import DitherRequest, Status
 
@@ -36,16 +36,17 @@ def chosen_modes(
     """Return the modes to dither: the settings' own, or the best for α.
 
     These are four above the controlled modes. Where fewer are left they are four of the highest
-    ``SPAN``, in the loop or not: the last of a basis tell little of a rotation, and answer least as
-    the model says. Until the model is known they are spread evenly, or the last four. None is
-    ``shunned``, which answers otherwise than the model says, but where there is no choice.
+    ``N_MODES_ABOVE_LOOP``, in the loop or not: the last of a basis tell little of a rotation, and
+    answer least as the model says. Until the model is known they are spread evenly, or the last
+    four. None is ``shunned``, which answers otherwise than the model says, but where there is no
+    choice.
     """
     fixed = _without_choice(rtc, policy, shunned)
     if fixed is not None:
         return fixed
     first = _first_free(rtc, policy)
     if policy.mode_information is not None:
-        return _telling(policy, first, min(first + SPAN, rtc.n_modes), shunned)
+        return _telling(policy, first, min(first + N_MODES_ABOVE_LOOP, rtc.n_modes), shunned)
     step = max(1, min(20, (rtc.n_modes - first) // (N_LINES + 1)))
     return tuple(first + step // 2 + step * line for line in range(N_LINES))
 
@@ -70,7 +71,7 @@ def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] 
         return 1.0
     gains = np.outer([rtc.gains[mode] for mode in modes], _OPTICAL_GAINS).ravel()
     lines = _MANY_LINES if chosen else np.array(LINE_FRACTIONS)
-    found = amplification(
+    found = compute_amplification(
         gains[:, None], lines, leak=rtc.leak, delay_frames=max(rtc.delay_frames, 1.0)
     )
     return max(float(np.sqrt(np.mean(found**2, axis=-1)).max()), 1.0)
@@ -101,7 +102,7 @@ def _without_choice(
         return None
     if policy.mode_information is None:
         return tuple(range(max(rtc.n_modes - N_LINES, 0), rtc.n_modes))
-    highest = max(rtc.n_modes - SPAN, 0)
+    highest = max(rtc.n_modes - N_MODES_ABOVE_LOOP, 0)
     return _telling(policy, highest, rtc.n_modes, shunned)[: rtc.max_dither_modes]
 
 
@@ -111,7 +112,7 @@ def _telling(policy: Policy, first: int, stop: int, shunned: frozenset[int]) -> 
     if policy.mode_information is None:
         return ()
     among = [mode for mode in range(first, stop) if mode not in shunned]
-    return most_informative(policy.mode_information, among, N_LINES, policy.dither_sigma)
+    return select_informative_modes(policy.mode_information, among, N_LINES, policy.dither_sigma)
 
 
 def _first_free(rtc: Status, policy: Policy) -> int:

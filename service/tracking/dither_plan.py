@@ -11,8 +11,8 @@ from service.control import dither
 from service.control.dither import (
     DitherRequirement,
     Schedule,
-    schedule,
-    tabulated,
+    compute_schedule,
+    look_up_precision,
 )
 from service.estimation.loop import why_open
 from service.estimation.windows import SETTLING_S
@@ -117,10 +117,10 @@ def choose_next(context: StepContext, rtc: Status) -> tuple[WantedDither, Dither
     requirement = _requirement(context, rtc, kappa)
     window_s = requirement.window_s
     sittings = tuple(n * window_s for n in SITTING_LADDER)
-    sparse = replace(requirement, window_s=dither.burst_s(kappa, requirement, sittings))
+    sparse = replace(requirement, window_s=dither.choose_burst_s(kappa, requirement, sittings))
     phase, reason, next_ns = _next_window(context, sparse)
     requirement = sparse if phase is DitherPhase.SPARSE else requirement
-    found = schedule(kappa, requirement)
+    found = compute_schedule(kappa, requirement)
     plan = _plan(state, found, requirement, window_s, phase)
     shown: tuple[int, ...] = ()
     no_matrix = state.matrices.in_use is None or mode_proof.unknown_loop(state, rtc)
@@ -243,7 +243,7 @@ def _plan(
 
 def precision(state: TrackerState, rtc: Status) -> NDArray[np.float64]:
     """Return κ ``(4,)`` of ``σ = κ / (A sqrt(T))`` as far as it has been learnt."""
-    table, learnt = tabulated(rtc.magnitude), state.dithers.policy.precision
+    table, learnt = look_up_precision(rtc.magnitude), state.dithers.policy.precision
     return table if learnt is None else table * learnt.ratio
 
 
@@ -305,7 +305,9 @@ def _requirement(
     lengths = window_lengths_s(policy)
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
-    return replace(requirement, window_s=dither.window_s(kappa, requirement, USABLE, lengths))
+    return replace(
+        requirement, window_s=dither.choose_window_s(kappa, requirement, USABLE, lengths)
+    )
 
 
 def _lasting_s(phase: DitherPhase) -> float:

@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.dither import Schedule, clear_of
+from service.control.dither import Schedule, place_lines
 from service.errors import CommandError, ModelError
 from service.estimation.demodulation import SIDE_OFFSETS_HZ
 from service.estimation.lockin import LockInPlan
@@ -233,7 +233,7 @@ def clear_lines(rtc: Status, n_lines: int, choice: DitherParameters) -> tuple[fl
     wanted = tuple(fraction * rate for fraction in fractions)
     band = (max(LINE_RANGE[0] * rate, edge), min(LINE_RANGE[1] * rate, rate / 2 - edge))
     for clearance_hz in (*CLEARANCES_HZ, 4.0 * step):
-        found = clear_of(
+        found = place_lines(
             wanted, choice.avoid_hz, clearance_hz=clearance_hz, step_hz=step, range_hz=band
         )
         if found is not None:

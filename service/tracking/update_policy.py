@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.expected_gain import explained_by_noise
+from service.control.expected_gain import estimate_noise_loss_m
 from service.estimation.loop import SAME_DELAY, SAME_LEAK, same_gains
 from service.model.misregistration import Misregistration, step_text
 from service.tracking.mode_limits import ModeLimit
@@ -156,7 +156,7 @@ def _gain_reason(
         return None
     step, covariance = since
     found, raised = last.expected, _raised(in_use, now_ns)
-    win_m = found.loss_m - explained_by_noise(found.loss_m, step, covariance)
+    win_m = found.loss_m - estimate_noise_loss_m(found.loss_m, step, covariance)
     if win_m > policy.update_gain_m * raised:
         return f"a new one is expected to win {win_m * 1e9:.2f} nm over {in_use.id}"
     share = _margin_lost(last)

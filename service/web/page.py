@@ -29,7 +29,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from typing_extensions import override
 
-from service.control.gate import LIMIT_M
+from service.control.gate import MAX_EDGE_MOTION_M
 from service.errors import BusyError, UnknownIdError
 from service.estimation.frames import FrameBlock
 from service.model.instrument import Instrument, Mirror
@@ -205,7 +205,7 @@ async def mirror(service: ServiceDep) -> Response:
             stop=instrument.stop,
             nominal=instrument.start,
             tolerance=service.policy.update_threshold,
-            edge_limit_m=LIMIT_M,
+            edge_limit_m=MAX_EDGE_MOTION_M,
             actuators=_actuators(instrument),
         )
     )

@@ -1,9 +1,9 @@
-"""Bytes <-> records: version 1 of the contract with an RTC.
+"""Messages of the contract with an RTC, version 1: records to bytes and back.
 
-``encode(record)`` turns a frozen record into bytes, ``decode(kind, data)`` does the reverse and
-refuses whatever breaks the contract with a :class:`~service.errors.WireError`. The refusal's text
-begins with ``missing``, ``v``, ``id`` or ``range``, so an RTC can put it into the ``reason`` of a
-reply. Nothing here knows zenoh, and nothing is ever unpickled.
+``encode(record)`` returns the bytes of a frozen record. ``decode(kind, data)`` returns the record
+of received bytes, or raises :class:`~service.errors.WireError` if they break the contract. The
+text of that error begins with ``missing``, ``v``, ``id`` or ``range``, so that an RTC can return
+it as the ``reason`` of a reply. The package does not use zenoh and never unpickles anything.
 """
 
 from service.wire.codec import MESSAGE_LIMIT, TEXT_LIMIT, VERSION, decode, encode
@@ -25,7 +25,7 @@ from service.wire.commands import (
     command_kind,
     decode_command,
 )
-from service.wire.keys import Encodings, Keys, Role, checked_id, chunk_index
+from service.wire.keys import Encodings, Keys, Role, parse_chunk_index, validate_id
 from service.wire.matrices import (
     CHUNK_LIMIT,
     Acknowledgement,

@@ -1,4 +1,9 @@
-"""Who may do what on the link: its three roles, as one table and as zenoh's access control."""
+"""Permissions of the three roles on the link, as a table and as zenoh's access control.
+
+The RTC, the service and read-only viewers each have a role. :func:`list_rights` is the table;
+:func:`access_control` translates it into the configuration of zenoh's router, which then refuses
+everything else.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +14,12 @@ from typing import Final
 
 from service.wire.keys import Keys, Role
 
-BESIDE: Final = "/@adv/**"
-"""Behind a key: what zenoh's advanced publishers and subscribers say to each other."""
+ADVANCED_SUFFIX: Final = "/@adv/**"
+"""Suffix of the keys on which zenoh's advanced publishers and subscribers exchange messages."""
 
 
 class LinkRole(StrEnum):
-    """What a program is on the link."""
+    """Role of a program on the link."""
 
     RTC = "rtc"
     SERVICE = "service"
@@ -23,25 +28,26 @@ class LinkRole(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rights:
-    """Keys on which a role may act; what is in none of these is refused."""
+    """Key expressions on which a role may act; all others are refused."""
 
     puts: tuple[str, ...] = ()
     subscribes: tuple[str, ...] = ()
     queries: tuple[str, ...] = ()
     answers: tuple[str, ...] = ()
     holds: tuple[str, ...] = ()
-    """Liveliness tokens."""
+    """Liveliness tokens that the role may declare."""
 
     watches: tuple[str, ...] = ()
-    """Liveliness tokens of others."""
+    """Liveliness tokens of other programs that the role may observe."""
 
 
-def rights_of(keys: Keys) -> Mapping[LinkRole, Rights]:
-    """Return what each role may do, and on which keys of a system."""
-    frames_beside, all_commands = keys.frames + BESIDE, keys.command("*")
-    frames, public = (keys.frames, frames_beside), (keys.state, keys.alarm)
-    # what a cache replies with has the key of the message itself
-    history = (*public, *(key + BESIDE for key in public))
+def list_rights(keys: Keys) -> Mapping[LinkRole, Rights]:
+    """Return the rights of each role on the keys of one system."""
+    advanced_frames, all_commands = keys.frames + ADVANCED_SUFFIX, keys.command("*")
+    frames, public = (keys.frames, advanced_frames), (keys.state, keys.alarm)
+    # A late subscriber fetches the last message from the publisher's cache, whose reply carries
+    # the key of the message itself: publishers need the right to answer on that key as well.
+    history = (*public, *(key + ADVANCED_SUFFIX for key in public))
     matrices = (keys.all_chunks, keys.all_commits)
     return {
         LinkRole.RTC: Rights(
@@ -54,7 +60,7 @@ def rights_of(keys: Keys) -> Mapping[LinkRole, Rights]:
             subscribes=(*matrices, *public),
             queries=(keys.all_matrices, *history),
             answers=(all_commands, keys.applied, *frames),
-            holds=(keys.alive(Role.RTC), frames_beside),
+            holds=(keys.alive(Role.RTC), advanced_frames),
             watches=(keys.alive(Role.SERVICE),),
         ),
         LinkRole.SERVICE: Rights(
@@ -71,7 +77,7 @@ def rights_of(keys: Keys) -> Mapping[LinkRole, Rights]:
             holds=(keys.alive(Role.SERVICE), keys.all_ranks),
             watches=(
                 *(keys.alive(Role.RTC), keys.alive(Role.SERVICE), keys.all_ranks),
-                frames_beside,
+                advanced_frames,
             ),
         ),
         LinkRole.VIEWER: Rights(
@@ -81,39 +87,39 @@ def rights_of(keys: Keys) -> Mapping[LinkRole, Rights]:
     }
 
 
-INWARDS, OUTWARDS = "ingress", "egress"
-"""Seen from the router: what a program sends, and what it is sent."""
+INGRESS, EGRESS = "ingress", "egress"
+"""Directions as zenoh's router names them: from a program, and to a program."""
 
-_MESSAGES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
-    "puts": {INWARDS: ("put",), OUTWARDS: ("declare_subscriber",)},
-    "subscribes": {INWARDS: ("declare_subscriber",), OUTWARDS: ("put",)},
-    "queries": {INWARDS: ("query",), OUTWARDS: ("reply", "declare_queryable")},
-    "answers": {INWARDS: ("reply", "declare_queryable"), OUTWARDS: ("query",)},
+_MESSAGES_BY_RIGHT: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
+    "puts": {INGRESS: ("put",), EGRESS: ("declare_subscriber",)},
+    "subscribes": {INGRESS: ("declare_subscriber",), EGRESS: ("put",)},
+    "queries": {INGRESS: ("query",), EGRESS: ("reply", "declare_queryable")},
+    "answers": {INGRESS: ("reply", "declare_queryable"), EGRESS: ("query",)},
     "holds": {
-        INWARDS: ("liveliness_token",),
-        OUTWARDS: ("declare_liveliness_subscriber", "liveliness_query"),
+        INGRESS: ("liveliness_token",),
+        EGRESS: ("declare_liveliness_subscriber", "liveliness_query"),
     },
     "watches": {
-        INWARDS: ("declare_liveliness_subscriber", "liveliness_query"),
-        OUTWARDS: ("liveliness_token",),
+        INGRESS: ("declare_liveliness_subscriber", "liveliness_query"),
+        EGRESS: ("liveliness_token",),
     },
 }
-"""zenoh's messages by right and direction. Nobody may delete."""
+"""Message types of zenoh that a right allows, by direction. No right allows ``delete``."""
 
 
 def access_control(
-    keys: Keys, names: Mapping[LinkRole, Sequence[str]], *, named_by: str
+    keys: Keys, names: Mapping[LinkRole, Sequence[str]], *, subject_kind: str
 ) -> dict[str, object]:
-    """Return zenoh's ``access_control``: all that :func:`rights_of` does not allow is refused.
+    """Return zenoh's ``access_control`` table, which allows only what :func:`list_rights` lists.
 
     Parameters
     ----------
     keys
-        Of the system; no other system's may be used.
+        Keys of the system; the keys of any other system are refused.
     names
-        Of the programs that have a role.
-    named_by
-        What tells a program's name: ``cert_common_names`` or ``usernames``.
+        Names of the programs that have each role; a role without names gets no rule.
+    subject_kind
+        How zenoh identifies a program: ``cert_common_names`` or ``usernames``.
     """
     rules = [
         {
@@ -123,8 +129,8 @@ def access_control(
             "messages": list(messages),
             "key_exprs": list(getattr(rights, right)),
         }
-        for role, rights in rights_of(keys).items()
-        for right, flows in _MESSAGES.items()
+        for role, rights in list_rights(keys).items()
+        for right, flows in _MESSAGES_BY_RIGHT.items()
         for flow, messages in flows.items()
         if names[role] and getattr(rights, right)
     ]
@@ -133,7 +139,7 @@ def access_control(
         "enabled": True,
         "default_permission": "deny",
         "rules": rules,
-        "subjects": [{"id": str(role), named_by: list(names[role])} for role in roles],
+        "subjects": [{"id": str(role), subject_kind: list(names[role])} for role in roles],
         "policies": [
             {
                 "rules": [str(rule["id"]) for rule in rules if str(rule["id"]).startswith(role)],

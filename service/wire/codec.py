@@ -1,8 +1,8 @@
-"""Records <-> msgpack maps, checked for keys, types and ranges.
+"""Conversion of records to msgpack maps and back, with checks of keys, types and ranges.
 
-The types of a record's fields say what its keys may hold; a refusal names the key, what was found
-and what was expected. A :class:`Form` says what else a kind of message asks for. Here are the types
-that messages share.
+The annotated types of a record's fields define what its keys may hold. A :class:`Form` adds the
+rules of one kind of message that types cannot express. Every error names the key, the value found
+and the values expected. The module also defines the annotated types that several messages share.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy as np
 from msgspec import Meta
 
 from service.errors import WireError
-from service.wire.keys import ID_EXPECTED, ID_PATTERN, RESERVED_IDS, checked_id
+from service.wire.keys import ID_EXPECTED, ID_PATTERN, RESERVED_IDS, validate_id
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -40,39 +40,39 @@ VERSION: Final = 1
 """The ``v`` of every message."""
 
 MESSAGE_LIMIT: Final = 64 * 1024
-"""Bytes: a longer status, manifest or command is refused unread."""
+"""Largest status, manifest or command, in bytes; a longer one is refused before it is parsed."""
 
 TEXT_LIMIT: Final = 1024
-"""Characters of the longest text."""
+"""Largest number of characters in a text."""
 
 INTEGER_LIMIT: Final = 2**63 - 1
-"""Largest integer on the wire."""
+"""Largest integer on the wire, that of a signed 64-bit type."""
 
-_FINITE: Final = float(np.finfo(np.float64).max)
+_MAX_FLOAT: Final = float(np.finfo(np.float64).max)
 
 _T = TypeVar("_T")
 _R = TypeVar("_R", bound="DataclassInstance")
 
 
 def integer(low: int = 0, high: int = INTEGER_LIMIT) -> Meta:
-    """Return what makes an ``int`` one from ``low`` to ``high``."""
+    """Return the constraint of an ``int`` from ``low`` to ``high``, both included."""
     return Meta(ge=low, le=high, description=f"an integer from {low} to {high}")
 
 
-def number(low: float, high: float = _FINITE) -> Meta:
-    """Return what makes a ``float`` a finite one from ``low`` to ``high``."""
-    span = f" from {low:g}" + ("" if high == _FINITE else f" to {high:g}")
+def number(low: float, high: float = _MAX_FLOAT) -> Meta:
+    """Return the constraint of a finite ``float`` from ``low`` to ``high``, both included."""
+    span = f" from {low:g}" + ("" if high == _MAX_FLOAT else f" to {high:g}")
     return Meta(ge=low, le=high, description=f"a finite number{span}")
 
 
-def above(low: float, high: float = _FINITE) -> Meta:
-    """Return what makes a ``float`` a finite one greater than ``low``, to ``high``."""
-    span = f" > {low:g}" + ("" if high == _FINITE else f" and <= {high:g}")
+def above(low: float, high: float = _MAX_FLOAT) -> Meta:
+    """Return the constraint of a finite ``float`` above ``low`` and up to ``high``."""
+    span = f" > {low:g}" + ("" if high == _MAX_FLOAT else f" and <= {high:g}")
     return Meta(gt=low, le=high, description=f"a finite number{span}")
 
 
 Count = Annotated[int, integer()]
-Finite = Annotated[float, Meta(ge=-_FINITE, le=_FINITE, description="a finite number")]
+Finite = Annotated[float, Meta(ge=-_MAX_FLOAT, le=_MAX_FLOAT, description="a finite number")]
 Positive = Annotated[float, above(0.0)]
 Text = Annotated[
     str,
@@ -84,7 +84,7 @@ Text = Annotated[
 Opaque = Annotated[
     str, Meta(min_length=1, max_length=128, description="1 to 128 printable characters")
 ]
-"""A name that only its sender understands."""
+"""Name whose meaning is known to its sender only."""
 
 _RESERVED = "|".join(sorted(RESERVED_IDS))
 Id = Annotated[
@@ -96,72 +96,72 @@ Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description=SHA256_EXP
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FourNumbers:
-    """The four parameters of a registration, or their 1 σ, by their names at every boundary."""
+class RegistrationNumbers:
+    """The four parameters of a registration, or their 1 σ."""
 
     shift_x_subap: Finite
-    """Along +x of the sensor."""
+    """Shift along +x of the sensor."""
 
     shift_y_subap: Finite
-    """Along +y of the sensor."""
+    """Shift along +y of the sensor."""
 
     rotation_deg: Finite
-    """From +x towards +y."""
+    """Rotation from +x towards +y."""
 
     magnification: Finite
-    """1: as the instrument file says."""
+    """Magnification; 1 is that of the instrument file."""
 
 
 Map = dict[str, Any]
-"""A message, or a part of one, as msgpack has it."""
+"""A message, or a nested map of one, as msgpack returns it."""
 
 
-def _untouched(keys: Map, _where: str = "") -> Map:
+def _same_keys(keys: Map, _where: str = "") -> Map:
     return keys
 
 
-def _no_more(_record: object, _where: str) -> None:
-    """Ask for no more than the types of the fields do."""
+def _accept(_record: object, _where: str) -> None:
+    """Accept every record: for messages whose field types are the only rules."""
 
 
 @dataclass(frozen=True, slots=True)
 class Form(Generic[_R]):
-    """Further rules for one kind of message, beyond the fields of its record."""
+    """Rules of one kind of message that the fields of its record do not express."""
 
     kind: type[_R]
-    """Of the record: its fields are the keys."""
+    """Type of the record; its fields are the keys of the message."""
 
     where: str
-    """What a message is called in refusals."""
+    """Name of the message in the texts of errors, such as "a status"."""
 
     _: KW_ONLY
     first: tuple[str, ...] = ()
-    """Keys that travel before the others, which follow in the order of the fields."""
+    """Keys that are sent before the others, which follow in the order of the fields."""
 
-    may_be_absent: tuple[str, ...] = ()
-    """Keys that came after the contract, or that mean something in some messages alone."""
+    optional_keys: tuple[str, ...] = ()
+    """Keys that were added after version 1, or that apply to some messages only."""
 
-    opened: Callable[[bytes, str], Map] | None = None
-    """Bytes to keys; None: a map of at most :data:`MESSAGE_LIMIT` bytes."""
+    unpack: Callable[[bytes, str], Map] | None = None
+    """Parser of the bytes; None if they are a map of at most :data:`MESSAGE_LIMIT` bytes."""
 
-    keys: Callable[[Map], Map] = _untouched
-    """Fields to keys, where they differ."""
+    keys: Callable[[Map], Map] = _same_keys
+    """Conversion from fields to keys, where they differ."""
 
-    fields: Callable[[Map, str], Map] = _untouched
-    """Keys to fields, where they differ."""
+    fields: Callable[[Map, str], Map] = _same_keys
+    """Conversion from keys to fields, where they differ."""
 
-    check: Callable[[_R, str], None] = _no_more
-    """What fields must be together."""
+    check: Callable[[_R, str], None] = _accept
+    """Check of rules that involve several fields; raises a ``WireError``."""
 
-    held: bool = True
-    """Whether what is sent is held against the contract first; not what an RTC ignores."""
+    checked_when_sent: bool = True
+    """True if :func:`encode` checks the message too; False for messages that an RTC ignores."""
 
 
 _FORMS: dict[type, Form[Any]] = {}
 
 
-def travels(kind: type[_R], where: str, **how: Any) -> None:  # noqa: ANN401 - as Form has it
-    """Let records of a kind travel, in the :class:`Form` that the rest describes."""
+def register(kind: type[_R], where: str, **how: Any) -> None:  # noqa: ANN401 - fields of Form
+    """Register a type of record as a message, with the other fields of its :class:`Form`."""
     _FORMS[kind] = Form(kind, where, **how)
 
 
@@ -175,32 +175,34 @@ def encode(record: DataclassInstance) -> bytes:
     """
     form = _FORMS[type(record)]
     data: bytes = msgpack.packb({"v": VERSION, **to_map(record)}, default=_plain)
-    if form.held:
+    if form.checked_when_sent:
+        # Dataclasses do not check their fields. Decoding here turns a mistake of the sender into
+        # an error where it was made, instead of a refusal by the other side.
         decode(form.kind, data)
     return data
 
 
 def decode(kind: type[_R], data: bytes) -> _R:
-    """Return the record that a message is.
+    """Return the record of a message's bytes.
 
     Raises
     ------
     WireError
-        If it breaks the contract; the text is fit for the ``reason`` of a reply.
+        If they break the contract; the text can be the ``reason`` of a reply.
     """
     form: Form[_R] = _FORMS[kind]
-    values = (form.opened or unpack)(data, form.where)
-    return of_map(kind, of_this_version(values, form.where), form.where)
+    values = (form.unpack or unpack)(data, form.where)
+    return from_map(kind, check_version(values, form.where), form.where)
 
 
 def to_map(record: DataclassInstance) -> Map:
-    """Return the map of a record, be it a message or a part of one."""
+    """Return the map of a record that is a message or a nested part of one."""
     kind = type(record)
-    return _FORMS[kind].keys({name: getattr(record, name) for name in names_of(kind)})
+    return _FORMS[kind].keys({name: getattr(record, name) for name in field_names(kind)})
 
 
-def of_map(kind: type[_R], values: Map, where: str) -> _R:
-    """Return the record of a map, be it a message or a part of one.
+def from_map(kind: type[_R], values: Map, where: str) -> _R:
+    """Return the record of a map that is a message or a nested part of one.
 
     Raises
     ------
@@ -208,13 +210,13 @@ def of_map(kind: type[_R], values: Map, where: str) -> _R:
         If it breaks the contract.
     """
     form: Form[_R] = _FORMS[kind]
-    record = read(form.fields(values, where), kind, where, form.may_be_absent)
+    record = read(form.fields(values, where), kind, where, form.optional_keys)
     form.check(record, where)
     return record
 
 
 def _plain(value: object) -> object:
-    """Turn numpy scalars, arrays and records into what msgpack knows."""
+    """Return numpy scalars, arrays, records and mappings as types that msgpack can pack."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if is_dataclass(value) and not isinstance(value, type):
@@ -225,21 +227,21 @@ def _plain(value: object) -> object:
 
 
 def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> Map:
-    """Return the map that a message is.
+    """Return the map that the bytes of a message contain.
 
     Parameters
     ----------
     data
-        The bytes.
+        Bytes of the message.
     where
-        What the message is, for the text of a refusal.
+        Name of the message in the text of an error.
     limit
-        Most bytes it may have.
+        Largest number of bytes.
 
     Raises
     ------
     WireError
-        If it is too long or no msgpack map.
+        If there are more bytes, or they are not a msgpack map.
     """
     if len(data) > limit:
         raise WireError(f"range: {where} has {len(data)} bytes, expected at most {limit}")
@@ -247,43 +249,43 @@ def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> Map:
         values = msgpack.unpackb(data)
     except (ValueError, msgpack.exceptions.UnpackException) as error:
         raise WireError(f"range: {where} is not msgpack: {error!s:.100}") from error
-    return as_map(values, where)
+    return require_map(values, where)
 
 
-def as_map(values: object, where: str) -> Map:
-    """Return what must be a map.
+def require_map(values: object, where: str) -> Map:
+    """Return ``values`` if it is a map.
 
     Raises
     ------
     WireError
-        If it is none.
+        If it is something else.
     """
     if not isinstance(values, dict):
         raise WireError(f"range: {where} is {_show(values)}, expected a map")
     return values
 
 
-def of_this_version(values: Map, where: str) -> Map:
-    """Return a map whose ``v`` is the version this code speaks.
+def check_version(values: Map, where: str) -> Map:
+    """Return the map if its ``v`` is :data:`VERSION`.
 
     Raises
     ------
     WireError
-        If it is another.
+        If the version is missing or different.
     """
-    version = get(values, "v", where)
-    if version != VERSION or isinstance(version, bool):
+    version = require(values, "v", where)
+    if version != VERSION or isinstance(version, bool):  # True == 1 in Python
         raise WireError(f"v: {_show(version)} in {where}, expected {VERSION}")
     return values
 
 
-def get(values: Map, key: str, where: str) -> Any:  # noqa: ANN401  as msgpack made it
+def require(values: Map, key: str, where: str) -> Any:  # noqa: ANN401 - any msgpack value
     """Return the value of a key that must be present.
 
     Raises
     ------
     WireError
-        If it is not.
+        If the key is absent.
     """
     if key not in values:
         raise WireError(f"missing: key {key!r} in {where}")
@@ -291,15 +293,15 @@ def get(values: Map, key: str, where: str) -> Any:  # noqa: ANN401  as msgpack m
 
 
 @cache
-def names_of(kind: type[DataclassInstance]) -> tuple[str, ...]:
-    """Return the fields of a record in the order in which they travel."""
+def field_names(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    """Return the names of a record's fields in the order in which they are sent."""
     first = _FORMS[kind].first if kind in _FORMS else ()
     return (*first, *(field.name for field in fields(kind) if field.name not in first))
 
 
-def may_be_absent(kind: type[DataclassInstance]) -> tuple[str, ...]:
-    """Return the keys of a record that need not be sent."""
-    return _FORMS[kind].may_be_absent if kind in _FORMS else ()
+def optional_keys(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    """Return the keys of a record that a message may leave out."""
+    return _FORMS[kind].optional_keys if kind in _FORMS else ()
 
 
 def read(values: Map, kind: type[_R], where: str, absent: tuple[str, ...] = ()) -> _R:
@@ -308,103 +310,109 @@ def read(values: Map, kind: type[_R], where: str, absent: tuple[str, ...] = ()) 
     Parameters
     ----------
     values
-        The map; a key that is no field is ignored.
+        The map. Keys that are not fields are ignored, so that either side can add some later.
     kind
-        The record's type.
+        Type of the record.
     where
-        What the map is, for the text of a refusal.
+        Name of the map in the text of an error.
     absent
-        Keys that need not be there.
+        Keys that may be absent; their fields then have their defaults.
 
     Raises
     ------
     WireError
-        If a key is missing or its value is not what the field's type says.
+        If a key is missing or its value does not match the type of the field.
     """
-    for name in names_of(kind):
-        if name not in values and name not in absent:
-            get(values, name, where)
+    for name in field_names(kind):
+        if name not in absent:
+            require(values, name, where)
     try:
         record = msgspec.convert(values, kind, builtin_types=(bytes,))
     except msgspec.ValidationError as error:
-        raise _refused(values, kind, where) from error
-    for name in _opaque(kind):
+        raise _find_mismatch(values, kind, where) from error
+    # A regular expression cannot express "printable", so msgspec has checked the length only.
+    for name in _opaque_fields(kind):
         if not getattr(record, name).isprintable():
-            raise refusal(name, getattr(record, name), expected_of(kind, name), where)
+            raise refusal(name, getattr(record, name), describe_field(kind, name), where)
     return record
 
 
-def read_four(values: Map, key: str, where: str) -> dict[str, float] | None:
-    """Return the four numbers of a registration below a key, None where it is nil.
+def read_registration(values: Map, key: str, where: str) -> dict[str, float] | None:
+    """Return the four numbers of the registration at ``key``; None if the value is nil.
 
     Raises
     ------
     WireError
         If one of them is missing or not finite.
     """
-    below = get(values, key, where)
-    if below is None:
+    numbers = require(values, key, where)
+    if numbers is None:
         return None
     inside = f"{key!r} of {where}"
-    return asdict(read(as_map(below, inside), FourNumbers, inside))
+    return asdict(read(require_map(numbers, inside), RegistrationNumbers, inside))
 
 
-def applicable(record: DataclassInstance, where: str, **applies: bool) -> None:
-    """Refuse a field that is None though it applies, or something though it does not.
+def check_applicability(record: DataclassInstance, where: str, **applies: bool) -> None:
+    """Check that each named field has a value if and only if it applies to this message.
 
     Raises
     ------
     WireError
-        If one is.
+        If a field that applies is None, or one that does not apply has a value.
     """
-    for key, does in applies.items():
+    for key, is_needed in applies.items():
         value = getattr(record, key)
-        if does and value is None:
-            raise refusal(key, value, expected_of(type(record), key), where)
-        if not does and value is not None:
+        if is_needed and value is None:
+            raise refusal(key, value, describe_field(type(record), key), where)
+        if not is_needed and value is not None:
             raise refusal(key, value, "nil, it does not apply", where)
 
 
-def reason_or_none(values: Map, _where: str) -> Map:
-    """Return a map in which a reason that is nil is an empty one."""
+def nil_reason_to_text(values: Map, _where: str) -> Map:
+    """Return the map with an empty ``reason`` in place of nil."""
     return values | {"reason": ""} if values.get("reason", "") is None else values
 
 
 def refusal(key: str, value: object, expected: str, where: str) -> WireError:
-    """Return the error that says what a key held and what it should hold."""
+    """Return the error for a key, with the value found and the values expected."""
     return WireError(f"range: {key} is {_show(value)} in {where}, expected {expected}")
 
 
-def expected_of(kind: type[DataclassInstance], key: str) -> str:
-    """Return in words what a field may hold."""
-    return _words(_types(kind)[key])
+def describe_field(kind: type[DataclassInstance], key: str) -> str:
+    """Return a text on the values that a field may have, such as "a finite number > 0"."""
+    return _describe_type(_field_types(kind)[key])
 
 
-def _refused(value: Any, kind: Any, where: str, key: str = "") -> WireError:  # noqa: ANN401
-    """Return the error of a value that is not of a type: of the first part of it that is wrong."""
+def _find_mismatch(value: Any, kind: Any, where: str, key: str = "") -> WireError:  # noqa: ANN401
+    """Return the error for a value that does not match its type, with the key at fault.
+
+    msgspec's own message has a path but not the texts of the contract. This function descends
+    into the first part that does not match, so that the error names a key of the message.
+    """
     kind, parts = _without_none(kind), []
     is_record = is_dataclass(kind)
     if is_record:
         if not isinstance(value, dict):
             return WireError(f"range: {key!r} of {where} is {_show(value)}, expected a map")
-        where, types = (f"{key!r} of {where}" if key else where), _types(kind)
+        where, types = (f"{key!r} of {where}" if key else where), _field_types(kind)
         parts = [(part, types[name], name) for name, part in value.items() if name in types]
     elif isinstance(value, list):
         parts = [
-            (part, item, key) for part, item in zip(value, _items(kind, len(value)), strict=False)
+            (part, item, key)
+            for part, item in zip(value, _item_types(kind, len(value)), strict=False)
         ]
     for part, expected, name in parts:
-        if not _is_of(part, expected):
-            return _refused(part, expected, where, name)
+        if not _matches_type(part, expected):
+            return _find_mismatch(part, expected, where, name)
     if is_record:
-        lacking = next(name for name in _types(kind) if name not in value)
+        lacking = next(name for name in _field_types(kind) if name not in value)
         return WireError(f"missing: key {lacking!r} in {where}")
-    if _words(kind) == ID_EXPECTED:
-        checked_id(value, f"key {key!r} in {where}")
-    return refusal(key, value, _words(kind), where)
+    if _describe_type(kind) == ID_EXPECTED:
+        validate_id(value, f"key {key!r} in {where}")
+    return refusal(key, value, _describe_type(kind), where)
 
 
-def _is_of(value: object, kind: Any) -> bool:  # noqa: ANN401  a type, annotated
+def _matches_type(value: object, kind: Any) -> bool:  # noqa: ANN401 - an annotated type
     try:
         msgspec.convert(value, kind, builtin_types=(bytes,))
     except msgspec.ValidationError:
@@ -413,31 +421,31 @@ def _is_of(value: object, kind: Any) -> bool:  # noqa: ANN401  a type, annotated
 
 
 @cache
-def _types(kind: type[DataclassInstance]) -> dict[str, Any]:
+def _field_types(kind: type[DataclassInstance]) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 
 @cache
-def _opaque(kind: type[DataclassInstance]) -> tuple[str, ...]:
-    printable = _words(Opaque)
-    return tuple(name for name, at in _types(kind).items() if _words(at) == printable)
+def _opaque_fields(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    printable = _describe_type(Opaque)
+    return tuple(name for name, at in _field_types(kind).items() if _describe_type(at) == printable)
 
 
-def _without_none(kind: Any) -> Any:  # noqa: ANN401  a type
-    """Return a type without the None that it may be as well."""
+def _without_none(kind: Any) -> Any:  # noqa: ANN401 - a type
+    """Return the type ``T`` of ``T | None``, and any other type as it is."""
     is_union = get_origin(kind) in {Union, UnionType}
     return next(one for one in get_args(kind) if one is not NoneType) if is_union else kind
 
 
-def _items(kind: Any, n_items: int) -> tuple[Any, ...]:  # noqa: ANN401  a type
-    """Return the type of each item of a list; none: it is no list, or of another length."""
+def _item_types(kind: Any, n_items: int) -> tuple[Any, ...]:  # noqa: ANN401 - a type
+    """Return the type of each item of a list; empty if ``kind`` has another length."""
     bare = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     items = get_args(bare) if get_origin(bare) is tuple else ()
     items = items[:1] * n_items if items[1:] == (...,) else items
     return items if len(items) == n_items else ()
 
 
-def _words(kind: Any) -> str:  # noqa: ANN401  a type
+def _describe_type(kind: Any) -> str:  # noqa: ANN401 - a type
     kind = _without_none(kind)
     if get_origin(kind) is Annotated:
         return str(kind.__metadata__[0].description)

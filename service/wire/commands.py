@@ -1,4 +1,8 @@
-"""Commands to the RTC, and its replies."""
+"""Commands from the service to the RTC, and the replies of the RTC.
+
+Every command is a frozen record; :func:`decode_command` returns one from received bytes after the
+checks that do not depend on the RTC. docs/rtc.md lists the keys.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +15,20 @@ from msgspec import Meta
 
 from service.errors import WireError
 from service.wire import codec
-from service.wire.keys import checked_id
+from service.wire.keys import validate_id
 
 AVERAGE_LIMIT: Final = 10_000
+"""Largest number of repetitions in the measurement of an interaction matrix."""
+
 RAMP_LIMIT: Final = 1_000_000
-"""Most frames at one gain of a ramp."""
+"""Largest number of frames at one gain of a ramp."""
 
 _Duration = Annotated[float, codec.above(0.0, 86_400.0)]
 _Pair = Annotated[tuple[codec.Count, codec.Count], Meta(description="pairs of integers")]
 
 
 class CommandKind(StrEnum):
-    """The last word of a command's key."""
+    """Kinds of commands: the last part of a command's key."""
 
     DITHER = "dither"
     LOOP = "loop"
@@ -37,7 +43,7 @@ class Loop(StrEnum):
     OPEN = "open"
     CLOSED = "closed"
     PARTIAL = "partial"
-    """Closed, with the gain of some controlled modes at 0."""
+    """Closed, but the gain of some controlled modes is 0."""
 
 
 class DitherKind(StrEnum):
@@ -47,24 +53,23 @@ class DitherKind(StrEnum):
     """``amplitude_m * sqrt(2) * sin(2 pi f (seq - start_seq) dt)``."""
 
     BINARY = "binary"
-    """Plus or minus ``amplitude_m`` per frame, from ``seed``."""
+    """Plus or minus ``amplitude_m`` in each frame, a sequence generated from ``seed``."""
 
 
 class Pattern(StrEnum):
-    """Patterns of measuring an interaction matrix."""
+    """Patterns of mirror commands with which an interaction matrix is measured."""
 
     PUSH_PULL_MODAL = "push-pull-modal"
-    """One mode after the other, loop open."""
+    """Push and pull of one mode after the other, loop open."""
 
     PUSH_PULL_ZONAL = "push-pull-zonal"
-    """One actuator after the other, loop open."""
+    """Push and pull of one actuator after the other, loop open."""
 
     HADAMARD = "hadamard"
     """All modes at once with the signs of a Hadamard matrix, loop open."""
 
     SYSTEM_MODES = "system-modes"
-    """Push-pull of the modes that the loop's own reconstructor tells apart best, loop open
-    (optional)."""
+    """Push and pull of the singular modes of the RTC's own reconstructor, loop open."""
 
     SINE = "sine"
     """All modes at once, each at its own frequency, loop closed."""
@@ -72,96 +77,96 @@ class Pattern(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strokes:
-    """Modes of the mirror that are moved, and how far."""
+    """Modes to be moved on the mirror, and their amplitudes."""
 
     id: codec.Id
-    """Of the command, and of a matrix that follows: repeated with the same id it is carried out
-    once."""
+    """Id of the command and of the matrix that results. A repeated id is carried out once."""
 
     modes: tuple[codec.Count, ...]
-    """0-based basis indices."""
+    """0-based indices in the modal basis."""
 
     amplitude_m: tuple[codec.Positive, ...]
-    """RMS of each mode, metres OPD."""
+    """RMS amplitude of each mode, metres OPD."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherRequest(Strokes):
-    """Start a dither."""
+    """Command to start a dither."""
 
     kind: DitherKind
-    """Sines, or random signs."""
+    """Shape in time: sines, or random signs."""
 
     frequency_hz: tuple[codec.Positive, ...] | None = None
-    """Of each mode, below half the frame rate; None: binary."""
+    """Frequency of each mode, below half the frame rate; None if the dither is binary."""
 
     duration_s: _Duration
-    """It ends by itself after ``round(duration_s * frame_rate_hz)`` frames."""
+    """Duration; the dither ends by itself after ``round(duration_s * frame_rate_hz)`` frames."""
 
     seed: codec.Count | None = None
-    """Of the binary sequence; None: sine."""
+    """Seed of the binary sequence; None if the dither is a sine."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherStop:
-    """Stop the dither, whichever plays; this always succeeds."""
+    """Command to stop the dither, whichever is running; it always succeeds."""
 
     id: codec.Id
-    """Of this command, not of the dither that it stops."""
+    """Id of this command, not of the dither that it stops."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopRequest:
-    """Change the loop; None leaves a value as it is, opening zeroes the integrator."""
+    """Command to change the loop. None leaves a value unchanged; opening zeroes the integrator."""
 
     id: codec.Id
-    """Of the command: repeated with the same id it is carried out once."""
+    """Id of the command. A repeated id is carried out once."""
 
     loop: Loop | None = None
-    """Open or close it; the service never asks for partial."""
+    """New state of the loop; the service sends ``open`` or ``closed``, never ``partial``."""
 
     gains: tuple[Annotated[float, codec.number(0.0)], ...] | None = None
-    """One per mode of the basis, 0 where uncontrolled."""
+    """Integrator gain of each mode of the basis, 0 for an uncontrolled mode."""
 
     leak: Annotated[float, codec.number(0.0, 1.0)] | None = None
-    """Per frame, 0..1; 1 forgets nothing."""
+    """Leak factor per frame; 1 is a pure integrator."""
 
     n_controlled: codec.Count | None = None
-    """Takes effect with the next reconstructor of that many rows."""
+    """Number of controlled modes; takes effect with the next reconstructor of that many rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixStrokes(Strokes):
-    """Strokes that an interaction matrix is measured with."""
+    """Strokes for the measurement of an interaction matrix."""
 
     frequency_hz: tuple[codec.Positive, ...] | None = None
-    """Of each mode; None unless it is a sine."""
+    """Frequency of each mode; None unless the pattern is ``sine``."""
 
     duration_s: _Duration | None = None
-    """How long it is to last; None: as long as the pattern takes."""
+    """Duration of the measurement; None unless the pattern is ``sine``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasureRequest(MatrixStrokes):
-    """Measure an interaction matrix."""
+    """Command to measure an interaction matrix."""
 
     pattern: Pattern
-    """How; the first is mandatory, the others are optional."""
+    """Pattern of mirror commands; an RTC must know the first and may know the others."""
 
     n_average: Annotated[int, codec.integer(1, AVERAGE_LIMIT)] | None = None
-    """Repetitions; None: the pattern has none."""
+    """Number of repetitions; None if the pattern is ``sine``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RampRequest:
-    """Try gains on one group of modes after the other; keep those of least residual slopes.
+    """Command to optimise the loop gains of one group of modes after the other.
 
-    While a group is tried the others keep the gains they have. What was chosen is seen in the
-    status' ``gains`` (Heritier et al. 2018: tip and tilt, then modes to 100, then to 400).
+    The RTC runs each gain for ``frames_per_gain`` frames, while the other groups keep theirs, and
+    keeps the gain with the smallest residual slopes. The result appears in the status' ``gains``.
+    Heritier et al. 2018 ramp tip and tilt, then the modes up to 100, then those up to 400.
     """
 
     id: codec.Id
-    """Of the command: repeated with the same id it is carried out once."""
+    """Id of the command. A repeated id is carried out once."""
 
     groups: tuple[_Pair, ...]
     """First and last mode of each group, 0-based basis indices, both included; none overlap."""
@@ -170,15 +175,18 @@ class RampRequest:
     """Loop gains, tried in this order on every group."""
 
     frames_per_gain: Annotated[int, codec.integer(1, RAMP_LIMIT)]
-    """Frames each gain is tried for, settling included."""
+    """Number of frames at each gain, settling included."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OffloadRequest(codec.FourNumbers):
-    """Move the mirror's image on the sensor, with a lens or a stage: so much α is to change."""
+class OffloadRequest(codec.RegistrationNumbers):
+    """Command to move the mirror's image on the sensor with a lens or a stage.
+
+    The four numbers are the change of the registration α.
+    """
 
     id: codec.Id
-    """Of the command: repeated with the same id it is carried out once."""
+    """Id of the command. A repeated id is carried out once."""
 
 
 Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampRequest | OffloadRequest
@@ -186,19 +194,19 @@ Command = DitherRequest | DitherStop | LoopRequest | MeasureRequest | RampReques
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """The RTC's answer to a command."""
+    """Reply of the RTC to a command."""
 
     id: codec.Id | None
-    """The command's; None when the command had none that could be read."""
+    """Id of the command; None if the command had no readable id."""
 
     accepted: bool
-    """Whether it is, or has been, carried out."""
+    """True if the command is being, or has been, carried out."""
 
     reason: codec.Text
-    """Empty, or begins with missing, v, id, busy, range or unsupported."""
+    """Reason of a refusal, begins with missing, v, id, busy, range or unsupported; else empty."""
 
     start_seq: codec.Count | None
-    """First frame whose exposure contains what was asked for; None where that means nothing."""
+    """First frame whose exposure contains the effect; None if the command has none."""
 
 
 _KINDS: dict[type[Command], CommandKind] = {
@@ -214,27 +222,27 @@ _START, _STOP = "start", "stop"
 
 
 def command_kind(command: Command) -> CommandKind:
-    """Return which key a command goes to."""
+    """Return the kind of a command, which is the last part of its key."""
     return _KINDS[type(command)]
 
 
 def command_id(data: bytes) -> str | None:
-    """Return the id of a command, for the reply that refuses the rest of it; None: unreadable."""
+    """Return the id in the bytes of a command, for a reply that refuses it; None if unreadable."""
     try:
-        return checked_id(codec.unpack(data, "a command").get("id"), "a command")
+        return validate_id(codec.unpack(data, "a command").get("id"), "a command")
     except WireError:
         return None
 
 
 def decode_command(kind: CommandKind, data: bytes) -> Command:
-    """Return the command a query on ``cmd/rtc/{kind}`` carries.
+    """Return the command in the bytes of a query on ``cmd/rtc/{kind}``.
 
-    What depends on the RTC (number of modes, strokes, rates) is for the RTC to check.
+    Limits that depend on the RTC (number of modes, strokes, rates) are left for the RTC to check.
 
     Raises
     ------
     WireError
-        If a key is missing or out of range; the text is fit for the reply's ``reason``.
+        If a key is missing or out of range; the text can be the ``reason`` of a reply.
     """
     dither = kind is CommandKind.DITHER
     if dither and codec.unpack(data, "a dither command").get("action") == _STOP:
@@ -242,26 +250,28 @@ def decode_command(kind: CommandKind, data: bytes) -> Command:
     return codec.decode(_STARTING[kind], data)
 
 
-def _starts(values: codec.Map, where: str) -> codec.Map:
-    if codec.get(values, "action", where) != _START:
+def _check_start(values: codec.Map, where: str) -> codec.Map:
+    if codec.require(values, "action", where) != _START:
         raise codec.refusal("action", values["action"], f"{_START} or {_STOP}", where)
     return values
 
 
 def _check_dither(command: DitherRequest, where: str) -> None:
     sine = command.kind is DitherKind.SINE
-    codec.applicable(command, where, frequency_hz=sine, seed=not sine)
+    codec.check_applicability(command, where, frequency_hz=sine, seed=not sine)
     _check_modes(command, where)
 
 
 def _check_measurement(command: MeasureRequest, where: str) -> None:
     sine = command.pattern is Pattern.SINE
-    codec.applicable(command, where, n_average=not sine, frequency_hz=sine, duration_s=sine)
+    codec.check_applicability(
+        command, where, n_average=not sine, frequency_hz=sine, duration_s=sine
+    )
     _check_modes(command, where)
 
 
 def _check_modes(command: Strokes, where: str) -> None:
-    """Refuse missing or repeated modes, and lists that have not one value for each."""
+    """Raise a ``WireError`` for no modes, repeated modes, or lists of another length."""
     modes = command.modes
     if not modes or len(set(modes)) != len(modes):
         raise codec.refusal("modes", modes, "at least one mode, none twice", where)
@@ -281,22 +291,22 @@ def _check_ramp(command: RampRequest, where: str) -> None:
         raise codec.refusal("gains", command.gains, "one or more gains to try", where)
 
 
-codec.travels(
+codec.register(
     DitherRequest,
     "a dither command",
     first=("id", "kind"),
     keys=lambda keys: {**keys, "action": _START},
-    fields=_starts,
+    fields=_check_start,
     check=_check_dither,
 )
-codec.travels(DitherStop, "a dither command", keys=lambda keys: {**keys, "action": _STOP})
-codec.travels(LoopRequest, "a loop command")
-codec.travels(
+codec.register(DitherStop, "a dither command", keys=lambda keys: {**keys, "action": _STOP})
+codec.register(LoopRequest, "a loop command")
+codec.register(
     MeasureRequest,
     "a measure command",
     first=("id", "pattern", "modes", "amplitude_m", "n_average"),
     check=_check_measurement,
 )
-codec.travels(RampRequest, "a ramp command", check=_check_ramp)
-codec.travels(OffloadRequest, "an offload command")
-codec.travels(Reply, "a reply", fields=codec.reason_or_none)
+codec.register(RampRequest, "a ramp command", check=_check_ramp)
+codec.register(OffloadRequest, "an offload command")
+codec.register(Reply, "a reply", fields=codec.nil_reason_to_text)

@@ -1,4 +1,4 @@
-"""Key expressions, ids and encodings."""
+"""zenoh key expressions of the contract, ids of messages, and encodings."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from service.errors import WireError
 ID_PATTERN = re.compile(r"[A-Za-z0-9._-]{1,64}")
 ID_EXPECTED = "1 to 64 of A-Z a-z 0-9 . _ -"
 RESERVED_IDS = frozenset({"ack", "current"})
+"""Words that cannot be ids, because ``cm/ack`` and ``cm/current`` are keys of their own."""
 
 
-def checked_id(value: object, where: str) -> str:
-    """Return ``value`` if it is an id, so that it may become part of a key or a file name.
+def validate_id(value: object, where: str) -> str:
+    """Return ``value`` if it is a valid id and therefore safe in a key or a file name.
 
     Raises
     ------
@@ -28,14 +29,14 @@ def checked_id(value: object, where: str) -> str:
 
 
 class Role(StrEnum):
-    """Holders of a liveliness token."""
+    """Sides of the link that hold a liveliness token."""
 
     RTC = "rtc"
     SERVICE = "service"
 
 
 class Encodings(StrEnum):
-    """Informative zenoh encodings of what travels."""
+    """zenoh encodings of the messages; informative only."""
 
     FRAMES = "application/octet-stream;ao.v1.frames"
     BYTES = "application/octet-stream"
@@ -53,7 +54,7 @@ class Keys:
     """Key expressions of one system, all below ``ao/v1/{system}``."""
 
     def __init__(self, system: str) -> None:
-        self.system = checked_id(system, "the name of the system")
+        self.system = validate_id(system, "the name of the system")
         self.root = f"ao/v1/{system}"
         self.frames = f"{self.root}/tel/frames"
         """Telemetry frames."""
@@ -74,9 +75,9 @@ class Keys:
         self.all_measured = f"{self.root}/im/**"
         """Every :meth:`measured_chunk` and :meth:`measured_commit`."""
         self.state = f"{self.root}/state"
-        """What the service knows, for whoever listens."""
+        """State messages of the service, for all subscribers."""
         self.alarm = f"{self.root}/alarm"
-        """Alarms of the service, for whoever listens."""
+        """Alarms of the service, for all subscribers."""
         self.all_ranks = f"{self.root}/alive/{Role.SERVICE}/*"
         """Every :meth:`rank`."""
 
@@ -90,7 +91,7 @@ class Keys:
 
     def matrix(self, matrix_id: str) -> str:
         """Queryable of one reconstructor: its manifest, or with ``?chunk=k`` its bytes."""
-        return f"{self.root}/cm/{checked_id(matrix_id, 'a matrix key')}"
+        return f"{self.root}/cm/{validate_id(matrix_id, 'a matrix key')}"
 
     def command(self, kind: str) -> str:
         """Queryable of the RTC: commands of this :class:`~service.wire.CommandKind`."""
@@ -98,18 +99,18 @@ class Keys:
 
     def measured_chunk(self, matrix_id: str, index: int) -> str:
         """Part ``index`` of a measured interaction matrix."""
-        return f"{self.root}/im/{checked_id(matrix_id, 'a matrix key')}/chunk/{index}"
+        return f"{self.root}/im/{validate_id(matrix_id, 'a matrix key')}/chunk/{index}"
 
     def measured_commit(self, matrix_id: str) -> str:
         """Manifest of a measured interaction matrix."""
-        return f"{self.root}/im/{checked_id(matrix_id, 'a matrix key')}/commit"
+        return f"{self.root}/im/{validate_id(matrix_id, 'a matrix key')}/commit"
 
     def alive(self, role: Role) -> str:
         """Liveliness token of one side."""
         return f"{self.root}/alive/{role}"
 
     @staticmethod
-    def every_alive(role: Role) -> str:
+    def all_alive(role: Role) -> str:
         """Liveliness tokens of one side in every system."""
         return f"ao/v1/*/alive/{role}"
 
@@ -119,31 +120,31 @@ class Keys:
         return key.split("/")[2]
 
     def rank(self, name: str) -> str:
-        """Liveliness token of one of several services; its name has the starting time."""
+        """Liveliness token of one of several services; ``name`` begins with its starting time."""
         return f"{self.root}/alive/{Role.SERVICE}/{name}"
 
     def matrix_id_of(self, key: str) -> str:
-        """Return the id in a key of a matrix, a chunk or a commit (``cm`` and ``im`` alike).
+        """Return the id in the key of a matrix, a chunk or a commit, below ``cm`` or ``im``.
 
         Raises
         ------
         WireError
-            If the key is none of these or its id is not one.
+            If it is another key, or the id in it is invalid.
         """
-        return checked_id(self._parts(key)[0], key)
+        return validate_id(self._parts(key)[0], key)
 
     def chunk_index_of(self, key: str) -> int | None:
-        """Return k of ``.../chunk/{k}``, None for any other key of a matrix.
+        """Return k of ``.../chunk/{k}``; None for any other key of a matrix.
 
         Raises
         ------
         WireError
-            If k is not a number from 0 on.
+            If k is not a decimal number.
         """
         parts = self._parts(key)
         if len(parts) != 3 or parts[1] != "chunk":
             return None
-        return chunk_index(parts[2], key)
+        return parse_chunk_index(parts[2], key)
 
     def _parts(self, key: str) -> list[str]:
         for branch in ("cm", "im"):
@@ -153,8 +154,8 @@ class Keys:
         raise WireError(f"id: {key!r:.120} is no key of a matrix of {self.root}")
 
 
-def chunk_index(text: str, where: str) -> int:
-    """Return the chunk number written in a key or a query.
+def parse_chunk_index(text: str, where: str) -> int:
+    """Return the number of a chunk from the text in a key or a query.
 
     Raises
     ------

@@ -1,4 +1,9 @@
-"""Matrices: manifests, parts, acknowledgements."""
+"""Matrices on the wire: manifests, chunks and acknowledgements.
+
+A matrix is sent in chunks, followed or preceded by a commit that carries its manifest: shape,
+checksum, and what it is for. The receiver collects both in a :class:`ChunkAssembler`. The RTC
+answers a reconstructor with an :class:`Acknowledgement`.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +22,16 @@ from service.errors import WireError
 from service.wire import codec, commands
 
 CHUNK_LIMIT: Final = 4_000_000
-"""Bytes of the largest part."""
+"""Largest chunk of a matrix, in bytes."""
 
 MATRIX_LIMIT: Final = 2**31
-"""Bytes of the largest matrix."""
+"""Largest matrix, in bytes."""
 
 DTYPE: Final = "<f4"
-"""Every matrix on the wire: little-endian float32, C order."""
+"""Type of every matrix on the wire: little-endian float32, in C order."""
 
 AXIS_LIMIT: Final = 1_000_000
+"""Largest number of rows or columns of a matrix."""
 
 _Axis = Annotated[int, codec.integer(0, AXIS_LIMIT)]
 _AXES: Final = f"two axes, at most {MATRIX_LIMIT} bytes"
@@ -33,36 +39,36 @@ _AXES: Final = f"two axes, at most {MATRIX_LIMIT} bytes"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatrixLayout:
-    """Shape, parts and checksum of a float32 matrix on the wire."""
+    """Shape, chunks and checksum of a float32 matrix on the wire."""
 
     shape: Annotated[tuple[_Axis, _Axis], Meta(description=_AXES)]
     """Rows and columns, C order, little-endian float32."""
 
     n_chunks: codec.Count
-    """Parts it travels in; 0: there is no matrix (a measurement that failed)."""
+    """Number of chunks; 0 if there is no matrix because a measurement failed."""
 
     chunk_bytes: Annotated[int, codec.integer(1, CHUNK_LIMIT)]
-    """Bytes of each part but the last, which may be shorter."""
+    """Bytes of each chunk; the last one may be shorter."""
 
     sha256: Annotated[str, Meta(pattern=r"\A([0-9a-f]{64})?\Z", description=codec.SHA256_EXPECTED)]
-    """Of all its bytes, 64 lower-case hex digits; empty: there is no matrix."""
+    """SHA-256 of all bytes, 64 lower-case hex digits; empty if there is no matrix."""
 
     @property
     def n_bytes(self) -> int:
-        """Bytes of the whole matrix."""
+        """Number of bytes of the whole matrix."""
         return 4 * self.shape[0] * self.shape[1]
 
     def size_of(self, index: int) -> int:
-        """Return the bytes part ``index`` must have."""
+        """Return the number of bytes that chunk ``index`` must have."""
         return min(self.chunk_bytes, self.n_bytes - index * self.chunk_bytes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Manifest:
-    """A reconstructor on its way from the service to the RTC, or the one the RTC uses."""
+    """Manifest of a reconstructor that the service sends, or that the RTC uses."""
 
     id: codec.Id
-    """Never reused."""
+    """Id of the reconstructor, never reused."""
 
     layout: MatrixLayout
     """Shape ``(n_controlled, n_slopes)``, chunks and checksum; row i commands basis mode i."""
@@ -74,36 +80,36 @@ class Manifest:
     """1 σ of ``alpha``, same names and units."""
 
     im_id: codec.Text | None
-    """Informative: the interaction matrix it inverts."""
+    """Id of the interaction matrix that was inverted; informative."""
 
     parent: codec.Text | None
-    """Informative: the reconstructor it follows."""
+    """Id of the reconstructor that it replaces; informative."""
 
     basis_id: codec.Opaque
-    """Of the modal basis it commands."""
+    """Id of the modal basis that it commands."""
 
     config_id: codec.Opaque
-    """Of the slopes it multiplies."""
+    """Id of the sensor configuration whose slopes it multiplies."""
 
     system: codec.Id
     """The ``{system}`` of the keys."""
 
     created_ns: codec.Count
-    """When it was computed, nanoseconds since the Unix epoch, UTC."""
+    """Time of its computation, nanoseconds since the Unix epoch, UTC."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredManifest:
-    """An interaction matrix the RTC has measured: slope per metre OPD."""
+    """Manifest of an interaction matrix measured by the RTC, in slope per metre OPD."""
 
     id: codec.Id
-    """The command's."""
+    """Id of the command to measure it."""
 
     layout: MatrixLayout
-    """Shape ``(n_slopes, n_modes_measured)``; no chunks when the measurement failed."""
+    """Shape ``(n_slopes, n_modes_measured)``; no chunks if the measurement failed."""
 
     reason: codec.Text | None
-    """Why there is no matrix; None when there is one."""
+    """Reason for which the measurement failed; None if there is a matrix."""
 
     modes: tuple[_Axis, ...]
     """0-based basis indices, one per column."""
@@ -112,28 +118,28 @@ class MeasuredManifest:
     """RMS of each mode's stroke, metres OPD."""
 
     n_average: Annotated[int, codec.integer(1)]
-    """Repetitions averaged."""
+    """Number of repetitions averaged."""
 
     pattern: commands.Pattern
-    """How it was measured."""
+    """Pattern of mirror commands."""
 
     double_pass: bool
-    """Whether the light saw the mirror twice."""
+    """True if the light is reflected by the mirror twice, so that slopes are doubled."""
 
     session: codec.Opaque
-    """The RTC's session."""
+    """Session of the RTC."""
 
     basis_id: codec.Opaque
-    """As in the frames."""
+    """Id of the modal basis, as in the frames."""
 
     config_id: codec.Opaque
-    """As in the frames."""
+    """Id of the sensor configuration, as in the frames."""
 
     system: codec.Id
     """The ``{system}`` of the keys."""
 
     created_ns: codec.Count
-    """When it was measured, nanoseconds since the Unix epoch, UTC."""
+    """Time of the measurement, nanoseconds since the Unix epoch, UTC."""
 
 
 class AckState(StrEnum):
@@ -146,49 +152,53 @@ class AckState(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement:
-    """The RTC's word on one reconstructor."""
+    """Acknowledgement of one reconstructor by the RTC."""
 
     session: codec.Opaque
-    """The RTC's, as in the frames: an acknowledgement of another session is ignored."""
+    """Session of the RTC, as in the frames; the service ignores one of another session."""
 
     id: codec.Id | None
-    """None: the commit that is rejected could not be read."""
+    """Id of the reconstructor; None if the rejected commit could not be read."""
 
     sha256: codec.Sha256 | None
-    """Of the matrix meant, 64 lower-case hex digits; None where ``id`` is."""
+    """SHA-256 of the matrix, 64 lower-case hex digits; None if ``id`` is None."""
 
     state: AckState
-    """How far it has come."""
+    """Progress of the reconstructor."""
 
     reason: codec.Text
-    """Why it was rejected; empty otherwise."""
+    """Reason of a rejection; else empty."""
 
     frame_seq: codec.Count | None
     """First frame whose slopes the new matrix multiplies; None unless applied."""
 
 
-def _with_keys_of_layout(keys: codec.Map) -> codec.Map:
+def _flatten_layout(keys: codec.Map) -> codec.Map:
     layout = asdict(keys.pop("layout"))
     return {**keys, "dtype": DTYPE, **layout}
 
 
+# On the wire the keys of a layout are on the top level of the manifest, in one flat map. The record
+# has them in a nested ``layout``; _flatten_layout and _nest_layout convert between the two.
+
+
 def _manifest_fields(values: codec.Map, where: str) -> codec.Map:
-    values = _with_layout(values, where)
-    alpha, sigma = (codec.read_four(values, key, where) for key in ("alpha", "sigma"))
+    values = _nest_layout(values, where)
+    alpha, sigma = (codec.read_registration(values, key, where) for key in ("alpha", "sigma"))
     if alpha is not None and alpha["magnification"] <= 0.0:
         inside = f"'alpha' of {where}"
         raise codec.refusal("magnification", alpha["magnification"], "a finite number > 0", inside)
     return {**values, "alpha": alpha, "sigma": sigma}
 
 
-def _measured_fields(values: codec.Map, where: str) -> codec.Map:
-    values = _with_layout(values, where, may_fail=True)
+def _measured_manifest_fields(values: codec.Map, where: str) -> codec.Map:
+    values = _nest_layout(values, where, may_fail=True)
     return values | {"reason": None} if values["layout"]["n_chunks"] else values
 
 
 def _check_measured(manifest: MeasuredManifest, where: str) -> None:
     layout, n_modes = manifest.layout, len(manifest.modes)
-    codec.applicable(manifest, where, reason=not layout.n_chunks)
+    codec.check_applicability(manifest, where, reason=not layout.n_chunks)
     if len(manifest.amplitude_m) != n_modes or (layout.n_chunks and n_modes != layout.shape[1]):
         expected = f"one for each of {layout.shape[1]} measured modes"
         raise codec.refusal("amplitude_m", manifest.amplitude_m, expected, where)
@@ -201,9 +211,9 @@ def _check_acknowledgement(ack: Acknowledgement, where: str) -> None:
         raise codec.refusal("id, sha256", (ack.id, ack.sha256), "both, unless rejected", where)
 
 
-def _with_layout(values: codec.Map, where: str, *, may_fail: bool = False) -> codec.Map:
-    """Return the map of a manifest with its layout, whose keys are among its own, below one."""
-    if codec.get(values, "dtype", where) != DTYPE:
+def _nest_layout(values: codec.Map, where: str, *, may_fail: bool = False) -> codec.Map:
+    """Return the map of a manifest with the keys of its layout moved below ``layout``."""
+    if codec.require(values, "dtype", where) != DTYPE:
         raise codec.refusal("dtype", values["dtype"], repr(DTYPE), where)
     failed = may_fail and values.get("n_chunks") == 0
     if failed:
@@ -221,29 +231,32 @@ def _with_layout(values: codec.Map, where: str, *, may_fail: bool = False) -> co
     return {**values, "layout": asdict(layout)}
 
 
-codec.travels(
-    Manifest, "the manifest of a reconstructor", keys=_with_keys_of_layout, fields=_manifest_fields
+codec.register(
+    Manifest, "the manifest of a reconstructor", keys=_flatten_layout, fields=_manifest_fields
 )
-codec.travels(
+codec.register(
     MeasuredManifest,
     "the manifest of a measured matrix",
-    keys=_with_keys_of_layout,
-    may_be_absent=("reason",),
-    fields=_measured_fields,
+    keys=_flatten_layout,
+    optional_keys=("reason",),
+    fields=_measured_manifest_fields,
     check=_check_measured,
 )
-codec.travels(
-    Acknowledgement, "an acknowledgement", fields=codec.reason_or_none, check=_check_acknowledgement
+codec.register(
+    Acknowledgement,
+    "an acknowledgement",
+    fields=codec.nil_reason_to_text,
+    check=_check_acknowledgement,
 )
 
 
 def layout_of(matrix: NDArray[np.float32], chunk_bytes: int) -> MatrixLayout:
-    """Return the layout of a matrix that will travel in parts of ``chunk_bytes``.
+    """Return the layout of a matrix that will be sent in chunks of ``chunk_bytes``.
 
     Raises
     ------
     WireError
-        If it is not a finite, two-dimensional matrix or the chunk size is out of range.
+        If the matrix is not two-dimensional and finite, or the chunk size is out of range.
     """
     if matrix.ndim != 2 or not np.all(np.isfinite(matrix)):
         raise WireError(
@@ -262,21 +275,22 @@ def layout_of(matrix: NDArray[np.float32], chunk_bytes: int) -> MatrixLayout:
 
 
 def checksum(matrix: NDArray[np.float32]) -> str:
-    """Return the SHA-256 of a matrix as it travels, 64 lower-case hex digits."""
+    """Return the SHA-256 of a matrix's bytes on the wire, 64 lower-case hex digits."""
     return hashlib.sha256(np.ascontiguousarray(matrix, dtype=DTYPE).data).hexdigest()
 
 
 def split(matrix: NDArray[np.float32], chunk_bytes: int) -> list[bytes]:
-    """Return the bytes of a matrix in parts of ``chunk_bytes``, the last one shorter."""
+    """Return the bytes of a matrix in chunks of ``chunk_bytes``; the last may be shorter."""
     data = np.ascontiguousarray(matrix, dtype=DTYPE).data.cast("B")
     return [bytes(data[start : start + chunk_bytes]) for start in range(0, len(data), chunk_bytes)]
 
 
 class ChunkAssembler:
-    """Parts of one matrix, collected in any order; the manifest may overtake them.
+    """Collector of the chunks of one matrix, in any order, before or after its manifest.
 
-    Until the manifest is known only the bound on memory is checked; then every part is held
-    against it, and those that do not fit are dropped so that they can be asked for again.
+    zenoh sends a commit at a higher priority than chunks, so a manifest may overtake them. Until
+    it has come only the limit on memory is checked. Chunks that do not fit the manifest are
+    dropped, so that they count as missing and can be requested again.
     """
 
     __slots__ = ("_layout", "_limit_bytes", "_parts")
@@ -287,12 +301,12 @@ class ChunkAssembler:
         self._layout: MatrixLayout | None = None
 
     def add(self, index: int, data: bytes) -> None:
-        """Take one part; the first of each index wins.
+        """Add one chunk; a repeated one is ignored.
 
         Raises
         ------
         WireError
-            If it is too long, does not fit the manifest, or would break the bound on memory.
+            If it is too long, does not fit the manifest, or would exceed the limit on memory.
         """
         if index in self._parts:
             return
@@ -310,12 +324,13 @@ class ChunkAssembler:
         self._parts[index] = data
 
     def announce(self, layout: MatrixLayout) -> None:
-        """Take the manifest's layout.
+        """Set the layout from the manifest.
 
         Raises
         ------
         WireError
-            If parts that are already there do not fit it; they are dropped.
+            If it exceeds the limit on memory, or chunks that have come do not fit it; those are
+            dropped.
         """
         if layout.n_bytes > self._limit_bytes:
             raise WireError(
@@ -335,27 +350,27 @@ class ChunkAssembler:
 
     @property
     def n_bytes(self) -> int:
-        """Bytes held."""
+        """Number of bytes collected."""
         return sum(map(len, self._parts.values()))
 
     @property
     def complete(self) -> bool:
-        """Whether the manifest and every part are there."""
+        """True if the manifest and all chunks have come."""
         return self._layout is not None and len(self._parts) == self._layout.n_chunks
 
     def missing(self) -> tuple[int, ...]:
-        """Return the parts still to come; empty before the manifest is known."""
+        """Return the indices of chunks that have not come; empty before the manifest has."""
         if self._layout is None:
             return ()
         return tuple(k for k in range(self._layout.n_chunks) if k not in self._parts)
 
     def matrix(self) -> NDArray[np.float32]:
-        """Return the matrix, whole, with the announced checksum, and finite (read-only).
+        """Return the complete matrix as a read-only array.
 
         Raises
         ------
         WireError
-            If parts are missing, the checksum differs, or a number is not finite.
+            If chunks are missing, the checksum differs, or a number is not finite.
         """
         layout = self._layout
         if layout is None or not self.complete:

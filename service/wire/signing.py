@@ -1,9 +1,10 @@
-"""Signatures: what reaches mirror or service vouches for itself, whoever runs the router.
+"""Signatures of messages, which protect the mirror even if the router is not trusted.
 
-A signed message is a msgpack map that ends with four more keys; the last is an HMAC of the signer's
-role, the key it travels under, all bytes before, and of a batch its rows. What is replayed is known
-by the signer's start, by the count of what it has signed and, of what a service signs, by the start
-of the RTC that it is for.
+A signed message is a msgpack map that ends with four more keys (docs/rtc.md, "Signatures"). The
+last is an HMAC-SHA256 of the signer's role, the key expression, all bytes before it and, for
+frames, their rows. The other three detect replayed messages: the start time of the signer, the
+number of messages that it has signed and, in messages of the service, the start time of the RTC
+for which they are meant.
 """
 
 from __future__ import annotations
@@ -21,47 +22,58 @@ from service.errors import WireError
 from service.wire.codec import Map
 from service.wire.keys import Role
 
-KEYS: Final = ("signer", "signed_n", "signed_for", "mac")
-"""Last in a signed message, in this order."""
+SIGNATURE_KEYS: Final = ("signer", "signed_n", "signed_for", "mac")
+"""Last keys of a signed message, in this order."""
 
-_FIRST_KEY: Final[bytes] = msgpack.packb(KEYS[0])
-_FOUR_KEYS: Final = bytes([0x80 + len(KEYS)])
-"""The head of a map of so many."""
+_FIRST_KEY: Final[bytes] = msgpack.packb(SIGNATURE_KEYS[0])
+_MAP_HEAD: Final = bytes([0x80 + len(SIGNATURE_KEYS)])
+"""First byte of a msgpack map with these keys."""
+
+_BIN_HEAD: Final = 0xC4
+"""First byte of a msgpack ``bin`` of at most 255 bytes; its length follows."""
 
 MAC_BYTES: Final = 32
+"""Bytes of an HMAC-SHA256."""
 
-REMEMBERED: Final[dict[Role, int]] = {Role.RTC: 4096, Role.SERVICE: 8}
-"""How far a message may be behind the newest of its signer, by the signer's role: frames that zenoh
-recovers come late, and of what a service sends a swap may overtake."""
+REPLAY_WINDOW: Final[dict[Role, int]] = {Role.RTC: 4096, Role.SERVICE: 8}
+"""Largest distance of a message behind the newest of its signer, in messages, by signer's role.
 
-SIGNERS: Final = 16
-"""Services that an RTC remembers."""
+Frames that zenoh recovers come seconds late; of the messages of a service only a commit may be
+overtaken by a few.
+"""
+
+MAX_SIGNERS: Final = 16
+"""Number of services whose messages an RTC remembers; the oldest is forgotten first."""
 
 
-class Window:
-    """Which of a signer's messages have come."""
+class ReplayWindow:
+    """Record of which of the last ``size`` messages of one signer have been received."""
 
-    __slots__ = ("_came", "_newest", "_size")
+    __slots__ = ("_newest", "_seen", "_size")
 
     def __init__(self, size: int) -> None:
-        self._size, self._newest, self._came = size, -1, 0
+        self._size, self._newest, self._seen = size, -1, 0
 
     def admit(self, n: int) -> bool:
-        """Return whether a message comes for the first time and not too late."""
+        """Record message ``n``; return False if it is a repetition or too old."""
+        # bit k of ``_seen`` stands for the message k before the newest
         ahead = n - self._newest
         if ahead > 0:
             mask = (1 << self._size) - 1
-            self._came = (self._came << min(ahead, self._size) | 1) & mask
+            self._seen = (self._seen << min(ahead, self._size) | 1) & mask
             self._newest = n
             return True
-        if -ahead >= self._size or self._came >> -ahead & 1:
+        if -ahead >= self._size or self._seen >> -ahead & 1:
             return False
-        self._came |= 1 << -ahead
+        self._seen |= 1 << -ahead
         return True
 
 
 class Signatures:
-    """Signs what a program sends and checks what it is sent; without a secret, neither."""
+    """Signer and checker of messages for one program; without a secret it does neither.
+
+    All methods may be called from any thread.
+    """
 
     def __init__(
         self, secret: bytes | None, role: Role, clock_ns: Callable[[], int] = time.time_ns
@@ -72,51 +84,61 @@ class Signatures:
         self._other = Role.SERVICE if role is Role.RTC else Role.RTC
         self._lock = threading.Lock()
         self._n = 0
-        self._windows: dict[int, Window] = {}
+        self._windows: dict[int, ReplayWindow] = {}
         self.signer = clock_ns()
-        """This program's start, nanoseconds since the Unix epoch, UTC: its name as a signer."""
+        """Start time of this program, nanoseconds since the Unix epoch, UTC; its id as a signer."""
         self._newest = 0
-        """Of an RTC's starts: what a service's messages are for; 0: it has none heard."""
+        """Newest start time of an RTC received by a service; 0 on the wire until one has come."""
 
     def sign(self, key: str, data: bytes, rows: bytes = b"") -> bytes:
-        """Return a message with its signature; ``rows`` travel beside it.
+        """Return a message with its signature appended.
 
-        What is no map cannot be signed, and no message.
+        Parameters
+        ----------
+        key
+            Key expression under which the message is sent.
+        data
+            The message, a msgpack map. Anything else is returned as it is: the checker sends
+            malformed messages on purpose.
+        rows
+            Payload that is sent with the message and is signed as well.
         """
         if not self._signs or not _is_map(data):
             return data
-        n_keys, body = _opened(data)
+        n_keys, body = _split_map(data)
         with self._lock:
             n, meant = self._n, self._newest
             self._n += 1
-        values = dict(zip(KEYS, (self.signer, n, meant, b""), strict=True))
+        values = dict(zip(SIGNATURE_KEYS, (self.signer, n, meant, b""), strict=True))
+        # The keys are appended to the packed bytes, so that the message is not packed twice. The
+        # two bytes cut off are the head of the empty ``mac``.
         more = b"".join(msgpack.packb(each) for pair in values.items() for each in pair)[:-2]
-        head: bytes = msgpack.Packer().pack_map_header(n_keys + len(KEYS))
-        text = head + body + more + bytes([0xC4, MAC_BYTES])
+        head: bytes = msgpack.Packer().pack_map_header(n_keys + len(SIGNATURE_KEYS))
+        text = head + body + more + bytes([_BIN_HEAD, MAC_BYTES])
         return text + self._mac(self._role, key, text, rows)
 
     def check(self, key: str, data: bytes, rows: bytes = b"") -> None:
-        """Refuse a message that is not signed by the other side, or was sent before.
+        """Check that a message was signed by the other side and is not a replay.
 
         Raises
         ------
         WireError
-            With what was found; the text is fit for the ``reason`` of a reply.
+            If not; the text begins with ``signature`` and can be the ``reason`` of a reply.
         """
         if not self._signs:
             return
-        said = _signature(data)
+        signature = _read_signature(data)
         mac = self._mac(self._other, key, data[:-MAC_BYTES], rows)
         if not hmac.compare_digest(mac, data[-MAC_BYTES:]):
             raise WireError(
                 f"signature: wrong on {key}: signed with another key, or changed on its way"
             )
         with self._lock:
-            self._admit(said)
+            self._admit(signature)
 
-    def _admit(self, said: Map) -> None:
-        signer, n = said["signer"], said["signed_n"]
-        if self._role is Role.RTC and said["signed_for"] != self.signer:
+    def _admit(self, signature: Map) -> None:
+        signer, n = signature["signer"], signature["signed_n"]
+        if self._role is Role.RTC and signature["signed_for"] != self.signer:
             raise WireError(
                 "signature: meant for another start of the RTC: sent before, or too early"
             )
@@ -127,11 +149,13 @@ class Signatures:
             )
         if signer not in self._windows:
             if self._role is Role.SERVICE:
+                # A service follows one RTC: a restart makes all messages of earlier starts void.
+                # An RTC hears several services, of which one drives and the others stand by.
                 self._newest = signer
                 self._windows.clear()
-            elif len(self._windows) >= SIGNERS:
+            elif len(self._windows) >= MAX_SIGNERS:
                 del self._windows[min(self._windows)]
-            self._windows[signer] = Window(REMEMBERED[self._other])
+            self._windows[signer] = ReplayWindow(REPLAY_WINDOW[self._other])
         if not self._windows[signer].admit(n):
             raise WireError(f"signature: message {n} of its signer came before, or too late")
 
@@ -144,32 +168,32 @@ class Signatures:
 
 
 UNSIGNED: Final = Signatures(None, Role.RTC)
-"""Neither signs nor checks."""
+"""Signer without a secret, which neither signs nor checks."""
 
 
 def _is_map(data: bytes) -> bool:
     return data[:1] == b"\xde" or (len(data) > 0 and 0x80 <= data[0] <= 0x8F)
 
 
-def _opened(data: bytes) -> tuple[int, bytes]:
-    """Return how many keys a map has, and all behind its head."""
+def _split_map(data: bytes) -> tuple[int, bytes]:
+    """Return the number of keys of a packed map, and the bytes behind its head."""
     first = data[0]
     if 0x80 <= first <= 0x8F:
         return first & 0x0F, data[1:]
     return int.from_bytes(data[1:3]), data[3:]  # no message has 65,536 keys
 
 
-def _signature(data: bytes) -> dict[str, Any]:
-    """Return the keys of a message's signature; the rest is read by whoever uses it."""
+def _read_signature(data: bytes) -> dict[str, Any]:
+    """Return the four keys of a message's signature, without parsing the rest of it."""
     begin = data.rfind(_FIRST_KEY)
     try:
-        said = msgpack.unpackb(_FOUR_KEYS + data[begin:]) if begin >= 0 else None
+        signature = msgpack.unpackb(_MAP_HEAD + data[begin:]) if begin >= 0 else None
     except (ValueError, msgpack.exceptions.UnpackException):
-        said = None
-    if not isinstance(said, dict) or tuple(said) != KEYS:
-        raise WireError("signature: none, and one is asked for")
-    *numbers, mac = said.values()
+        signature = None
+    if not isinstance(signature, dict) or tuple(signature) != SIGNATURE_KEYS:
+        raise WireError("signature: none, and this system requires one")
+    *numbers, mac = signature.values()
     is_whole = all(type(number) is int and 0 <= number < 2**63 for number in numbers)
     if not is_whole or not isinstance(mac, bytes) or data[-MAC_BYTES:] != mac:
-        raise WireError("signature: not of the form that docs/rtc.md has")
-    return said
+        raise WireError("signature: a key has another type than docs/rtc.md says")
+    return signature

@@ -1,6 +1,7 @@
-"""What is told again and again: frames and status by the RTC, state and alarms by the service.
+"""Messages that are sent continuously: frames and status of the RTC, state and alarms of pyrcal.
 
-A batch of frames is a msgpack attachment and raw float32 rows; the others are msgpack maps.
+A batch of frames is a payload of raw float32 rows with a msgpack attachment that describes them.
+The other messages are msgpack maps.
 """
 
 from __future__ import annotations
@@ -21,29 +22,30 @@ from service.wire import codec, commands
 
 
 BATCH_LIMIT: Final = 4_000_000
-"""Bytes: a longer payload is refused unread."""
+"""Largest payload of a batch, in bytes; a longer one is refused before it is parsed."""
 
 ATTACHMENT_LIMIT: Final = 4096
-"""Bytes: a longer attachment is refused unread."""
+"""Largest attachment of a batch, in bytes; a longer one is refused before it is parsed."""
 
 FRAMES_PER_BATCH: Final = 50
-"""Most frames in one batch."""
+"""Largest number of frames in one batch."""
 
 COLUMN_LIMIT: Final = BATCH_LIMIT // 4
+"""Largest number of float32 values in one row."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameHeader:
-    """Description of a batch's rows."""
+    """Description of the rows of a batch."""
 
     session: codec.Opaque
-    """New when the RTC starts, or its sequence or integrator starts over."""
+    """Session; a new one begins when the RTC starts, or resets its sequence or integrator."""
 
     seq0: Annotated[int, codec.integer(high=2**62)]
     """Sequence number of row 0; row i is ``seq0 + i``."""
 
     n: Annotated[int, codec.integer(1, FRAMES_PER_BATCH)]
-    """Rows, 1..50."""
+    """Number of rows, 1..50."""
 
     t0_ns: Annotated[int, codec.integer(high=2**62)]
     """End of exposure of row 0, nanoseconds since the Unix epoch, UTC."""
@@ -52,56 +54,57 @@ class FrameHeader:
     """Nominal frame period, nanoseconds."""
 
     n_slopes: Annotated[int, codec.integer(1, COLUMN_LIMIT)]
-    """Slopes of a row."""
+    """Number of slopes in a row."""
 
     n_modes: Annotated[int, codec.integer(1, COLUMN_LIMIT)]
-    """Commands of a row: the whole basis, controlled or not."""
+    """Number of modal commands in a row: the whole basis, controlled or not."""
 
     dither: bool
-    """Whether each row ends with the dither's share of its commands."""
+    """True if each row ends with the part of its commands that is dither."""
 
     cm_id: codec.Id | None
-    """The reconstructor that multiplies these slopes; None when the RTC does not know."""
+    """Id of the reconstructor that multiplies these slopes; None if the RTC does not know it."""
 
     basis_id: codec.Opaque
-    """Of the modal basis; changes with modes, order and scale."""
+    """Id of the modal basis; changes with modes, order and scale."""
 
     config_id: codec.Opaque
-    """Of the sensor; changes with mask, slope recipe, reference slopes, binning, modulation."""
+    """Id of the sensor configuration; changes with mask, slope recipe, reference slopes, binning
+    and modulation."""
 
     @property
     def n_columns(self) -> int:
-        """Floats of a row: slopes, commands and, if there, the dither."""
+        """Number of floats in a row: slopes, commands and, if present, dither."""
         return self.n_slopes + self.n_modes * (2 if self.dither else 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameBatch:
-    """Consecutive frames as they travel.
+    """Batch of consecutive frames as received.
 
-    Row k holds the slopes and the command that was on the mirror during the exposure that made
-    them; the arrays are read-only views of the received bytes.
+    Row k has the slopes of one exposure and the command that was on the mirror during it. The
+    arrays are read-only views of the received bytes.
     """
 
     header: FrameHeader
-    """What the rows mean."""
+    """Description of the rows."""
 
     rows: NDArray[np.float32]
-    """``(n, n_columns)``: slopes | commands | dither, if there."""
+    """Rows ``(n, n_columns)``: slopes | commands | dither, if present."""
 
     @property
     def slopes(self) -> NDArray[np.float32]:
-        """``(n, n_slopes)``, in the RTC's own order and sign."""
+        """Slopes ``(n, n_slopes)``, in the order and with the signs of the RTC."""
         return self.rows[:, : self.header.n_slopes]
 
     @property
     def commands_m(self) -> NDArray[np.float32]:
-        """``(n, n_modes)``: total modal command, dither included, metres OPD."""
+        """Total modal commands ``(n, n_modes)``, dither included, metres OPD."""
         return self.rows[:, self.header.n_slopes : self.header.n_slopes + self.header.n_modes]
 
     @property
     def dither_m(self) -> NDArray[np.float32] | None:
-        """``(n, n_modes)``: the dither's share, metres OPD; None without dither."""
+        """Dither ``(n, n_modes)`` within the commands, metres OPD; None if not sent."""
         if not self.header.dither:
             return None
         return self.rows[:, self.header.n_slopes + self.header.n_modes :]
@@ -113,14 +116,14 @@ def encode_frames(header: FrameHeader, rows: NDArray[np.float32]) -> tuple[bytes
     Parameters
     ----------
     header
-        What the rows mean.
+        Description of the rows.
     rows
-        ``(n, n_columns)``: slopes | commands in metres | the dither's share if ``header.dither``.
+        Rows ``(n, n_columns)``: slopes | commands, metres OPD | dither if ``header.dither``.
 
     Raises
     ------
     WireError
-        If the rows are not what the header says, or the batch is longer than the limit.
+        If the shape of the rows contradicts the header, or the batch is too long.
     """
     if rows.shape != (header.n, header.n_columns):
         raise WireError(
@@ -133,14 +136,14 @@ def encode_frames(header: FrameHeader, rows: NDArray[np.float32]) -> tuple[bytes
 
 
 def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
-    """Return the batch; its rows are a view of ``payload``, nothing is copied.
+    """Return the batch of a payload and its attachment, without copying the rows.
 
-    The values are not looked at: a frame with a NaN costs one frame, not its batch.
+    The values are not checked here, so that a NaN costs one frame and not the whole batch.
 
     Raises
     ------
     WireError
-        If attachment or payload break the contract or do not fit together.
+        If attachment or payload break the contract or contradict each other.
     """
     if attachment is None:
         raise WireError("missing: attachment of a frame batch")
@@ -154,10 +157,10 @@ def decode_frames(payload: bytes, attachment: bytes | None) -> FrameBatch:
     return FrameBatch(header=header, rows=rows)
 
 
-codec.travels(
+codec.register(
     FrameHeader,
     "the attachment of a frame batch",
-    opened=lambda data, where: codec.unpack(data, where, ATTACHMENT_LIMIT),
+    unpack=lambda data, where: codec.unpack(data, where, ATTACHMENT_LIMIT),
 )
 
 
@@ -174,11 +177,11 @@ def _check_sizes(payload: bytes, header: FrameHeader) -> None:
 
 
 STATUS_LIMIT: Final = codec.MESSAGE_LIMIT + 16 * 512**2
-"""Bytes: a longer status is refused unread; its images come on top of what a message may have."""
+"""Largest status, in bytes; its flux images may add to the size of an ordinary message."""
 
-A_STATUS: Final = "a status"
+STATUS_NAME: Final = "a status"
 
-ESSENTIAL: Final = (
+ESSENTIAL_KEYS: Final = (
     "session",
     "loop",
     "cm_id",
@@ -189,113 +192,113 @@ ESSENTIAL: Final = (
     "basis_id",
     "config_id",
 )
-"""What of a status must not be missed, however soon the next one comes."""
+"""Keys of a status whose changes must not be missed, even if a newer status has come already."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DitherStatus:
-    """The dither the RTC is playing."""
+    """Dither that the RTC is playing."""
 
     request: commands.DitherRequest
-    """What was asked for."""
+    """Command that started it."""
 
     start_seq: codec.Count
-    """First frame whose exposure contains it."""
+    """First frame whose exposure contains the dither."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pointing:
-    """A direction of the telescope."""
+    """Pointing of the telescope."""
 
     elevation_deg: Annotated[float, codec.number(-90.0, 90.0)]
-    """Above the horizon."""
+    """Elevation above the horizon."""
 
     azimuth_deg: Annotated[float, codec.number(-720.0, 720.0)]
-    """From north over east; only differences count."""
+    """Azimuth from north over east; only differences matter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlLaw:
-    """The integrator of the loop: ``c[k+d] = leak * c[k+d-1] - gain * R s[k]``."""
+    """Integrator of the loop: ``c[k+d] = leak * c[k+d-1] - gain * R s[k]``."""
 
     delay_frames: Annotated[float, codec.number(0.0, 100.0)]
-    """End to end, from exposure to the command that answers it."""
+    """Delay d from an exposure to the command that corrects it."""
 
     gains: tuple[Annotated[float, codec.number(0.0)], ...]
-    """One per mode of the basis, 0 where uncontrolled."""
+    """Integrator gain of each mode of the basis, 0 for an uncontrolled mode."""
 
     leak: Annotated[float, codec.number(0.0, 1.0)]
-    """Per frame; 1 forgets nothing."""
+    """Leak factor per frame; 1 is a pure integrator."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status(ControlLaw):
-    """The RTC's own account of its loop, a few times a second."""
+    """Status of the RTC's loop, sent a few times a second."""
 
     session: codec.Opaque
-    """As in the frames."""
+    """Session, as in the frames."""
 
     seq: codec.Count | None
-    """The last frame processed; None: there has been none yet."""
+    """Last frame processed; None before the first."""
 
     t_ns: codec.Count
-    """Nanoseconds since the Unix epoch, UTC."""
+    """Time of the status, nanoseconds since the Unix epoch, UTC."""
 
     loop: commands.Loop
-    """Closed, open, or closed with the gain of some controlled modes at 0."""
+    """State: closed, open, or closed with the gain of some controlled modes at 0."""
 
     frame_rate_hz: Annotated[float, codec.above(0.0, 1e6)]
-    """Frames a second, nominal or measured."""
+    """Frame rate, nominal or measured."""
 
     n_slopes: Annotated[int, codec.integer(1)]
-    """Slopes of a frame."""
+    """Number of slopes in a frame."""
 
     n_modes: Annotated[int, codec.integer(1)]
-    """Modes of the whole basis, controlled or not."""
+    """Number of modes of the whole basis, controlled or not."""
 
     n_controlled: codec.Count
-    """Modes that the reconstructor in use commands, the first ones of the basis."""
+    """Number of modes that the reconstructor in use commands, the first ones of the basis."""
 
     cm_id: codec.Id | None
-    """The reconstructor in use; None when the RTC does not know."""
+    """Id of the reconstructor in use; None if the RTC does not know it."""
 
     basis_id: codec.Opaque
-    """Of the modal basis, as in the frames."""
+    """Id of the modal basis, as in the frames."""
 
     config_id: codec.Opaque
-    """Of the sensor, as in the frames."""
+    """Id of the sensor configuration, as in the frames."""
 
     dither: DitherStatus | None
-    """What plays, as it was asked for; None: nothing does."""
+    """Dither that is running; None if there is none."""
 
     max_dither_m: Annotated[float, codec.number(0.0)]
-    """Most the RTC accepts for one mode, metres RMS."""
+    """Largest amplitude that the RTC accepts for one mode, metres RMS."""
 
     max_dither_modes: codec.Count
-    """Most modes the RTC dithers at once."""
+    """Largest number of modes that the RTC dithers at once."""
 
     magnitude: codec.Finite | None
-    """Of the guide star."""
+    """Magnitude of the guide star; None if unknown."""
 
     flux: bytes | None = field(default=None, repr=False)
     """``<f4`` ``[4, n_subapertures, n_subapertures]``, counts per frame averaged over a second."""
 
     pointing: Pointing | None = None
-    """An extension: an RTC that does not know it may leave the key out."""
+    """Pointing of the telescope; an extension that an RTC may leave out."""
 
     trouble: codec.Text | None = None
-    """An extension: what is wrong on the RTC's side, for people; None or no such key: nothing."""
+    """Fault on the RTC's side, for people; an extension; None or left out if there is none."""
 
     @property
     def dither_id(self) -> str | None:
-        """The dither now running; None: none."""
+        """Id of the dither that is running; None if there is none."""
         return None if self.dither is None else self.dither.request.id
 
     @property
     def in_loop(self) -> tuple[int, ...]:
-        """Modes the loop moves, the controlled ones with a gain; none: it is open.
+        """Modes that the loop moves: controlled, with a gain above 0; empty if it is open.
 
-        Some gains of 0 ("partial") make it a loop of the other modes, no less closed.
+        A "partial" loop is a closed loop of the modes that have a gain.
         """
         if self.loop == commands.Loop.OPEN:
             return ()
@@ -303,7 +306,7 @@ class Status(ControlLaw):
 
     @property
     def flux_images(self) -> NDArray[np.float32] | None:
-        """``(4, n_subapertures, n_subapertures)``, in row-major order of their place."""
+        """Flux images ``(4, n_subapertures, n_subapertures)``, row-major on the detector."""
         if self.flux is None:
             return None
         side = math.isqrt(len(self.flux) // 16)
@@ -312,72 +315,74 @@ class Status(ControlLaw):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StateMessage:
-    """The service's state for all subscribers; an RTC ignores it."""
+    """State of the service, for all subscribers; an RTC ignores it."""
 
     system: codec.Id
     """The ``{system}`` of the keys."""
 
     t_ns: codec.Count
-    """When it was said, nanoseconds since the Unix epoch, UTC."""
+    """Time of the message, nanoseconds since the Unix epoch, UTC."""
 
     mode: codec.Text
-    """How much the service may do by itself: auto, propose or hold."""
+    """Degree of autonomy of the service: auto, propose or hold."""
 
     alpha: Mapping[str, float] | None
-    """Registration: shifts in subapertures, rotation in degrees, ratio; None: not known yet."""
+    """Registration: shifts in subapertures, rotation in degrees, ratio; None if not known yet."""
 
     sigma: Mapping[str, float] | None
     """1 σ of ``alpha``, same names and units."""
 
     in_use: codec.Id | None
-    """The reconstructor the RTC multiplies with; None: unknown."""
+    """Id of the reconstructor that the RTC uses; None if unknown."""
 
     validity: codec.Text | None = None
-    """Whether ``alpha`` may be relied on: fresh, ageing, stale or invalid; None: nothing is known,
-    or a service of before this key said it."""
+    """Validity of ``alpha``: fresh, ageing, stale or invalid; None if there is no ``alpha``, or the
+    service is older than this key."""
 
     waiting_for: tuple[codec.Text, ...] = ()
-    """Whom the service waits for and what they should do."""
+    """Conditions that the service waits for, each with what somebody should do."""
 
     operation: codec.Text | None = None
-    """What the service is in and does, like "Operational, Tracking"; None: a service of before this
-    key said it."""
+    """State and operation of the service, like "Operational, Tracking"; None if the service is
+    older than this key."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmMessage:
-    """One alarm that began or ended, for all subscribers."""
+    """Alarm that began or ended, for all subscribers."""
 
     system: codec.Id
     """The ``{system}`` of the keys."""
 
     t_ns: codec.Count
-    """When it came or went, nanoseconds since the Unix epoch, UTC."""
+    """Time at which it began or ended, nanoseconds since the Unix epoch, UTC."""
 
     name: codec.Opaque
-    """Machine-readable."""
+    """Name of the alarm, for programs."""
 
     active: bool
-    """False: it is over."""
+    """True if it began, false if it ended."""
 
     text: codec.Text
-    """What was found, and what to do."""
+    """Description of the finding and of what to do."""
 
 
 def essentials(data: bytes) -> tuple[object, ...]:
-    """Return what of a status must not be missed, unchecked; two that differ in it both count.
+    """Return the values of :data:`ESSENTIAL_KEYS` in the bytes of a status, unchecked.
+
+    The link drops a status that the next one has overtaken, unless these values differ.
 
     Raises
     ------
     WireError
-        If the message is no map, or too long.
+        If the message is not a map, or is too long.
     """
-    values = _opened(data, A_STATUS)
-    return tuple(values.get(key) for key in ESSENTIAL)
+    values = _unpack_status(data, STATUS_NAME)
+    return tuple(values.get(key) for key in ESSENTIAL_KEYS)
 
 
-def _opened(data: bytes, where: str) -> codec.Map:
-    """Return the map of a status that is no longer than its limit, its images left aside."""
+def _unpack_status(data: bytes, where: str) -> codec.Map:
+    """Return the map of a status after the check of its size, with and without flux images."""
     values = codec.unpack(data, where, STATUS_LIMIT)
     flux = values.get("flux")
     n_bytes = len(data) - (len(flux) if isinstance(flux, bytes) else 0)
@@ -392,6 +397,7 @@ def _opened(data: bytes, where: str) -> codec.Map:
 def _status_keys(keys: codec.Map) -> codec.Map:
     playing = keys["dither"]
     if keys["trouble"] is None:
+        # absent and nil mean the same; a status without a fault is the one of version 1
         del keys["trouble"]
     if playing is None:
         return keys
@@ -399,11 +405,11 @@ def _status_keys(keys: codec.Map) -> codec.Map:
 
 
 def _status_fields(values: codec.Map, where: str) -> codec.Map:
-    playing, inside = codec.get(values, "dither", where), f"'dither' of {where}"
+    playing, inside = codec.require(values, "dither", where), f"'dither' of {where}"
     if playing is None:
         return values
-    request = codec.of_map(commands.DitherRequest, codec.as_map(playing, inside), inside)
-    start_seq = codec.get(playing, "start_seq", inside)
+    request = codec.from_map(commands.DitherRequest, codec.require_map(playing, inside), inside)
+    start_seq = codec.require(playing, "start_seq", inside)
     return {**values, "dither": {"request": asdict(request), "start_seq": start_seq}}
 
 
@@ -419,25 +425,25 @@ def _check_status(status: Status, where: str) -> None:
 
 
 def _state_fields(values: codec.Map, where: str) -> codec.Map:
-    four = {key: codec.read_four(values, key, where) for key in ("alpha", "sigma")}
+    four = {key: codec.read_registration(values, key, where) for key in ("alpha", "sigma")}
     return {**values, **four, "waiting_for": values.get("waiting_for") or ()}
 
 
-codec.travels(
+codec.register(
     Status,
-    A_STATUS,
+    STATUS_NAME,
     first=("session", "seq", "t_ns", "loop", "frame_rate_hz"),
-    may_be_absent=("pointing", "trouble"),
-    opened=_opened,
+    optional_keys=("pointing", "trouble"),
+    unpack=_unpack_status,
     keys=_status_keys,
     fields=_status_fields,
     check=_check_status,
 )
-codec.travels(
+codec.register(
     StateMessage,
     "a state message",
-    may_be_absent=("validity", "waiting_for", "operation"),
+    optional_keys=("validity", "waiting_for", "operation"),
     fields=_state_fields,
-    held=False,
+    checked_when_sent=False,
 )
-codec.travels(AlarmMessage, "an alarm message", held=False)
+codec.register(AlarmMessage, "an alarm message", checked_when_sent=False)

@@ -406,7 +406,8 @@ def test_what_nobody_has_signed_is_not_believed(signed):
     assert after.statuses_received == before.statuses_received
     assert set(after.messages_malformed) == {"ack", "frames", "status"}
     texts = {each.text for each in after.dispositions if each.outcome == "malformed"}
-    assert texts == {"signature: none, and one is asked for"}
+    assert len(texts) == 1
+    assert texts.pop().startswith("signature: none")
 
 
 def test_what_was_said_before_is_not_believed_again(signed):
@@ -489,5 +490,5 @@ def test_an_rtc_that_does_not_sign_is_named_where_signatures_are_asked_for():
             time.sleep(0.1)
         assert "signature: none" in complaints(bridge.statistics())["messages-refused"]
         order = LoopRequest(id="a", leak=0.98)
-        with pytest.raises(LinkError, match="unusable: signature: none, and one is asked for"):
+        with pytest.raises(LinkError, match="signature: none"):
             asyncio.run(bridge.command(order))

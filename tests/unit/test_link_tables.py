@@ -19,7 +19,7 @@ from service.config.link_tables import (
 from service.errors import ConfigurationError
 from service.link.guard import LinkSecurity
 from service.wire import Keys
-from service.wire.access import LinkRole, Rights, access_control, rights_of
+from service.wire.access import LinkRole, Rights, access_control, list_rights
 
 
 @pytest.fixture(scope="module")
@@ -107,14 +107,14 @@ def test_all_that_zenoh_is_told_it_takes(folder):
 
 def test_a_role_without_names_has_no_subject_and_no_rule():
     names = {LinkRole.RTC: ("a", "b"), LinkRole.SERVICE: (), LinkRole.VIEWER: ()}
-    control = access_control(Keys("bench"), names, named_by="usernames")
+    control = access_control(Keys("bench"), names, subject_kind="usernames")
     assert control["subjects"] == [{"id": "rtc", "usernames": ["a", "b"]}]
     assert all(rule["id"].startswith("rtc-") for rule in control["rules"])
 
 
 def test_only_a_service_puts_matrices_and_commands_and_only_an_rtc_telemetry():
     keys = Keys("bench")
-    rights = rights_of(keys)
+    rights = list_rights(keys)
     assert [role for role in rights if keys.all_commits in rights[role].puts] == ["service"]
     assert [role for role in rights if keys.command("*") in rights[role].queries] == ["service"]
     for key in (keys.frames, keys.status, keys.acknowledgement):
@@ -130,7 +130,7 @@ def test_only_a_service_puts_matrices_and_commands_and_only_an_rtc_telemetry():
 
 def test_nobody_may_delete():
     names = {role: (str(role),) for role in LinkRole}
-    control = access_control(Keys("bench"), names, named_by="usernames")
+    control = access_control(Keys("bench"), names, subject_kind="usernames")
     assert not [rule for rule in control["rules"] if "delete" in rule["messages"]]
 
 

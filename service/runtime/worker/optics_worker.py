@@ -9,8 +9,14 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.control.dither import information
-from service.control.expected_gain import ExpectedGain, Sky, beyond_m2, expected_gain, noise_of_star
+from service.control.dither import compute_information
+from service.control.expected_gain import (
+    ExpectedGain,
+    Sky,
+    estimate_slope_noise,
+    expected_gain,
+    extrapolate_variance_m2,
+)
 from service.control.gains import CalibrationGains
 from service.control.gate import GateVerdict, judge
 from service.control.loop import ControlLoop
@@ -165,7 +171,7 @@ class OpticsWorker:
             n_modes=model.basis.n_modes,
             mode_variance_m2=model.basis.variance_m2,
             actuators=actuators_of(model),
-            mode_information=information(linearisation),
+            mode_information=compute_information(linearisation),
             kind=model.instrument.slopes.kind,
             products=linearisation.matrix.T @ linearisation.matrix,
             diameter_m=model.instrument.diameter_m,
@@ -415,7 +421,7 @@ class OpticsWorker:
 
         def judged(n_modes: int) -> Made:
             inversion = reconstruct(matrix, self._recipe(n_modes))
-            of_these = replace(conditions, loop=loop.of(slice(n_modes)))
+            of_these = replace(conditions, loop=loop.select_modes(slice(n_modes)))
             verdict = self.judge(inversion.matrix, of_these)
             return Made(
                 matrix=inversion.matrix, condition_number=inversion.condition_number, gate=verdict
@@ -440,7 +446,7 @@ class OpticsWorker:
         fresh = reconstruct(flat, self._recipe(n_modes)).matrix
         noise, kind = self._compute.slope_noise, model.instrument.slopes.kind
         if magnitude is not None:
-            noise = noise_of_star(
+            noise = estimate_slope_noise(
                 model.instrument,
                 magnitude=magnitude,
                 frame_rate_hz=loop.frame_rate_hz,
@@ -448,7 +454,7 @@ class OpticsWorker:
             )
         sky = Sky(
             variance_m2=model.basis.variance_m2,
-            beyond_m2=beyond_m2(model.basis.variance_m2),
+            beyond_m2=extrapolate_variance_m2(model.basis.variance_m2),
             crossing_hz=self._compute.wind_m_s / model.instrument.diameter_m,
             slope_noise=noise * kind.noise,
         )

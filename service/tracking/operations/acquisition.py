@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.control.gate import FORGIVING_LEAK
+from service.control.gate import MAX_SLIP_SAFE_LEAK
 from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
@@ -206,7 +206,7 @@ def _closed_stage(context: StepContext, rtc: Status) -> None:
     elif acquisition.stage is AcquisitionStage.WIDENING:
         _widen(context, rtc, record)
     elif record is None:
-        if acquisition.command is None or rtc.leak <= FORGIVING_LEAK:
+        if acquisition.command is None or rtc.leak <= MAX_SLIP_SAFE_LEAK:
             _make(context, acquisition.n_modes, rtc)
     elif rtc.cm_id != record.id:
         return
@@ -260,10 +260,10 @@ def _on_refused(context: StepContext, record: ReconstructorRecord) -> None:
     slippery = gate is not None and gate.edge_motion_m is not None
     if acquisition.stage is AcquisitionStage.WIDENING:
         stages.set_acquisition(context, replace(acquisition, max_modes=acquisition.n_modes))
-    elif slippery and rtc is not None and rtc.leak > FORGIVING_LEAK:
-        text = f"a leak of {FORGIVING_LEAK} is to keep the outer ring in place"
+    elif slippery and rtc is not None and rtc.leak > MAX_SLIP_SAFE_LEAK:
+        text = f"a leak of {MAX_SLIP_SAFE_LEAK} is to keep the outer ring in place"
         context.log("acquisition.leak", text)
-        stages.request_loop(context, cmd.SetLoop(leak=FORGIVING_LEAK))
+        stages.request_loop(context, cmd.SetLoop(leak=MAX_SLIP_SAFE_LEAK))
     else:
         reason = gate.reason if gate is not None else record.reason
         stages.fail_acquisition(context, f"no number of modes passes the gate: {reason}")

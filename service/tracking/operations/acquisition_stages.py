@@ -8,13 +8,13 @@ from functools import lru_cache
 import numpy as np
 
 from service.control.dither import (
-    FEWEST_LINES,
-    FINER,
-    FIRST_CLOSED,
-    SMOOTH,
+    COARSE_BAND,
+    FINE_BAND,
+    FIRST_LOOP_MODES,
+    MIN_LINES,
     Band,
-    lines_of,
-    modes_of,
+    spread_lines,
+    spread_modes,
 )
 from service.estimation.loop import NO_RTC
 from service.estimation.windows import RefusalKind
@@ -80,7 +80,7 @@ STOPS_WITHIN_S = 2.0
 
 def band_of(stage: AcquisitionStage) -> Band:
     """Return the band of modes that is dithered in a stage with the loop open."""
-    return SMOOTH if stage is AcquisitionStage.COARSE else FINER
+    return COARSE_BAND if stage is AcquisitionStage.COARSE else FINE_BAND
 
 
 def wide_capture_dither(
@@ -111,20 +111,20 @@ def _wide_capture_modes(
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return the modes dithered in a stage with the loop open, and lines for them, Hz."""
     lines = _lines(rtc.frame_rate_hz, rtc.max_dither_modes)
-    return modes_of(band_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
+    return spread_modes(band_of(stage), rtc.n_modes, len(lines)) if lines else (), lines
 
 
 @lru_cache(maxsize=4)
 def _lines(frame_rate_hz: float, n_lines: int) -> tuple[float, ...]:
     """Return the lines of an RTC; whether there are enough is asked with every state shown."""
-    return lines_of(frame_rate_hz, WINDOW_S, n_lines)
+    return spread_lines(frame_rate_hz, WINDOW_S, n_lines)
 
 
 def _why_too_few(modes: tuple[int, ...], rtc: Status) -> str | None:
-    if len(modes) >= FEWEST_LINES:
+    if len(modes) >= MIN_LINES:
         return None
     return (
-        f"found room for {len(modes)} dithered modes; expected at least {FEWEST_LINES}: the "
+        f"found room for {len(modes)} dithered modes; expected at least {MIN_LINES}: the "
         f"RTC plays {rtc.max_dither_modes} at once, at {rtc.frame_rate_hz:g} Hz, and its basis "
         f"has {rtc.n_modes}"
     )
@@ -176,7 +176,7 @@ def begin_acquisition(context: StepContext, rtc: Status, *, why: str, commanded:
             commanded=commanded,
             attempt=1,
             found=found,
-            n_modes=min(found.n_controlled, FIRST_CLOSED),
+            n_modes=min(found.n_controlled, FIRST_LOOP_MODES),
             sent=left is not None and left.sent,
             cause=context.cause,
         ),

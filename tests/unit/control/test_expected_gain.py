@@ -7,10 +7,10 @@ import pytest
 
 from service.control.expected_gain import (
     Sky,
-    beyond_m2,
+    compute_radial_orders,
+    estimate_noise_loss_m,
     expected_gain,
-    explained_by_noise,
-    radial_order,
+    extrapolate_variance_m2,
 )
 from service.control.loop import ControlLoop
 from service.control.reconstructor import invert
@@ -154,20 +154,20 @@ def test_the_tail_of_a_power_law_is_its_integral():
     modes = np.arange(1, 301)
     law = modes ** (-11 / 6)
     beyond = np.sum(np.arange(301, 2_000_000) ** (-11 / 6))
-    assert beyond_m2(law) == pytest.approx(beyond, rel=2e-3)
+    assert extrapolate_variance_m2(law) == pytest.approx(beyond, rel=2e-3)
 
 
 def test_radial_orders_count_like_zernikes_without_piston():
-    assert radial_order(9).tolist() == [1, 1, 2, 2, 2, 3, 3, 3, 3]
+    assert compute_radial_orders(9).tolist() == [1, 1, 2, 2, 2, 3, 3, 3, 3]
 
 
 class TestNoise:
     """How much of a loss is only the registration's own uncertainty."""
 
     def test_a_step_of_two_sigma_in_one_parameter_is_all_noise(self):
-        assert explained_by_noise(1e-9, np.array([2.0, 0, 0, 0]), np.eye(4)) == 1e-9
+        assert estimate_noise_loss_m(1e-9, np.array([2.0, 0, 0, 0]), np.eye(4)) == 1e-9
 
     def test_a_large_step_is_hardly_any(self):
-        assert explained_by_noise(1e-9, np.array([20.0, 0, 0, 0]), np.eye(4)) == pytest.approx(
+        assert estimate_noise_loss_m(1e-9, np.array([20.0, 0, 0, 0]), np.eye(4)) == pytest.approx(
             1e-11
         )

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.control.expected_gain import noise_of_star
+from service.control.expected_gain import estimate_slope_noise
 from tests.numerics import small_instrument
 
 
 def test_a_bright_star_has_photon_noise_and_a_faint_one_four_reads_besides():
     bright, dimmer, faint = (
-        noise_of_star(small_instrument(), magnitude=m, frame_rate_hz=1000.0, n_valid=100)
+        estimate_slope_noise(small_instrument(), magnitude=m, frame_rate_hz=1000.0, n_valid=100)
         for m in (-5.0, 0.0, 12.5)
     )
     assert dimmer == pytest.approx(10.0 * bright, rel=1e-3)

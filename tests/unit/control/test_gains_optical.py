@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from service.control.gains import (
-    FACTOR_BOUNDS,
+    GAIN_FACTOR_RANGE,
     REFERENCE_GAINS,
     REFERENCE_MODES,
     ModeGain,
@@ -74,7 +74,9 @@ def test_factors_have_mean_one_and_stay_within_bounds():
     table = table_of(HIGH, reference(HIGH), np.full(4, 0.01), 594)
     assert table.factors.mean() == pytest.approx(1.0)
     steep = table_of(np.array([0, 300]), np.array([0.1, 1.0]), np.full(2, 1e-3), 594)
-    assert FACTOR_BOUNDS[0] <= steep.factors.min() <= steep.factors.max() == FACTOR_BOUNDS[1]
+    assert (
+        GAIN_FACTOR_RANGE[0] <= steep.factors.min() <= steep.factors.max() == GAIN_FACTOR_RANGE[1]
+    )
 
 
 def test_the_gains_act_alike_on_every_mode():

@@ -9,7 +9,13 @@ import pytest
 import scipy
 
 from service.control import gate
-from service.control.gate import FORGIVING_LEAK, HELD_LIMIT_M, LIMIT_M, NEAR, judge
+from service.control.gate import (
+    MAX_EDGE_MOTION_M,
+    MAX_HELD_EDGE_MOTION_M,
+    MAX_SLIP_SAFE_LEAK,
+    RADIUS_TOLERANCE,
+    judge,
+)
 from service.control.loop import ControlLoop, pole_radius
 from service.control.reconstructor import invert
 from service.model.misregistration import Misregistration
@@ -285,10 +291,10 @@ def test_a_stable_loop_whose_edge_would_slip_is_refused_and_a_leak_forgives_it()
     quiet, loud = verdict(loop=with_ring(0.1)), verdict(loop=with_ring(10.0))
     assert quiet.accepted
     assert loud.edge_motion_m == pytest.approx(100.0 * quiet.edge_motion_m)
-    assert loud.edge_motion_m > LIMIT_M > quiet.edge_motion_m
+    assert loud.edge_motion_m > MAX_EDGE_MOTION_M > quiet.edge_motion_m
     assert not loud.accepted
     assert loud.reason.startswith("its outer ring would slip")
-    assert verdict(loop=with_ring(10.0, FORGIVING_LEAK)).accepted
+    assert verdict(loop=with_ring(10.0, MAX_SLIP_SAFE_LEAK)).accepted
 
 
 class TestHolding:
@@ -300,7 +306,7 @@ class TestHolding:
         return replace(with_ring(motion_m / of_unit), **changes)
 
     def test_it_may_move_a_little_more_than_one_that_is_to_be_closed(self):
-        between_m = (LIMIT_M + HELD_LIMIT_M) / 2
+        between_m = (MAX_EDGE_MOTION_M + MAX_HELD_EDGE_MOTION_M) / 2
         assert not verdict(loop=self.loop(between_m)).accepted
         held = verdict(loop=self.loop(between_m, n_holding=N_CONTROLLED))
         assert held.accepted
@@ -308,15 +314,15 @@ class TestHolding:
 
     @pytest.mark.parametrize("n_holding", [N_CONTROLLED - 1, N_CONTROLLED + 1])
     def test_not_with_other_modes_than_those_it_holds_with(self, n_holding):
-        between_m = (LIMIT_M + HELD_LIMIT_M) / 2
+        between_m = (MAX_EDGE_MOTION_M + MAX_HELD_EDGE_MOTION_M) / 2
         assert not verdict(loop=self.loop(between_m, n_holding=n_holding)).accepted
 
     def test_not_without_end(self):
-        beyond = self.loop(1.001 * HELD_LIMIT_M, n_holding=N_CONTROLLED)
+        beyond = self.loop(1.001 * MAX_HELD_EDGE_MOTION_M, n_holding=N_CONTROLLED)
         assert not verdict(loop=beyond).accepted
 
     def test_poles_that_are_refused_are_refused_however_well_it_holds(self):
-        calm = self.loop(0.5 * LIMIT_M, n_holding=N_CONTROLLED)
+        calm = self.loop(0.5 * MAX_EDGE_MOTION_M, n_holding=N_CONTROLLED)
         refused = verdict(truth=turned(30.0), loop=calm)
         assert not refused.accepted
         assert "pole radius" in refused.reason
@@ -344,7 +350,7 @@ def every_radius(matrix, truth, covariance, loop):
 @pytest.mark.parametrize("seed", range(30))
 def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed, many, monkeypatch):
     if many:
-        monkeypatch.setattr(gate, "_MANY", 1)
+        monkeypatch.setattr(gate, "_N_MODES_FOR_BOUNDS", 1)
     rng = np.random.default_rng(seed)
     away = rng.normal(0.0, [0.1, 0.1, 0.08, 0.01])
     truth = Misregistration.from_vector(Misregistration().vector + away)
@@ -362,7 +368,7 @@ def test_whatever_is_left_out_the_word_is_that_of_all_nine_points(seed, many, mo
     assert found.accepted == (radii.max() <= found.bound and radii.max() < 1.0)
     assert found.worst_pole_radius <= radii.max() + 1e-3
     if found.accepted:
-        assert found.worst_pole_radius >= radii.max() - NEAR
+        assert found.worst_pole_radius >= radii.max() - RADIUS_TOLERANCE
 
 
 def test_many_modes_are_tried_at_fewer_points_for_the_same_word(monkeypatch):
@@ -374,7 +380,7 @@ def test_many_modes_are_tried_at_fewer_points_for_the_same_word(monkeypatch):
     )
     moved = Misregistration(shift_x_subap=0.15, rotation_rad=0.002)
     of_few, n_few = verdict(made_for=Misregistration(), truth=moved), len(tried)
-    monkeypatch.setattr(gate, "_MANY", 1)
+    monkeypatch.setattr(gate, "_N_MODES_FOR_BOUNDS", 1)
     of_many, n_many = verdict(made_for=Misregistration(), truth=moved), len(tried) - n_few
     assert of_few == of_many
     assert n_many < n_few
@@ -399,7 +405,7 @@ def symmetric(kind, n=60):
 def test_no_eigenvalue_is_beyond_a_proven_end_and_the_end_is_near(kind):
     matrix = symmetric(kind)
     values = np.linalg.eigvalsh(matrix.astype(float))
-    low, high = gate._proven_ends(matrix)
+    low, high = gate._bound_eigenvalues(matrix)
     size = np.abs(values).max()
     assert values[0] - 5e-3 * size - 1e-9 <= low <= values[0] + 1e-5 * size + 1e-9
     assert values[-1] - 1e-5 * size - 1e-9 <= high <= values[-1] + 5e-3 * size + 1e-9
@@ -408,10 +414,10 @@ def test_no_eigenvalue_is_beyond_a_proven_end_and_the_end_is_near(kind):
 def test_the_least_of_a_square_is_not_sought(monkeypatch):
     """It is near zero among many: of 1030 modes Lanczos took 28,000 steps to it."""
     sought = []
-    monkeypatch.setattr(gate, "_MANY", 1)
-    monkeypatch.setattr(gate, "_proven_largest", lambda a: sought.append(a) or 1.0)
+    monkeypatch.setattr(gate, "_N_MODES_FOR_BOUNDS", 1)
+    monkeypatch.setattr(gate, "_bound_largest_eigenvalue", lambda a: sought.append(a) or 1.0)
     matrix = symmetric("spread") + np.triu(np.ones((60, 60), np.float32))
-    gate._extent(matrix)
+    gate._bound_numerical_range(matrix)
     assert [np.linalg.eigvalsh(a).min() < -1e-3 for a in sought] == [True, True, False]
 
 
@@ -419,7 +425,7 @@ def test_a_guess_that_is_too_low_is_raised_until_it_is_proven(monkeypatch):
     """Lanczos may miss an end: then the proof fails, and the end is moved."""
     monkeypatch.setattr(scipy.sparse.linalg, "eigsh", lambda *_, **__: np.array([1.0]))
     matrix = symmetric("one far out")
-    assert gate._proven_largest(matrix) >= 7.0 - 1e-5
+    assert gate._bound_largest_eigenvalue(matrix) >= 7.0 - 1e-5
 
 
 def test_a_guess_that_does_not_come_leaves_the_largest_sum_of_a_row(monkeypatch):
@@ -429,7 +435,7 @@ def test_a_guess_that_does_not_come_leaves_the_largest_sum_of_a_row(monkeypatch)
     monkeypatch.setattr(scipy.sparse.linalg, "eigsh", never)
     matrix = symmetric("spread")
     expected = float(np.abs(matrix).sum(axis=0).max())
-    assert gate._proven_largest(matrix) == pytest.approx(expected)
+    assert gate._bound_largest_eigenvalue(matrix) == pytest.approx(expected)
     assert expected >= 2.0
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from service.control.gate import (
-    FORGIVING_LEAK,
-    HELD_LIMIT_M,
-    LIMIT_M,
-    edge_motion_m,
-    why_slippery,
+    MAX_EDGE_MOTION_M,
+    MAX_HELD_EDGE_MOTION_M,
+    MAX_SLIP_SAFE_LEAK,
+    check_edge_motion,
+    compute_edge_motion_m,
 )
 from service.control.loop import ControlLoop
 
@@ -57,7 +57,7 @@ def test_the_motion_is_that_of_a_loop_played_in_time(leak, delay):
     """1.5 %: the scatter of a variance over 250 000 correlated frames, and 256 frequencies."""
     matrix, ring, gain = reconstructor(), outer(), 0.3
     coupling = np.eye(N) + 0.15 * np.random.default_rng(5).normal(size=(N, N))
-    found = edge_motion_m(
+    found = compute_edge_motion_m(
         matrix, coupling.astype(np.float32), np.full(N, gain), ring, loop_of(N, leak, delay)
     )
     played = simulated(coupling, gain, ring, leak, delay)
@@ -68,27 +68,25 @@ def test_one_aligned_mode_without_delay_to_speak_of_has_the_textbook_variance():
     """One frame of delay, no leak: variance of the command is g / (2 - g) times that of R n."""
     matrix = np.full((1, 1), 1e-7, np.float32)
     one = np.eye(1, dtype=np.float32)
-    found = edge_motion_m(matrix, one, np.array([0.5]), np.ones((1, 1)), loop_of(1, 1.0, 1))
+    found = compute_edge_motion_m(matrix, one, np.array([0.5]), np.ones((1, 1)), loop_of(1, 1.0, 1))
     assert found == pytest.approx(1e-7 * np.sqrt(0.5 / 1.5), rel=1e-4)
 
 
 def test_a_slippery_loop_is_named_with_what_to_do_and_a_leak_forgives_it():
-    assert why_slippery(0.99 * LIMIT_M, 1.0) is None
-    assert why_slippery(2.0 * LIMIT_M, FORGIVING_LEAK) is None
-    reason = why_slippery(2.0 * LIMIT_M, 0.999)
-    assert reason is not None
-    assert "fewer modes, a lower gain or more leak" in reason
+    assert check_edge_motion(0.99 * MAX_EDGE_MOTION_M, 1.0) is None
+    assert check_edge_motion(2.0 * MAX_EDGE_MOTION_M, MAX_SLIP_SAFE_LEAK) is None
+    assert check_edge_motion(2.0 * MAX_EDGE_MOTION_M, 0.999) is not None
 
 
 def test_a_loop_that_holds_may_move_its_edge_a_little_more_and_no_further():
-    between_m = (LIMIT_M + HELD_LIMIT_M) / 2
-    assert why_slippery(between_m, 0.999) is not None
-    assert why_slippery(between_m, 0.999, holds=True) is None
-    reason = why_slippery(1.001 * HELD_LIMIT_M, 0.999, holds=True)
+    between_m = (MAX_EDGE_MOTION_M + MAX_HELD_EDGE_MOTION_M) / 2
+    assert check_edge_motion(between_m, 0.999) is not None
+    assert check_edge_motion(between_m, 0.999, holds=True) is None
+    reason = check_edge_motion(1.001 * MAX_HELD_EDGE_MOTION_M, 0.999, holds=True)
     assert reason is not None
-    assert f"{HELD_LIMIT_M * 1e9:.0f} at most" in reason
+    assert f"{MAX_HELD_EDGE_MOTION_M * 1e9:.0f} nm" in reason
 
 
 def test_what_is_borne_of_a_loop_that_holds_lies_below_every_slip_that_was_seen():
     """201 nm is the least motion with which a loop without leak has slipped (edge_slip.md)."""
-    assert LIMIT_M < HELD_LIMIT_M < 201e-9
+    assert MAX_EDGE_MOTION_M < MAX_HELD_EDGE_MOTION_M < 201e-9

@@ -52,10 +52,10 @@ def test_fewer_modes_of_a_loop_keep_their_own_gains():
         delay_frames=2.0,
         optical_gain=np.arange(5.0) + 10.0,
     )
-    few = loop.of(slice(3))
+    few = loop.select_modes(slice(3))
     assert few.gains.tolist() == [0.0, 1.0, 2.0]
     assert few.optical_gain.tolist() == [10.0, 11.0, 12.0]
     one = ControlLoop(
         frame_rate_hz=1000.0, gains=np.arange(5.0), leak=1.0, delay_frames=2.0, optical_gain=0.5
     )
-    assert one.of(slice(2)).optical_gain == 0.5
+    assert one.select_modes(slice(2)).optical_gain == 0.5

@@ -73,8 +73,8 @@ def test_many_modes_are_truncated_by_their_eigenvectors_as_fewer_are(monkeypatch
     """1e-6 of the largest element at a condition of 5000: squares of it lose half of 16 digits."""
     matrix = with_singular_values(list(np.geomspace(1.0, 2e-4, 12)))
     by_svd = invert(matrix, 12)
-    monkeypatch.setattr(reconstructor, "_MANY", 1)
-    monkeypatch.setattr(reconstructor, "_SLOPES_AT_ONCE", 7)
+    monkeypatch.setattr(reconstructor, "_N_MODES_FOR_EIGENVECTORS", 1)
+    monkeypatch.setattr(reconstructor, "_SLOPES_PER_BLOCK", 7)
     found = invert(matrix, 12)
     assert found.n_truncated == by_svd.n_truncated == 6
     assert found.condition_number == pytest.approx(by_svd.condition_number, rel=1e-6)
@@ -83,7 +83,7 @@ def test_many_modes_are_truncated_by_their_eigenvectors_as_fewer_are(monkeypatch
 
 def test_a_mode_that_nobody_sees_leaves_a_condition_that_cannot_be_told(monkeypatch):
     matrix = with_singular_values([3.0, 2.0, 0.0])
-    monkeypatch.setattr(reconstructor, "_MANY", 1)
+    monkeypatch.setattr(reconstructor, "_N_MODES_FOR_EIGENVECTORS", 1)
     found = invert(matrix, 3)
     assert found.n_truncated == 1
     assert found.condition_number > 1e7

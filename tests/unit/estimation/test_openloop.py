@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from service.control.dither import FINER, SMOOTH, lines_of, modes_of
+from service.control.dither import COARSE_BAND, FINE_BAND, spread_lines, spread_modes
 from service.estimation.lockin import LockIn, LockInPlan
 from service.estimation.openloop import UNEXPLAINED, WideCaptureEstimate, WideCaptureSearch, find
 from service.estimation.windows import RefusalKind, WindowRefused
@@ -35,9 +35,9 @@ CORNERS = [
 NOMINAL = Misregistration()
 
 
-def plan(reach=SMOOTH, amplitude_m=50e-9):
-    lines = lines_of(FRAME_RATE_HZ, 1.0, 6)
-    modes = modes_of(reach, N_MODES, len(lines))
+def plan(reach=COARSE_BAND, amplitude_m=50e-9):
+    lines = spread_lines(FRAME_RATE_HZ, 1.0, 6)
+    modes = spread_modes(reach, N_MODES, len(lines))
     return LockInPlan(
         modes=modes,
         frequencies_hz=lines[: len(modes)],
@@ -85,14 +85,14 @@ def error(found, alpha):
 def test_smooth_modes_lead_home_from_every_corner_of_the_range(alpha):
     found = look(window(alpha))
     # the model that decides is coarser than the one that made the telemetry
-    assert np.all(error(found, alpha) < SMOOTH.floor)
+    assert np.all(error(found, alpha) < COARSE_BAND.floor)
     assert found.unexplained < UNEXPLAINED / 2
 
 
 def test_finer_modes_confirm_from_where_smooth_ones_lead():
     first = look(window(FAR)).estimate.alpha
-    found = look(window(FAR, plan(FINER)), first)
-    assert np.all(error(found, FAR) < FINER.floor)
+    found = look(window(FAR, plan(FINE_BAND)), first)
+    assert np.all(error(found, FAR) < FINE_BAND.floor)
 
 
 def test_the_stated_sigma_is_the_scatter_from_window_to_window():
@@ -105,14 +105,14 @@ def test_the_stated_sigma_is_the_scatter_from_window_to_window():
 
 def test_optical_gain_is_measured_and_does_not_move_alpha():
     weak = look(window(FAR, optical_gain=0.15))
-    assert np.all(error(weak, FAR) < SMOOTH.floor)
+    assert np.all(error(weak, FAR) < COARSE_BAND.floor)
     np.testing.assert_allclose(np.abs(weak.estimate.optical_gain), 0.15, rtol=0.05)
 
 
 def test_a_later_start_is_taken_where_the_first_leads_nowhere():
     outside = Misregistration(shift_x_subap=2.9, shift_y_subap=2.9, rotation_rad=np.deg2rad(-19.0))
     found = look(window(CORNERS[3]), outside, NOMINAL)
-    assert np.all(error(found, CORNERS[3]) < SMOOTH.floor)
+    assert np.all(error(found, CORNERS[3]) < COARSE_BAND.floor)
 
 
 def test_another_mirrors_response_is_refused():

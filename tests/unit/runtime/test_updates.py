@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import brentq
 
 from service.control.gains import ModeGain
-from service.control.gate import HELD_LIMIT_M, LIMIT_M
+from service.control.gate import MAX_EDGE_MOTION_M, MAX_HELD_EDGE_MOTION_M
 from service.control.loop import ControlLoop
 from service.errors import CommandError
 from service.model.misregistration import Misregistration
@@ -106,7 +106,7 @@ def just_beyond(bench):
         )
 
     def excess_m(gain):
-        return make_in(bench, loop(gain)).gate.edge_motion_m - (LIMIT_M + 1e-9)
+        return make_in(bench, loop(gain)).gate.edge_motion_m - (MAX_EDGE_MOTION_M + 1e-9)
 
     return loop(brentq(excess_m, 0.2, 0.6, xtol=1e-5))
 
@@ -124,7 +124,7 @@ class TestEdge:
         made = make_in(bench, held, fewer_modes_than(N_CONTROLLED))
         assert made.gate.accepted
         assert (len(made.matrix), made.why_fewer) == (N_CONTROLLED, "")
-        assert LIMIT_M < made.gate.edge_motion_m < HELD_LIMIT_M
+        assert MAX_EDGE_MOTION_M < made.gate.edge_motion_m < MAX_HELD_EDGE_MOTION_M
 
     def test_one_that_holds_with_fewer_is_not_given_more(self, bench, just_beyond):
         made = make_in(bench, replace(just_beyond, n_holding=40), (40,))
@@ -137,7 +137,7 @@ class TestEdge:
         state = changed(STATE, registration=registration, rtc=loop_of(gain))
         made = await make(actions, state, fewer=fewer_modes_than(N_CONTROLLED))
         assert made.record.n_modes == N_CONTROLLED
-        assert LIMIT_M < made.record.gate.edge_motion_m < HELD_LIMIT_M
+        assert MAX_EDGE_MOTION_M < made.record.gate.edge_motion_m < MAX_HELD_EDGE_MOTION_M
         state = changed(state, reconstructors=(made.record,))
         judged = await actions.perform(ev.JudgeMatrix(id=made.record.id), state)
         assert judged.verdict.accepted

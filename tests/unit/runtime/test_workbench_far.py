@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.control.dither import FINER, SMOOTH, lines_of, modes_of
+from service.control.dither import COARSE_BAND, FINE_BAND, spread_lines, spread_modes
 from service.estimation.frames import FrameBlock
 from service.estimation.lockin import LockIn, LockInPlan
 from service.estimation.openloop import WideCaptureEstimate
@@ -23,11 +23,11 @@ def bench():
     return OpticsWorker(small_instrument(), COMPUTE)
 
 
-def window(bench, reach=SMOOTH, *, seed=1, noise=1e-3):
+def window(bench, reach=COARSE_BAND, *, seed=1, noise=1e-3):
     """An open loop whose mirror lies at ``FAR``, with half the model's response."""
-    lines = lines_of(1000.0, 1.0, 8)
+    lines = spread_lines(1000.0, 1.0, 8)
     matrix = bench._model.interaction_matrix(FAR)
-    modes = modes_of(reach, matrix.shape[1], len(lines))
+    modes = spread_modes(reach, matrix.shape[1], len(lines))
     plan = LockInPlan(
         modes=modes,
         frequencies_hz=lines[: len(modes)],
@@ -58,10 +58,10 @@ def window(bench, reach=SMOOTH, *, seed=1, noise=1e-3):
 def test_two_sets_of_modes_find_the_same_place_one_after_the_other(bench):
     first = bench.find(window(bench), None, None)
     assert isinstance(first, WideCaptureEstimate)
-    assert np.all(np.abs(first.estimate.alpha.vector - FAR.vector) < SMOOTH.floor)
-    second = bench.find(window(bench, FINER), first.estimate.alpha, None)
+    assert np.all(np.abs(first.estimate.alpha.vector - FAR.vector) < COARSE_BAND.floor)
+    second = bench.find(window(bench, FINE_BAND), first.estimate.alpha, None)
     assert isinstance(second, WideCaptureEstimate)
-    assert np.all(np.abs(second.estimate.alpha.vector - FAR.vector) < FINER.floor)
+    assert np.all(np.abs(second.estimate.alpha.vector - FAR.vector) < FINE_BAND.floor)
 
 
 def test_light_saves_steps_and_changes_nothing(bench):

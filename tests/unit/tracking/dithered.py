@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.control.dither import tabulated
+from service.control.dither import look_up_precision
 from service.estimation.estimate import PassiveEstimate
 from service.estimation.windows import SETTLING_S
 from service.tracking import events as ev
@@ -28,7 +28,7 @@ class DitheredNight(Story):
         self.looks = looks
         self.deaf = False
         self.view = rtc(magnitude=magnitude, **changes)
-        self.kappa = tabulated(magnitude) if kappa is None else kappa
+        self.kappa = look_up_precision(magnitude) if kappa is None else kappa
         self.alpha = alpha
         self.t_s = 0.0
         self.playing = None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.control.loop import amplification
+from service.control.loop import compute_amplification
 from service.tracking.alarms import OVER_BUDGET
 from service.tracking.dither_modes import (
     LINE_RANGE,
@@ -32,7 +32,7 @@ def on_the_mirror_m(request, view):
     """RMS that the loop makes of a dither, all lines together, with the gain that adds most."""
     fractions = np.array(request.frequency_hz) / view.frame_rate_hz
     own = np.isin(request.modes, view.in_loop)
-    by = amplification(0.4, fractions, leak=view.leak, delay_frames=view.delay_frames)
+    by = compute_amplification(0.4, fractions, leak=view.leak, delay_frames=view.delay_frames)
     return float(np.sqrt(np.sum((np.where(own, by, 1.0) * request.amplitude_m) ** 2)))
 
 
@@ -109,7 +109,9 @@ def test_the_amplification_is_that_of_a_loop_that_runs():
             command[k + 2] = leak * command[k + 1] - gain * moved[k]
         line = np.exp(-2j * np.pi * fraction * np.arange(n))[n // 2 :]
         found = abs(line @ moved[n // 2 :]) / abs(line @ dither[n // 2 :])
-        expected = amplification(np.array(gain), np.array(fraction), leak=leak, delay_frames=2.0)
+        expected = compute_amplification(
+            np.array(gain), np.array(fraction), leak=leak, delay_frames=2.0
+        )
         assert found == pytest.approx(float(expected), rel=0.01)
 
 

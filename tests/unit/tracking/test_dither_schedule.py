@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from service.control.dither import tabulated
+from service.control.dither import look_up_precision
 from service.errors import CommandError
 from service.estimation.windows import SETTLING_S
 from service.tracking import commands as cmd
@@ -93,7 +93,7 @@ class TestHowMuch:
 
     def test_a_nanometre_is_enough_for_half_a_percent_of_a_calm_mirror(self):
         policy = replace(CALM, dither_budget_m=1e-9, drift_rate=FAST / 100.0)
-        night = DitheredNight(policy, kappa=tabulated(10.0) / 2.0).live(180)
+        night = DitheredNight(policy, kappa=look_up_precision(10.0) / 2.0).live(180)
         assert sigma_of(night)[0] < 0.005
         assert max(night.lived) <= 1e-9 * (1.0 + 1e-9)
 
@@ -108,7 +108,7 @@ class TestHowMuch:
 
 class TestPrecision:
     def test_what_windows_show_replaces_the_table(self):
-        night = DitheredNight(CALM, kappa=tabulated(10.0) / 10.0).live(60)
+        night = DitheredNight(CALM, kappa=look_up_precision(10.0) / 10.0).live(60)
         np.testing.assert_allclose(night.state.dithers.policy.precision.ratio, 0.1, rtol=1e-6)
         wary = DitheredNight(CALM).live(60)
         assert (
@@ -116,13 +116,13 @@ class TestPrecision:
         )
 
     def test_it_is_kept_from_star_to_star_and_from_session_to_session(self):
-        night = DitheredNight(CALM, kappa=tabulated(10.0) / 3.0).live(30)
+        night = DitheredNight(CALM, kappa=look_up_precision(10.0) / 3.0).live(30)
         night.tell(ev.RtcVanished())
         night.meet(session="s2", magnitude=7.0)
         assert night.state.dithers.policy.precision.n_windows >= 3
 
     def test_a_refused_window_teaches_nothing(self):
-        night = DitheredNight(CALM, kappa=tabulated(10.0) * 15.0)
+        night = DitheredNight(CALM, kappa=look_up_precision(10.0) * 15.0)
         night.live(30)
         assert night.state.windows.accepted == 0
         assert night.state.dithers.policy.precision is None

@@ -154,10 +154,6 @@ class TrackingTable(Table):
     bias_memory_s: Positive = 3600.0
     """Time in which the learnt bias of the passive estimate decays to 1/e, seconds."""
 
-    passive: Literal["slopes", "commands"] = "slopes"
-    """What the passive estimate is made of: "slopes", or the "commands" that followed them, which
-    takes two thirds of the processor time, for errors a tenth larger."""
-
     flexure_subap_per_degree: float = Field(default=0.02, ge=0.0)
     """Shift per degree of elevation, 1 σ, subapertures."""
 

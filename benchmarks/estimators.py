@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from service.config import load_instrument
-from service.estimation import correlation, demodulation, loopcheck, passive
-from service.estimation.correlation import CommandCorrelation
+from service.estimation import demodulation, loopcheck, passive
 from service.estimation.description import Actuators, Description, EdgeWatch, edge_watch
 from service.estimation.frames import FrameBlock
 from service.estimation.health import (
@@ -141,8 +140,6 @@ def _parts() -> Iterator[Part]:
     yield Part(name=TOGETHER[1], begin=_random(DITHERED), feed=_random_fed)
     watched = Passive(n_modes=N_CONTROLLED, memory_frames=1e4)
     yield Part(name=TOGETHER[2], begin=watched, feed=passive.accumulate)
-    commands = CommandCorrelation(n_modes=N_CONTROLLED, sums=watched, terms=_terms())
-    yield Part(name="passive by commands instead", begin=commands, feed=correlation.accumulate)
     everything = _random(tuple(range(N_CONTROLLED)))
     yield Part(name="random dither, 400 modes", begin=everything, feed=_random_fed)
     yield from _watchers()

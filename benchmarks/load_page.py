@@ -21,34 +21,29 @@ STOP_S = 1.0
 """Of the slowest."""
 
 
-def judge(phases: Sequence[Phase]) -> list[Row]:
-    """Return what was found beside what is asked, part by part."""
-    return [row for phase in phases for row in _judge(phase)]
-
-
-def _judge(phase: Phase) -> list[Row]:
+def judge(phase: Phase) -> list[Row]:
+    """Return what was measured beside what is asked."""
     seen, first, last = phase.seen, phase.before, phase.after
     p50, p99 = 1e3 * np.percentile(seen.answers_s, [50, 99])
     lost = last.frames_lost - first.frames_lost
     overwritten = last.frames_overwritten - first.frames_overwritten
-    where = name(phase)
     return [
         Row(
-            what=f"{where}: answers, 99th percentile",
+            what="answers, 99th percentile",
             found=f"{p99:.0f} ms (median {p50:.0f}, slowest {1e3 * max(seen.answers_s):.0f}, "
             f"{len(seen.answers_s)} answers)",
             asked=f"<= {ANSWER_MS:g} ms",
             reached=bool(p99 <= ANSWER_MS),
         ),
         Row(
-            what=f"{where}: order to stop, the slowest",
+            what="order to stop, the slowest",
             found=f"{max(seen.stops_s):.2f} s (median {np.median(seen.stops_s):.2f}, "
             f"{len(seen.stops_s)} orders)",
             asked=f"<= {STOP_S:g} s",
             reached=max(seen.stops_s) <= STOP_S,
         ),
         Row(
-            what=f"{where}: frames lost, overwritten",
+            what="frames lost, overwritten",
             found=f"{lost}, {overwritten} of {last.frames_received - first.frames_received}",
             asked="0, 0",
             reached=lost == overwritten == 0,
@@ -56,25 +51,17 @@ def _judge(phase: Phase) -> list[Row]:
     ]
 
 
-def name(phase: Phase) -> str:
-    """Return in words who else is there."""
-    return "beside the crowd" if phase.crowd.idle else "clients alone"
-
-
-def page(phases: Sequence[Phase], rows: Sequence[Row], cores: int) -> str:
+def page(phase: Phase, rows: Sequence[Row], cores: int) -> str:
     """Return the page in Markdown."""
-    crowd = phases[-1].crowd
     lines = [f"| {row.what} | {row.found} | {row.asked} |" for row in rows]
-    told = "\n".join(f"- {_facts(phase)}" for phase in phases)
     return (
         "# REST under load\n\n"
         "`make load` writes this page: FLAO at 1 kHz in auto, no keys; 50 clients, each asking "
-        "one page after the other with half a second between; then beside a crowd of "
-        f"{crowd.idle} idle connections, {crowd.heads} heads and {crowd.bodies} bodies that come "
-        f"a byte a second, and that come back when they are turned out. {cores} cores, which "
-        "clients, crowd and simulator share with the service.\n\n"
-        "| what | found | asked |\n| --- | --- | --- |\n" + "\n".join(lines) + f"\n\n{told}\n\n"
-        "![how long answers take](load.png)\n"
+        f"one page after the other with half a second between. {cores} cores, which clients and "
+        "simulator share with the service.\n\n"
+        "| what | found | asked |\n| --- | --- | --- |\n"
+        + "\n".join(lines)
+        + f"\n\n{_facts(phase)}\n\n![how long answers take](load.png)\n"
     )
 
 
@@ -82,7 +69,7 @@ def _facts(phase: Phase) -> str:
     first, last = phase.before, phase.after
     cores = (last.service_cpu_s - first.service_cpu_s) / (last.t_s - first.t_s)
     return (
-        f"{name(phase)}: load {first.load:.1f} to {last.load:.1f}; the service took {cores:.2f} of "
+        f"Load {first.load:.1f} to {last.load:.1f}; the service took {cores:.2f} of "
         f"a core, the clients {phase.own_cores:.2f}; memory {first.service_mb:.0f} to "
         f"{last.service_mb:.0f} MB; {_trouble(phase.seen)}"
     )
@@ -93,20 +80,19 @@ def _trouble(seen: Seen) -> str:
     return f"{seen.turned_out} connections ended before their answer; refused: {refused or 'none'}"
 
 
-def plot(path: Path, phases: Sequence[Phase]) -> None:
+def plot(path: Path, phase: Phase) -> None:
     """Draw which share of the answers took longer."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = figure.subplots()
-    for phase in phases:
-        for kind, answers, style in (
-            ("answers", phase.seen.answers_s, "-"),
-            ("orders to stop", phase.seen.stops_s, ":"),
-        ):
-            ms = np.sort(1e3 * np.array(answers))
-            share = 1.0 - np.arange(len(ms)) / len(ms)
-            axes.plot(ms, share, style, label=f"{name(phase)}: {kind}")
+    for kind, answers, style in (
+        ("answers", phase.seen.answers_s, "-"),
+        ("orders to stop", phase.seen.stops_s, ":"),
+    ):
+        ms = np.sort(1e3 * np.array(answers))
+        share = 1.0 - np.arange(len(ms)) / len(ms)
+        axes.plot(ms, share, style, label=kind)
     axes.axvline(ANSWER_MS, color="#222222", linewidth=0.8)
     axes.axhline(0.01, color="#222222", linewidth=0.8)
     axes.set_xscale("log")

@@ -94,7 +94,6 @@ def create_app(
     app.add_middleware(SecurityHeaders)
     app.state.service = service
     app.state.keys = keys
-    app.state.bodies = {}
     app.state.slopes = page.SlopesCache()
     app.state.stream = page.Stream(service, over or asyncio.Event())
     problems.install(app)

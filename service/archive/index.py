@@ -37,24 +37,21 @@ CREATE TABLE IF NOT EXISTS {} (
 """
 """A table for each kind."""
 
-_TABLES = f"""
+_SCHEMA = f"""
 {"".join(map(_PRODUCTS.format, ("reconstructor", "measurement", "noisy_matrix")))}
 CREATE TABLE IF NOT EXISTS pin (
     id TEXT PRIMARY KEY, who TEXT NOT NULL, why TEXT NOT NULL
 );
-"""
-
-_OF_ORDERS = ("address", "whence", "why", "answer", "cause")
-"""Columns of the audit trail that are there since version 3; the last one since version 5."""
-
-_SCHEMA = f"""
-{_TABLES}
 CREATE TABLE IF NOT EXISTS audit (
     t_ns_utc INTEGER NOT NULL,
     who TEXT NOT NULL,
     name TEXT NOT NULL,
     text TEXT NOT NULL,
-    {", ".join(f"{column} TEXT NOT NULL DEFAULT ''" for column in _OF_ORDERS)}
+    address TEXT NOT NULL,
+    whence TEXT NOT NULL,
+    why TEXT NOT NULL,
+    answer TEXT NOT NULL,
+    cause TEXT NOT NULL
 );
 CREATE INDEX IF NOT EXISTS audit_by_time ON audit (t_ns_utc);
 {nights.SCHEMA}
@@ -225,8 +222,7 @@ class Index:
                 version = self._version(connection)
                 connection.execute("PRAGMA journal_mode = WAL")
                 connection.execute("PRAGMA synchronous = FULL")
-                older = _widened(connection) if 0 < version < _VERSION else ""
-                connection.executescript(f"BEGIN;{older}{_SCHEMA}")
+                connection.executescript(f"BEGIN;{_SCHEMA}")
         except ArchiveError:
             connection.close()
             raise
@@ -247,18 +243,19 @@ class Index:
         with self._explained():
             self._connection = sqlite3.connect(name, uri=True, isolation_level=None)
             self._version(self._connection)
-            there = self._connection.execute("SELECT name FROM sqlite_master").fetchall()
-            # what an earlier version did not have is empty here, and nowhere on the disk
-            for statement in _TABLES.split(";"):
-                if statement.strip() and not any(f" {name} (" in statement for (name,) in there):
-                    self._connection.execute(statement.replace("CREATE", "CREATE TEMP"))
 
     def _version(self, connection: sqlite3.Connection) -> int:
         version: int = connection.execute("PRAGMA user_version").fetchone()[0]
         if version > _VERSION:
             raise ArchiveError(
                 f"{self._path}: found version {version}, which a later pyrcal has written, "
-                f"expected at most {_VERSION}: run that pyrcal, nothing has been changed"
+                f"expected {_VERSION}: run that pyrcal, nothing has been changed"
+            )
+        if 0 < version < _VERSION:
+            raise ArchiveError(
+                f"{self._path}: found version {version}, which a pyrcal before 1.0 has written, "
+                f"expected {_VERSION}: move it away; the next start makes a new one from the "
+                "products, the audit trail stays in the old one"
             )
         return version
 
@@ -429,16 +426,6 @@ _COLUMNS = ", ".join(
     {"channel": "whence"}.get(field.name, field.name) for field in fields(AuditEntry)[:_N_COLUMNS]
 )
 """Of the file; it is older than some of our words."""
-
-
-def _widened(connection: sqlite3.Connection) -> str:
-    """Return what gives an older trail the columns it lacks."""
-    there = {name for _, name, *_ in connection.execute("PRAGMA table_info(audit)")}
-    return "".join(
-        f"ALTER TABLE audit ADD COLUMN {column} TEXT NOT NULL DEFAULT '';"
-        for column in _OF_ORDERS
-        if column not in there
-    )
 
 
 def _storable(value: str | int) -> str | int:

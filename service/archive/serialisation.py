@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import threading
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -18,9 +17,8 @@ from service.errors import ArchiveError, ModelError, StorageError
 from service.files.durable import replace_file
 from service.model.misregistration import BOUNDARY_SCALE, COVARIANCE_SCALE
 from service.tracking.filtering import joint_of
-from service.tracking.registration import Purpose, Registration
+from service.tracking.registration import Registration
 from service.tracking.state import Saved
-from service.tracking.validity import BEFORE_DOUBT, BOTH_SIDES, MOVING
 
 NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
 """What reading a record of another version, or a damaged one, raises."""
@@ -30,8 +28,6 @@ _OF_THIS_RUN = "judged"
 
 _NUMERIC = ("shift_x_subap", "shift_y_subap", "rotation_rad", "magnification")
 _RADIANS, _DEGREES, _DEGREES_PER_RADIAN = "rotation_rad", "rotation_deg", float(BOUNDARY_SCALE[2])
-
-_TOTAL = "total_m"
 
 _Record = TypeVar("_Record")
 
@@ -51,7 +47,7 @@ def from_json(text: str, kind: type[_Record]) -> _Record:
     ValueError, KeyError, TypeError, ModelError
         If the text is something else.
     """
-    values = json.loads(text, object_hook=_as_now)
+    values = json.loads(text, object_hook=_in_radians)
     record = msgspec.convert(values, kind, dec_hook=_array)
     refuse_unknown(values, record)
     return record
@@ -106,22 +102,15 @@ def _in_degrees(value: Any) -> Any:  # noqa: ANN401  any value of a record
     return found
 
 
-def _as_now(values: dict[str, Any]) -> dict[str, Any]:
+def _in_radians(values: dict[str, Any]) -> dict[str, Any]:
     if _DEGREES in values:
         values[_RADIANS] = values.pop(_DEGREES) / _DEGREES_PER_RADIAN
-    if _TOTAL in values:  # written when a noisy matrix had a record of its own
-        n_modes = len(values["modes"])
-        each_m = values.pop(_TOTAL) / math.sqrt(max(n_modes, 1))
-        values |= {"pattern": None, "amplitude_m": [each_m] * n_modes}
     return values
 
 
 # --- what the next service needs
 
 VERSION = 1
-
-_RENAMED = {"move": "offload", "most_modes": "max_modes"}
-"""Keys that services before this one have written, and what they are called now."""
 
 _NOT_KEPT = ("grown", "validity", "suspected_jump", "previous_estimate", "restored_ns_utc")
 """Of the registration and its bias: what the next service works out anew."""
@@ -184,10 +173,10 @@ class TrackingFile:
         try:
             text = self._path.read_text(encoding="utf-8")
             values = json.loads(text)
-            expected = values.pop("sha256", None)  # versions before this one wrote none
-            if expected not in {None, _sha256(values)}:
+            expected = values.pop("sha256")
+            if expected != _sha256(values):
                 raise ValueError(f"found checksum {_sha256(values)}, expected {expected}")
-            return _saved_of(json.loads(json.dumps(values), object_hook=_with_new_names))
+            return _saved_of(values)
         except (OSError, AttributeError, *NOT_UNDERSTOOD) as error:
             aside = self._path.with_suffix(".damaged")
             self._path.replace(aside)
@@ -215,10 +204,6 @@ def _kept(saved: Saved) -> dict[str, Any]:
     return {"version": VERSION, **values}
 
 
-def _with_new_names(values: dict[str, Any]) -> dict[str, Any]:
-    return {_RENAMED.get(name, name): value for name, value in values.items()}
-
-
 def _saved_of(values: dict[str, Any]) -> Saved:
     if values.pop("version") != VERSION:
         raise ValueError(f"expected version {VERSION}")
@@ -228,10 +213,6 @@ def _saved_of(values: dict[str, Any]) -> Saved:
         known["alpha"] = dict(zip(_NUMERIC, four, strict=True)) | {
             "anamorphosis": stretches or None
         }
-        # written when there was one passive estimate
-        known.setdefault("biases", [bias for bias in (known.pop("bias", None),) if bias])
-    of_before = _voids_of_before(known or {}, values.get("offload"))
-    values.setdefault("void_intervals", []).extend(of_before)
     saved = msgspec.convert(
         values, Saved, dec_hook=lambda _kind, value: np.array(value, dtype=np.float64)
     )
@@ -250,23 +231,6 @@ def _saved_of(values: dict[str, Any]) -> Saved:
     if orders is not None and (orders.mode is None) is not (orders.settings_mode is None):
         raise ValueError(f"mode is {orders.mode!r} and of the settings {orders.settings_mode!r}")
     return saved
-
-
-def _voids_of_before(known: dict[str, Any], offload: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """Return what was void by the fields that services before the list of it have written."""
-    doubted_ns, passive_ns = (
-        known.pop(name, 0) for name in ("doubted_ns_utc", "passive_after_ns_utc")
-    )
-    found = {
-        (Purpose.MEASURE, MOVING): (offload or {}).pop("still_ns_utc", 0),
-        (Purpose.PASSIVE, BOTH_SIDES): passive_ns,
-        (Purpose.SETTLE, BEFORE_DOUBT): doubted_ns if known.get("doubt") else 0,
-    }
-    return [
-        {"until_ns_utc": until_ns, "because": because, "purpose": purpose.value}
-        for (purpose, because), until_ns in found.items()
-        if until_ns
-    ]
 
 
 def _check_shapes(arrays: list[tuple[NDArray[Any], tuple[int, ...]]]) -> None:

@@ -104,7 +104,6 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         drift_rate=per_minute / np.sqrt(60.0),
         floor=floor_of(settings, instrument) / BOUNDARY_SCALE,
         bias_memory_s=tracking.bias_memory_s,
-        passive=tracking.passive,
         flexure_per_degree=_vector(
             tracking.flexure_subap_per_degree,
             tracking.flexure_deg_per_degree,

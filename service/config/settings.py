@@ -154,10 +154,6 @@ class TrackingTable(Table):
     bias_memory_s: Positive = 3600.0
     """Time in which the learnt bias of the passive estimate decays to 1/e, seconds."""
 
-    passive: Literal["slopes", "commands"] = "slopes"
-    """What the passive estimate is made of: "slopes", or the "commands" that followed them, which
-    takes two thirds of the processor time, for errors a tenth larger."""
-
     flexure_subap_per_degree: float = Field(default=0.02, ge=0.0)
     """Shift per degree of elevation, 1 σ, subapertures."""
 
@@ -334,8 +330,8 @@ class ArchiveTable(Table):
     last_telemetry_s: float = Field(default=60.0, ge=0.0, le=3600.0)
     """Telemetry held in memory for recordings that begin before now, seconds."""
 
-    last_telemetry_mb: int = Field(default=192, ge=1, le=1_000_000)
-    """Its largest size, megabytes: half a minute of FLAO at 1 kHz, zeros held as bits."""
+    last_telemetry_mb: int = Field(default=96, ge=0, le=1_000_000)
+    """Memory for it, megabytes; 0: none is held. FLAO at 1 kHz fills 10 MB a second."""
 
 
 Scalar = bool | float | str

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.files import FileKind, kind_of
-from service.files.bounds import attributes, check_fits, datasets
+from service.files.bounds import attributes, datasets
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
 
 MAX_BYTES = 4 << 30
@@ -32,6 +32,9 @@ ROOMY_BYTES = 64 << 20
 
 MAX_SWELLING = 1000
 """Bytes in memory for each in the file, of larger ones: gzip does not compress noise any better."""
+
+MAX_PARTS = 1000
+"""Parts (HDUs) of a FITS file."""
 
 _LISTED = 12
 """Arrays of a file that a message names."""
@@ -84,7 +87,7 @@ class StoredArray:
             )
         try:
             return self.load()
-        except (OSError, RuntimeError, TypeError, ValueError) as error:
+        except (OSError, RuntimeError, TypeError, ValueError, LookupError) as error:
             raise MatrixError(f"{self.where}: damaged: {error}") from error
 
 
@@ -120,6 +123,9 @@ class _ImageHdu(Protocol):
     """The used part of astropy's HDU, which has no type information."""
 
     shape: tuple[int, ...]
+    size: int
+    """Size of the data as the header has it, bytes."""
+
     header: Mapping[str, Any]
     data: NDArray[Any]
 
@@ -186,19 +192,19 @@ def _fits(path: Path) -> Iterator[Container]:
         raise MatrixError(
             f"{path}: a FITS file needs astropy; expected it beside pyrcal: pip install astropy"
         ) from error
-    check_fits(path)
     with path.open("rb") as raw, warnings.catch_warnings():
         # astropy warns of a truncated file and goes on; what else it warns of does no harm
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message=".*truncated")
         try:
-            file = fits.open(raw, memmap=False, lazy_load_hdus=False)
+            file = fits.open(raw, memmap=False, lazy_load_hdus=True)
         except (OSError, ValueError, TypeError, LookupError, Warning) as error:
             raise MatrixError(f"{path}: damaged FITS file: {error}") from error
         arrays: dict[str, StoredArray] = {}
         known: dict[str, StoredArray] = {}
         try:
             for number, hdu in enumerate(file):
+                _check_part(hdu, number, path)
                 if hdu.is_image and hdu.shape:
                     name = str(hdu.header.get("EXTNAME", number))
                     array = _image(hdu, f"{path}[{name}]", path.stat().st_size)
@@ -206,7 +212,7 @@ def _fits(path: Path) -> Iterator[Container]:
                     known.setdefault(name.lower(), array)
                     known[str(number)] = array
             facts = {str(key).lower(): value for key, value in file[0].header.items()}
-        except (ValueError, TypeError, LookupError, fits.VerifyError) as error:
+        except (OSError, ValueError, TypeError, LookupError, Warning, fits.VerifyError) as error:
             said = str(error).replace("\n", " ")
             raise MatrixError(f"{path}: damaged FITS file: {said}") from error
         yield Container(
@@ -216,6 +222,14 @@ def _fits(path: Path) -> Iterator[Container]:
             facts=facts,
             is_fits=True,
         )
+
+
+def _check_part(hdu: _ImageHdu, number: int, path: Path) -> None:
+    """Refuse a part after which astropy would go backwards and read the same part for ever."""
+    if hdu.size < 0:
+        raise MatrixError(f"{path}[{number}]: found data of {hdu.size} bytes, expected 0 or more")
+    if number >= MAX_PARTS:
+        raise MatrixError(f"{path}: found more than {MAX_PARTS} parts, expected no more")
 
 
 def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:

@@ -1,9 +1,8 @@
 """Hold the last telemetry in memory, for recordings that begin before now.
 
-Messages are packed together: words of four zero bytes are held as bits. Of a frame of FLAO they are
-a quarter, what the dither adds to modes that it leaves alone and modes that are not controlled; all
-bytes come back. Packs lie beside the heap: in it, between what comes and goes in moments, each
-would hold pages that nobody uses, 100 MB of them in half a minute.
+Messages are joined in chunks of one megabyte that lie in memory maps of their own. On the heap,
+between objects that live for moments, messages kept for half a minute fragment it: 100 MB of pages
+were held that nothing used.
 """
 
 from __future__ import annotations
@@ -16,114 +15,99 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
-import numpy as np
-
 from service.files.recording import Message, RecordedKind
 
-PACK_BYTES: Final = 1_000_000
-"""Of messages that are packed together: it takes less than a millisecond."""
+CHUNK_BYTES: Final = 1_000_000
+"""Messages that are joined in one memory map."""
 
 OVERHEAD_BYTES: Final = 200
-"""Of a message in memory, besides what is in it."""
-
-_WORD: Final = np.dtype("<u4")
+"""Memory of a message besides its payload and attachment."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Pack:
-    """Messages without their zeros."""
+class _Chunk:
+    """Messages whose bytes lie one after another in a memory map."""
 
     heads: tuple[Message, ...]
-    """The messages, of which only time and kind are kept."""
+    """Time and kind of each message; payloads and attachments are empty."""
 
     sizes: tuple[tuple[int, int], ...]
-    """Bytes of payload and attachment of each."""
+    """Bytes of payload and attachment of each message."""
 
-    marks: bytes
-    """A bit for every word of payloads and attachments, one after another: 0, it is zero."""
-
-    words: mmap.mmap
-    """The other words."""
+    data: mmap.mmap
 
     @classmethod
-    def of(cls, messages: Sequence[Message]) -> Self:
-        """Return messages packed."""
-        data = b"".join(part for one in messages for part in (one.payload, one.attachment))
-        every = np.frombuffer(data + bytes(-len(data) % _WORD.itemsize), _WORD)
-        marked = every != 0
-        some = every[marked]
-        words = mmap.mmap(-1, max(some.nbytes, 1))
-        words.write(some.data)
+    def of(cls, messages: Iterable[Message]) -> Self:
+        """Return a chunk of these messages."""
+        joined = b"".join(part for one in messages for part in (one.payload, one.attachment))
+        data = mmap.mmap(-1, max(len(joined), 1))
+        data.write(joined)
         return cls(
             heads=tuple(Message(one.time_s, one.kind, b"") for one in messages),
             sizes=tuple((len(one.payload), len(one.attachment)) for one in messages),
-            marks=np.packbits(marked).tobytes(),
-            words=words,
+            data=data,
         )
 
     @property
     def n_bytes(self) -> int:
-        """What it takes in memory."""
-        return len(self.words) + len(self.marks) + OVERHEAD_BYTES * len(self.heads)
+        """Memory of the chunk, bytes."""
+        return len(self.data) + OVERHEAD_BYTES * len(self.heads)
 
     @property
     def newest_s(self) -> float:
-        """When its last message came."""
+        """Time at which its last message came, monotonic seconds."""
         return self.heads[-1].time_s
 
     def __iter__(self) -> Iterator[Message]:
         """Yield the messages as they came."""
-        marked = np.unpackbits(np.frombuffer(self.marks, np.uint8)).astype(np.bool_)
-        every = np.zeros(len(marked), _WORD)
-        every[marked] = np.frombuffer(self.words, _WORD, count=int(np.count_nonzero(marked)))
-        data, start = every.tobytes(), 0
+        start = 0
         for head, (payload, attachment) in zip(self.heads, self.sizes, strict=True):
             middle, end = start + payload, start + payload + attachment
-            yield head._replace(payload=data[start:middle], attachment=data[middle:end])
+            yield head._replace(payload=self.data[start:middle], attachment=self.data[middle:end])
             start = end
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Past:
-    """Messages that came since some time; unpacked as they are asked for."""
+    """Messages that came since some time, copied out of memory as they are iterated over."""
 
-    packs: Sequence[_Pack]
+    chunks: Sequence[_Chunk]
     waiting: Sequence[Message]
-    """Those that came last."""
+    """Messages that came last and are in no chunk yet."""
 
     since_s: float
     """Monotonic seconds."""
 
     @property
     def start_s(self) -> float | None:
-        """When the first of them came; None: there are none."""
-        heads = (one for pack in self.packs for one in pack.heads)
+        """Time at which the first of them came, monotonic seconds; None if there are none."""
+        heads = (one for chunk in self.chunks for one in chunk.heads)
         times = [one.time_s for one in (*heads, *self.waiting) if one.time_s >= self.since_s]
         return min(times, default=None)
 
     def __iter__(self) -> Iterator[Message]:
         """Yield them, oldest first."""
-        held: list[Iterable[Message]] = [*self.packs, self.waiting]
+        held: list[Iterable[Message]] = [*self.chunks, self.waiting]
         for messages in held:
             yield from (one for one in messages if one.time_s >= self.since_s)
 
 
 class LastTelemetry:
-    """Holds messages until they are too old, or too many; every method may be called anywhere.
+    """Holds messages until they are too old, or too many. Its methods are thread-safe.
 
     Parameters
     ----------
     seconds
-        Older ones go; 0: none are held.
+        Age at which messages are dropped; 0 if none are to be held.
     max_bytes
-        Beyond it the oldest go.
+        Memory beyond which the oldest messages are dropped; 0 if none are to be held.
     """
 
     def __init__(self, seconds: float, max_bytes: int) -> None:
-        self._seconds = seconds
+        self._seconds = seconds if max_bytes > 0 else 0.0
         self._max_bytes = max_bytes
-        self._packs: deque[_Pack] = deque()
-        self._packed_bytes = 0
+        self._chunks: deque[_Chunk] = deque()
+        self._chunk_bytes = 0
         self._waiting: deque[Message] = deque()
         self._waiting_bytes = 0
         self._lock = threading.Lock()
@@ -136,30 +120,27 @@ class LastTelemetry:
         with self._lock:
             self._waiting.append(now)
             self._waiting_bytes += now.n_bytes + OVERHEAD_BYTES
-            if self._waiting_bytes >= PACK_BYTES:
-                self._pack()
+            if self._waiting_bytes >= CHUNK_BYTES:
+                self._chunks.append(_Chunk.of(self._waiting))
+                self._chunk_bytes += self._chunks[-1].n_bytes
+                self._waiting.clear()
+                self._waiting_bytes = 0
             self._drop(now.time_s - self._seconds)
 
     def since(self, before_s: float) -> Past:
-        """Return those that came at most so many seconds ago."""
+        """Return the messages that came at most so many seconds ago."""
         with self._lock:
             since_s = time.monotonic() - min(before_s, self._seconds)
-            packs = tuple(pack for pack in self._packs if pack.newest_s >= since_s)
-            return Past(packs=packs, waiting=tuple(self._waiting), since_s=since_s)
-
-    def _pack(self) -> None:
-        self._packs.append(_Pack.of(self._waiting))
-        self._packed_bytes += self._packs[-1].n_bytes
-        self._waiting.clear()
-        self._waiting_bytes = 0
+            chunks = tuple(chunk for chunk in self._chunks if chunk.newest_s >= since_s)
+            return Past(chunks=chunks, waiting=tuple(self._waiting), since_s=since_s)
 
     def _drop(self, oldest_s: float) -> None:
-        """Let go what is too old or too much."""
-        while self._packs and (self._is_too_much or self._packs[0].newest_s < oldest_s):
-            self._packed_bytes -= self._packs.popleft().n_bytes
+        """Drop messages that are too old, and the oldest while there are too many."""
+        while self._chunks and (self._is_too_much or self._chunks[0].newest_s < oldest_s):
+            self._chunk_bytes -= self._chunks.popleft().n_bytes
         while self._waiting and (self._is_too_much or self._waiting[0].time_s < oldest_s):
             self._waiting_bytes -= self._waiting.popleft().n_bytes + OVERHEAD_BYTES
 
     @property
     def _is_too_much(self) -> bool:
-        return self._packed_bytes + self._waiting_bytes > self._max_bytes
+        return self._chunk_bytes + self._waiting_bytes > self._max_bytes

@@ -98,7 +98,7 @@ class Engine:
 
     def set_description(self, description: Description) -> None:
         """Take what the optical model expects of telemetry: estimators begin to listen."""
-        self.bank = EstimatorBank.of(description, self.policy.passive)
+        self.bank = EstimatorBank.of(description)
         self._mode_information = description.mode_information
         self.policy = replace(self.policy, start=description.start)
         self._weigh_modes()
@@ -111,7 +111,7 @@ class Engine:
         self._checked_out = None
         if self.bank is not None:
             before = self.bank.loop
-            anew = EstimatorBank.of(before.description, self.policy.passive)
+            anew = EstimatorBank.of(before.description)
             self.bank = replace(anew, loop=replace(anew.loop, matrices=before.matrices))
             self._follow()
 

@@ -21,7 +21,7 @@ from service.estimation.frames import FrameBlock
 from service.estimation.loop import last_seq, same_loop, same_rate
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.windows import SETTLING_S, WindowRefused
-from service.runtime.registry import Entry, listed
+from service.runtime.registry import REGISTRY, Entry
 from service.tracking.dither_request import Dither, expected_dither, lock_in_plan, random_plan
 from service.wire import DitherKind, Status
 
@@ -37,7 +37,7 @@ class EstimatorBank:
 
     loop: LoopContext
     entries: tuple[Entry, ...]
-    """Of the registry, those that are fed."""
+    """Estimators of the registry, in the order in which they are fed."""
 
     members: tuple[Streaming, ...]
     """One for each of them."""
@@ -49,11 +49,11 @@ class EstimatorBank:
     """The one that is followed."""
 
     @classmethod
-    def of(cls, description: Description, passive: str = "slopes") -> EstimatorBank:
-        """Return estimators before any RTC, the passive one made of slopes or commands."""
-        loop, entries = LoopContext(description=description), listed(passive)
-        members = tuple(entry.kind.begin(loop) for entry in entries)
-        return cls(loop=loop, entries=entries, members=members)
+    def of(cls, description: Description) -> EstimatorBank:
+        """Return the estimators of the registry, before any RTC has been seen."""
+        loop = LoopContext(description=description)
+        members = tuple(entry.kind.begin(loop) for entry in REGISTRY)
+        return cls(loop=loop, entries=REGISTRY, members=members)
 
     def __getitem__(self, kind: type[Member]) -> Member:
         """Return the estimator of a kind."""

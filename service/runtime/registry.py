@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from service.estimation.control_law import ControlLawCheck
-from service.estimation.correlation import CommandCorrelation
 from service.estimation.dither_monitor import LOUDER, DitherMeasurement, DitherWatch
 from service.estimation.dither_windows import DitherWindows
 from service.estimation.estimator import Detector, LoopContext, Streaming
@@ -114,10 +113,6 @@ class Entry:
     events: Changes | None = None
     """What else the tracker hears of it."""
 
-    passive: str = ""
-    """Where the settings must say that the passive estimate is made of this; empty: it is always
-    fed. Two passive estimates know the same noise: a filter would count it twice."""
-
     def conditions(self, member: Streaming) -> list[tuple[str, str | None, str]]:
         """Return name, text (None: all is well) and what is said when it is over, of each alarm."""
         texts = member.conditions if isinstance(member, Detector) else ()
@@ -137,12 +132,6 @@ REGISTRY: Final = (
     Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),
     Entry(Rejection, events=_held),
     Entry(Comparison, events=_compared),
-    Entry(Passive, passive="slopes"),
-    Entry(CommandCorrelation, passive="commands"),
+    Entry(Passive),
     Entry(DitherWindows),
 )
-
-
-def listed(passive: str) -> tuple[Entry, ...]:
-    """Return what is fed where the passive estimate is made of this."""
-    return tuple(entry for entry in REGISTRY if entry.passive in ("", passive))

@@ -126,9 +126,6 @@ class Policy:
     bias_memory_s: float
     """After so long what was learnt of the passive estimate's bias is worth 1/e."""
 
-    passive: str
-    """What the passive estimate is made of: slopes or commands."""
-
     flexure_per_degree: NDArray[np.float64]
     """``(4,)`` 1 σ of what a degree of elevation does to α, numeric units."""
 

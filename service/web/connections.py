@@ -1,7 +1,7 @@
-"""Idle connections, request ids, idempotency, what a client has already.
+"""The HTTP server, request ids, idempotent orders and ETags.
 
-The same POST sent twice, by a double click or a lost answer, is carried out once; what a client has
-already is not sent again.
+The same POST sent twice, by a double click or a lost answer, is carried out once. An answer that a
+client has already is not sent again.
 """
 
 from __future__ import annotations
@@ -10,9 +10,6 @@ import asyncio
 import contextlib
 import hashlib
 import re
-import resource
-import socket
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -31,31 +28,13 @@ from typing_extensions import override
 from service.web.bodies import STREAMED, again
 from service.web.problems import problem
 
-IDLE_S = 10.0
-"""Longest time a request's head may take, seconds, or nothing be taken of an answer."""
-
-MAX_IDLE = 2000
-"""Connections that may wait so, half of the descriptors at most; beyond it those that have waited
-longest give way. One that waits costs nothing, one that comes back again and again does."""
-
-MAX_DESCRIPTORS = 8192
-"""That the service asks of the system, where its limit is less."""
-
-AT_ONCE = 20
-"""Connections that are taken, or ended, before others have their turn."""
-
-BREATH_S = 0.1
-"""Between two lots that have stood still for too long: those that came together would come back
-together, and have others wait."""
-
-MAX_PENDING = 2048
-"""Connections that the system holds until they are taken."""
-
-TICK_S = 0.9
-"""From one look of the server's at what is idle to the next, besides uvicorn's own 0.1 s."""
+MAX_CONNECTIONS = 500
+"""Connections and requests at once; uvicorn answers 503 to more. A page holds two of them, and the
+system allows 1024 open files by default. Where clients are not trusted, a reverse proxy limits
+each of them (docs/operate/deploying.md)."""
 
 RETRY_S = 5
-"""When a client that finds no place should come again, seconds."""
+"""``Retry-After`` of an answer 503, seconds."""
 
 
 class Middleware:
@@ -99,22 +78,19 @@ async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -
 
 
 class Server(uvicorn.Server):
-    """uvicorn that ends with the service and closes idle connections.
-
-    uvicorn limits the time between two requests, not that of a request's head, and not how long
-    it waits for somebody who takes nothing of an answer.
+    """uvicorn that leaves the signals to the service and ends with it.
 
     Parameters
     ----------
     app
         The application.
     over
-        Set when the service ends.
+        Event that is set when the service ends.
     within_s
-        For requests that are under way then.
+        Time that requests under way are given then, seconds.
     proxies
-        Addresses and networks whose word is taken for who asks, and how: ``X-Forwarded-For``,
-        ``X-Forwarded-Proto``.
+        Addresses and networks of reverse proxies whose ``X-Forwarded-For`` and
+        ``X-Forwarded-Proto`` are trusted.
     """
 
     def __init__(
@@ -126,69 +102,22 @@ class Server(uvicorn.Server):
             ws="none",
             log_config=None,
             access_log=False,
-            backlog=AT_ONCE,
+            limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=within_s,
             proxy_headers=bool(proxies),
             forwarded_allow_ips=list(proxies),
         )
         super().__init__(config)
         self._over = over
-        self._since_s: dict[object, float] = {}
-        self._max_idle = min(MAX_IDLE, _descriptors() // 2)
-
-    @override
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        for listener in sockets or ():
-            listener.listen(
-                MAX_PENDING
-            )  # asyncio takes ``backlog`` for what it accepts at once, too
 
     @override
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        yield  # uvicorn would raise them again before all is closed
+        yield  # uvicorn would raise them again before the service has closed everything
 
     @override
     async def on_tick(self, counter: int) -> bool:
-        over = await super().on_tick(0)  # the date of answers is told anew
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(TICK_S):
-                await self._end_idle()
-                await self._over.wait()
-        return over or self._over.is_set()
-
-    async def _end_idle(self) -> None:
-        """End what has stood still for too long; of too much, what has done so the longest."""
-        now_s = time.monotonic()
-        idle = {still: one for one in self.server_state.connections if (still := _stands(one))}
-        self._since_s = {still: self._since_s.get(still, now_s) for still in idle}
-        by_age = sorted(idle, key=self._since_s.__getitem__)
-        n_too_many = max(len(by_age) - self._max_idle, 0)
-        for n_seen, still in enumerate(by_age):
-            at_leisure = n_seen >= n_too_many
-            if self._over.is_set() or (at_leisure and now_s - self._since_s[still] <= IDLE_S):
-                return
-            if n_seen % AT_ONCE == 0:
-                await asyncio.sleep(BREATH_S if at_leisure else 0)
-            if _stands(idle[still]) == still:
-                idle[still].transport.abort()
-
-
-def _descriptors() -> int:
-    """Return how many files and connections the service may hold, once it has asked for more."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = MAX_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(MAX_DESCRIPTORS, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-    return wanted if soft == resource.RLIM_INFINITY else max(soft, wanted)
-
-
-def _stands(connection: Any) -> tuple[object, ...]:  # noqa: ANN401 - uvicorn's own
-    """Return where a connection stands still, until it does something; empty: it is at work."""
-    n_unsent, cycle = connection.transport.get_write_buffer_size(), connection.cycle
-    at_work = cycle is not None and not cycle.response_complete
-    return () if at_work and not n_unsent else (connection, cycle, n_unsent)
+        return await super().on_tick(counter) or self._over.is_set()
 
 
 # --- the same POST is carried out once

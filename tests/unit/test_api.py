@@ -26,7 +26,7 @@ from service.errors import (
     StorageError,
     UnknownIdError,
 )
-from service.estimation.correlation import CORRELATION_BIAS
+from service.estimation.estimate import PASSIVE_BIAS
 from service.link.statistics import LinkStatistics
 from service.model.misregistration import PARAMETERS, Misregistration
 from service.runtime.command_results import Refits
@@ -418,7 +418,9 @@ async def test_alpha_has_the_bias_of_the_estimate_that_is_shown(client, service)
     by_commands = replace(STATE.alpha.passive, estimator="commands")
     service.change(registration=registration, passive=by_commands)
     assert (await body_of(client, "/v1/alpha"))["passive_bias"] is None
-    of_commands = replace(of_slopes, block=CORRELATION_BIAS, offset=np.full(4, 0.03))
+    of_commands = replace(
+        of_slopes, block=replace(PASSIVE_BIAS, name="commands"), offset=np.full(4, 0.03)
+    )
     service.change(registration=replace(registration, biases=(of_slopes, of_commands)))
     bias = (await body_of(client, "/v1/alpha"))["passive_bias"]
     assert bias["shift_x_subap"] == pytest.approx(0.03)

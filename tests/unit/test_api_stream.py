@@ -12,7 +12,7 @@ import pytest
 from service.api import create_app
 from service.tracking.state import Level, LogEntry
 from service.tracking.step_context import LOG_LENGTH
-from service.web import connections, page
+from service.web import page
 from service.web.connections import Server
 from tests.system.pace import patience
 from tests.unit.test_api import LINK, STATE, FakeService, Snapshot
@@ -199,26 +199,6 @@ async def test_a_stream_ends_at_once_with_the_service(service):
         async with asyncio.timeout(patience(1.0)):
             while await listener.message() is not None:
                 pass
-
-
-async def test_one_that_takes_nothing_is_dropped_and_leaves_no_place_taken(service, monkeypatch):
-    monkeypatch.setattr(connections, "IDLE_S", 0.3)
-    service.change(passive_unavailable_reason="long " * 100_000)
-    async with serving(service) as listening:
-        reader, writer = await asyncio.open_connection("127.0.0.1", listening.port, limit=1000)
-        writer.write(b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        await writer.drain()
-        streams = listening.app.state.stream
-        async with asyncio.timeout(patience(10.0)):
-            while not streams.n_listeners:  # noqa: ASYNC110 - nobody tells
-                await asyncio.sleep(0.01)
-            k = 0
-            while streams.n_listeners:
-                k += 1
-                service.change(passive_unavailable_reason="long " * 100_000 + str(k))
-                await asyncio.sleep(0.05)
-        writer.close()
-        del reader
 
 
 async def test_more_than_there_may_be_are_told_to_come_later(service, monkeypatch):

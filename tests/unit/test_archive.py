@@ -648,20 +648,3 @@ def test_a_disk_that_refuses_leaves_nothing_behind(tmp_path):
     assert "StorageError" in complaint
     assert "cm-000000.h5: cannot be written" in complaint
     assert assert_nothing_told_is_lost(tmp_path) == []
-
-
-def test_a_trail_of_before_causes_is_read_and_goes_on(tmp_path):
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        note(archive, 1, "before")
-    connection = sqlite3.connect(tmp_path / "index.sqlite")
-    connection.executescript("ALTER TABLE audit DROP COLUMN cause; PRAGMA user_version = 4;")
-    connection.close()
-    archive = Archive(tmp_path)
-    assert archive.open() == ()
-    with archive:
-        since = AuditEntry(t_ns_utc=2, who="Ada", name="SetMode", text="since", cause="set-mode-1")
-        archive.record((), (since,))
-        found = [(entry.text, entry.cause) for entry in archive.audit_trail()]
-    assert found == [("before", ""), ("since", "set-mode-1")]

@@ -1,6 +1,5 @@
 """Measured interaction matrices that outlive the service: real files and a real index."""
 
-import sqlite3
 from dataclasses import replace
 
 import h5py
@@ -10,8 +9,6 @@ import pytest
 from service.archive import Archive
 from service.errors import ArchiveError, UnknownIdError, WireError
 from service.tracking.operation_records import MeasurementRecord, MeasureState
-from service.tracking.products import MatrixState
-from service.tracking.products import ReconstructorRecord as Reconstructor
 from service.wire import Pattern, checksum
 
 MATRIX = np.arange(12, dtype=np.float32).reshape(4, 3) * 1e6
@@ -163,20 +160,3 @@ def test_a_file_the_index_missed_is_taken_in_and_a_damaged_one_named(tmp_path):
         assert "bad.h5: damaged" in line
         assert archive.measured.records() == (record_of("good"),)
         assert not list(tmp_path.glob("*/*.part"))
-
-
-def test_an_index_from_before_there_were_measurements_is_brought_up_to_date(tmp_path):
-    rtc_matrix = Reconstructor(id="r", state=MatrixState.APPLIED, n_modes=3, created_ns_utc=5)
-    archive = Archive(tmp_path)
-    archive.open()
-    with archive:
-        archive.record((rtc_matrix,), ())
-    connection = sqlite3.connect(tmp_path / "index.sqlite")
-    connection.executescript("DROP TABLE measurement; PRAGMA user_version = 1;")
-    connection.close()
-    archive = Archive(tmp_path)
-    assert archive.open() == ()
-    with archive:
-        archive.measured.store(record_of(), MATRIX, "flao-lbt")
-        assert [r.id for r in archive.reconstructors.records()] == ["r"]
-        assert archive.measured.records() == (record_of(),)

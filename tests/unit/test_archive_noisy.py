@@ -1,6 +1,5 @@
 """Noisy interaction matrices that outlive the service, and never look like reconstructors."""
 
-import json
 from dataclasses import replace
 
 import h5py
@@ -172,13 +171,3 @@ def test_a_file_that_is_none_is_named_at_the_start(tmp_path):
     with archive:
         assert "bad.h5: damaged" in line
     assert not list(tmp_path.glob("*/*.part"))
-
-
-@pytest.mark.parametrize("modes", [[], [3, 1]])
-def test_a_record_of_before_it_was_one_more_pattern_is_read(modes):
-    values = json.loads(to_json(record_of(modes=tuple(modes), amplitude_m=(1e-9,) * len(modes))))
-    del values["pattern"], values["amplitude_m"]
-    again = from_json(json.dumps(values | {"total_m": 5e-9}), MeasurementRecord)
-    assert (again.pattern, again.modes) == (None, tuple(modes))
-    assert again.total_m == pytest.approx(5e-9 if modes else 0.0)
-    assert again.each_m == pytest.approx(5e-9 / 2**0.5 if modes else 0.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks import load_page, soak_page
-from benchmarks.load import EVERYBODY, NOBODY, Phase, Seen
+from benchmarks.load import Phase, Seen
 from benchmarks.standing import Sample, size_mb
 
 FIRST = Sample(
@@ -74,21 +74,20 @@ def test_the_page_of_a_long_run_has_its_length_its_load_and_a_picture(tmp_path):
     assert (tmp_path / "soak.png").read_bytes().startswith(b"\x89PNG")
 
 
-def phase(crowd, answer_s, stop_s, lost=0):
+def phase(answer_s, stop_s, lost=0):
     seen = Seen(answers_s=[answer_s] * 99 + [0.2], stops_s=[stop_s], turned_out=4)
     after = replace(FIRST, t_s=30.0, frames_received=31_000, frames_lost=3 + lost)
-    return Phase(crowd=crowd, seen=seen, before=FIRST, after=after, own_cores=0.2)
+    return Phase(seen=seen, before=FIRST, after=after, own_cores=0.2)
 
 
-def test_of_load_each_part_is_judged(tmp_path):
-    phases = [phase(NOBODY, 0.01, 0.1), phase(EVERYBODY, 0.06, 1.2, lost=1)]
-    rows = load_page.judge(phases)
-    assert [row.reached for row in rows] == [True, True, True, False, False, False]
-    text = load_page.page(phases, rows, cores=2)
-    assert "1000 idle connections, 200 heads and 200 bodies" in text
-    assert "| beside the crowd: frames lost, overwritten | 1, 0 of 30000 | 0, 0 |" in text
-    assert "4 connections ended before their answer" in text
-    load_page.plot(tmp_path / "load.png", phases)
+def test_load_is_judged_and_drawn(tmp_path):
+    assert [row.reached for row in load_page.judge(phase(0.01, 0.1))] == [True, True, True]
+    loaded = phase(0.06, 1.2, lost=1)
+    rows = load_page.judge(loaded)
+    assert [row.reached for row in rows] == [False, False, False]
+    text = load_page.page(loaded, rows, cores=2)
+    assert "| frames lost, overwritten | 1, 0 of 30000 | 0, 0 |" in text
+    load_page.plot(tmp_path / "load.png", loaded)
     assert (tmp_path / "load.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.files import last_telemetry
-from service.files.last_telemetry import OVERHEAD_BYTES, PACK_BYTES, LastTelemetry
+from service.files.last_telemetry import CHUNK_BYTES, OVERHEAD_BYTES, LastTelemetry
 from service.files.recording import Message, RecordedKind, Recording, RecordingWriter
 
 
@@ -47,6 +47,9 @@ def test_with_nothing_to_hold_it_holds_nothing():
     last.put(RecordedKind.FRAMES, b"x")
     assert list(last.since(60.0)) == []
     assert last.since(60.0).start_s is None
+    none_held = LastTelemetry(60.0, 0)
+    none_held.put(RecordedKind.FRAMES, b"x")
+    assert list(none_held.since(60.0)) == []
 
 
 def frames(rng, n, n_slopes=100, n_modes=60, n_moved=3):
@@ -59,28 +62,18 @@ def frames(rng, n, n_slopes=100, n_modes=60, n_moved=3):
 
 def test_every_byte_comes_back_whatever_it_is(clock):
     rng, last, sent = np.random.default_rng(1), LastTelemetry(1e6, 10**9), []
-    for k in range(400):  # three packs, and some that wait
+    for k in range(400):  # three chunks, and some that wait
         clock["s"] += 0.01
         payload = [frames(rng, 10), rng.bytes(k), bytes(k), b""][k % 4] * 3
         sent.append(Message(clock["s"], list(RecordedKind)[k % 5], payload, rng.bytes(k % 7)))
         last.put(sent[-1].kind, sent[-1].payload, sent[-1].attachment)
-    assert sum(one.n_bytes for one in sent) > 2 * PACK_BYTES
+    assert sum(one.n_bytes for one in sent) > 2 * CHUNK_BYTES
     assert list(last.since(1e6)) == sent
     assert list(last.since(1.5)) == [one for one in sent if one.time_s >= clock["s"] - 1.5]
     assert last.since(1.5).start_s == pytest.approx(clock["s"] - 1.5, abs=0.011)
 
 
-def test_zeros_take_no_room(clock):
-    rng = np.random.default_rng(2)
-    last = LastTelemetry(1e6, 10**6)
-    for _ in range(300):
-        last.put(RecordedKind.FRAMES, frames(rng, 10))
-    held = sum(len(one.payload) for one in last.since(1e6))
-    # 57 of 220 numbers are none; a bit stands for each
-    assert held > 1.2 * (10**6 - PACK_BYTES / 2)
-
-
-def test_old_packs_go_as_old_messages_do(clock):
+def test_old_chunks_go_as_old_messages_do(clock):
     last, rng = LastTelemetry(1.0, 10**9), np.random.default_rng(3)
     for _ in range(600):
         clock["s"] += 0.01

@@ -158,18 +158,6 @@ def test_a_file_too_short_for_one_look_gives_what_it_can(telemetry, tmp_path, ca
     assert len(found["passive"]) == 1
 
 
-def test_commands_alone_tell_alpha_where_the_settings_say_so(telemetry, tmp_path, capsys):
-    """Within 3 sigma, which are mostly the bias that no dither has taught: it is that of a wind."""
-    settings = tmp_path / "commands.toml"
-    settings.write_text('[tracking]\npassive = "commands"\n')
-    plain = {k: v for k, v in telemetry.items() if not k.startswith("dither")}
-    _, found, _ = tracked(capsys, saved(tmp_path, plain), f"--config={settings}")
-    last = found["passive"][-1]
-    assert last["estimator"] == "commands"
-    for name, value in TRUE.items():
-        assert abs(last["alpha"][name] - value) < 3.0 * last["sigma"][name]
-
-
 def without(name):
     return lambda arrays: arrays.pop(name)
 

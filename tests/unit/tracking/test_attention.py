@@ -1,6 +1,5 @@
 """Acknowledged, muted, gone unseen: what operators do about alarms, told to the tracker."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -164,16 +163,6 @@ def test_what_was_acknowledged_and_is_not_raised_again_after_a_restart_is_over(s
     assert note(again, "edge-slip") is not None
     again.wait(40)
     assert note(again, "edge-slip") is None
-
-
-def test_a_file_of_before_there_were_acknowledgements_is_read(small, tmp_path):
-    small.tell(cmd.StopEverything())
-    file = TrackingFile(tmp_path / "tracking.json")
-    file.write(saved_of(small.state, small.now_ns))
-    left = json.loads((tmp_path / "tracking.json").read_text())
-    del left["orders"]["seen"], left["sha256"]
-    (tmp_path / "tracking.json").write_text(json.dumps(left))
-    assert file.read().orders.seen == ()
 
 
 def test_what_lasts_without_news_costs_the_disk_nothing(story):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from service.runtime.archiving import is_urgent
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking.policy import Offloading
-from service.tracking.registration import OffloadState, Purpose, Validity
+from service.tracking.registration import OffloadState, Validity
 from service.tracking.resume import resumed, saved_of
 from service.tracking.state import Mode
 from service.tracking.validity import MOVING, end_of
@@ -213,35 +212,6 @@ def test_telemetry_of_a_move_measures_nothing_for_the_next_service_either(tmp_pa
     again.see(AFTER, n_windows=2)
     assert again.state.alpha.registration.n_windows == 2
     assert not [name for name in again.logged if "jump" in name]
-
-
-def test_a_file_from_before_the_end_of_a_move_was_saved_is_read(tmp_path):
-    story = a_story()
-    answer(story)
-    file = TrackingFile(tmp_path / "tracking.json")
-    file.write(saved_of(story.state, story.now_ns))
-    values = json.loads((tmp_path / "tracking.json").read_text())
-    del values["void_intervals"], values["sha256"]
-    (tmp_path / "tracking.json").write_text(json.dumps(values))
-    assert file.read().void_intervals == ()
-
-
-def test_a_file_that_kept_the_end_of_a_move_with_it_is_read(tmp_path):
-    story = a_story()
-    answer(story)
-    file = TrackingFile(tmp_path / "tracking.json")
-    file.write(saved_of(story.state, story.now_ns))
-    values = json.loads((tmp_path / "tracking.json").read_text())
-    still_ns = values["void_intervals"][0]["until_ns_utc"]
-    del values["void_intervals"], values["sha256"]
-    values["offload"]["still_ns_utc"] = still_ns
-    values["registration"] |= {"passive_after_ns_utc": 7, "doubted_ns_utc": 8, "doubt": "a jump"}
-    (tmp_path / "tracking.json").write_text(json.dumps(values))
-    assert {(void.purpose, void.until_ns_utc) for void in file.read().void_intervals} == {
-        (Purpose.MEASURE, still_ns),
-        (Purpose.PASSIVE, 7),
-        (Purpose.SETTLE, 8),
-    }
 
 
 def test_what_else_happens_meanwhile_does_not_make_the_image_stand_still():

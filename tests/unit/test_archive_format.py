@@ -1,4 +1,4 @@
-"""A service's folder as an earlier version has written it is read: ``tests/data/archive``."""
+"""The formats of 1.0 are read for good: ``tests/data/archive`` is a folder that 1.0 has written."""
 
 import contextlib
 import shutil
@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.archive import Archive, AuditEntry, index
+from service.archive import Archive, AuditEntry
 from service.archive.serialisation import TrackingFile
 from service.control.gains import ModeGain
+from service.errors import ArchiveError
 from service.estimation.estimate import PASSIVE_BIAS
 from service.tracking.operation_records import AcquisitionStage, MeasureState
 from service.tracking.products import MatrixState
@@ -19,7 +20,6 @@ from service.tracking.state import Mode, Orders
 from service.wire import Pattern
 
 WRITTEN = Path(__file__).parents[1] / "data" / "archive"
-VERSIONS = sorted((WRITTEN.parent / "archive_versions").glob("index-*.sql"))
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_the_audit_trail_is_there(archive):
     )
 
 
-def test_the_audit_trail_goes_on_in_the_same_file_and_is_widened_once(archive, folder):
+def test_the_audit_trail_goes_on_in_the_same_file(archive, folder):
     order = AuditEntry(
         t_ns_utc=4,
         who="Ada",
@@ -131,39 +131,10 @@ def test_an_acquisition_under_way_is_what_it_was(folder):
     assert saved.acquisition.interruption.session == "s2"
 
 
-def schema(folder):
-    """Return version, tables and their columns of an index."""
+def test_an_index_of_before_the_first_release_is_refused_and_left_as_it_is(folder):
     with contextlib.closing(sqlite3.connect(folder / "index.sqlite")) as connection:
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        tables = [
-            name
-            for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-            if not name.startswith("sqlite_")
-        ]
-        columns = {
-            name: {row[1] for row in connection.execute(f"PRAGMA table_info({name})")}
-            for name in tables
-        }
-    return version, columns
-
-
-def test_of_every_version_of_the_index_one_is_kept():
-    names = [path.name for path in VERSIONS]
-    assert names == [f"index-{number}.sql" for number in range(1, index._VERSION + 1)]
-
-
-@pytest.mark.parametrize("dump", VERSIONS, ids=lambda path: path.stem)
-def test_an_index_of_every_version_is_read_goes_on_and_is_then_of_this_one(tmp_path, dump):
-    (tmp_path / "var").mkdir()
-    with contextlib.closing(sqlite3.connect(tmp_path / "var" / "index.sqlite")) as connection:
-        connection.executescript(dump.read_text(encoding="utf-8"))
-    entry = AuditEntry(t_ns_utc=4, who="Ada", name="SetMode", text="since", cause="set-mode-1")
-    for folder in ("var", "new"):
-        archive = Archive(tmp_path / folder)
-        assert archive.open() == ()
-        with archive:
-            archive.record((), (entry,))
-            found = [(line.who, line.text, line.cause) for line in archive.audit_trail()]
-        before = [("operator", "auto", "")] if folder == "var" else []
-        assert found == [*before, ("Ada", "since", "set-mode-1")]
-    assert schema(tmp_path / "var") == schema(tmp_path / "new")
+        connection.execute("PRAGMA user_version = 4")
+    before = (folder / "index.sqlite").read_bytes()
+    with pytest.raises(ArchiveError, match="found version 4"):
+        Archive(folder).open()
+    assert (folder / "index.sqlite").read_bytes() == before

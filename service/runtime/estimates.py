@@ -230,7 +230,8 @@ async def read_own_matrix(
         # a matrix that comes later finds the orientation settled, and names none
         workers.found_slopes = slopes or workers.found_slopes
         at, known = state.loop.config_id, workers.found_slopes
-        workers.first = partial(run_job, OpticsWorker.adopt, known, response, at)
+        left_over = None if own is None else own.left_over
+        workers.first = partial(run_job, OpticsWorker.adopt, known, response, at, left_over)
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} agrees with the instrument file"

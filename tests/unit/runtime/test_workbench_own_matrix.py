@@ -74,3 +74,20 @@ def test_a_new_worker_is_told_what_the_last_one_found(bench):
     another = OpticsWorker(small_instrument(), COMPUTE)
     another.adopt(None, response)
     np.testing.assert_allclose(another.response(ALPHA), bench.response(ALPHA), rtol=1e-5)
+
+
+def test_a_new_worker_judges_loops_with_the_measured_response_too(bench):
+    """What the model does not explain of the RTC's own matrix weakens the loop of its inverse."""
+    rng = np.random.default_rng(4)
+    response = bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    error = rng.standard_normal(response.shape)
+    error *= 0.4 * np.linalg.norm(response, axis=0) / np.linalg.norm(error, axis=0)
+    found, mode_response = bench.recognise(
+        np.linalg.pinv(response + error).astype(np.float32), None, None
+    )
+    another = OpticsWorker(small_instrument(), COMPUTE)
+    plain = made_by(another).gate.worst_pole_radius
+    another.adopt(None, mode_response, None, found.left_over)
+    radius = made_by(bench).gate.worst_pole_radius
+    assert made_by(another).gate.worst_pole_radius == pytest.approx(radius, abs=1e-3)
+    assert radius > plain + 0.01

@@ -154,6 +154,11 @@ SUSPECT_FOR = 2.0
 LOOK_FRAMES = 50
 """One of so many frames is looked at, however long a block is."""
 
+SLOW_TURBULENCE = 2.0
+"""Times the averaged positions of the inner actuators, in RMS, that the outer ones are compared
+with. Turbulence that a slow wind carries leaves both parts of the mirror where they are for longer
+than the memory; the largest of a ring of healthy actuators then stands at 1.2 to 1.8."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EdgeHealth(Detector):
@@ -163,14 +168,15 @@ class EdgeHealth(Detector):
     unless = Mark.STANDS | Mark.ABSURD
     only_closed = True
 
-    position: NDArray[np.float32] | None = None
-    """``(n_outer,)`` averaged position, in σ of the turbulence the basis was made for."""
+    command: NDArray[np.float32] | None = None
+    """``(n_watched,)`` averaged command of the modes that are watched, metres."""
 
     turbulence: float = 1.0
-    """RMS of the inner actuators in the same unit."""
+    """RMS of the inner actuators, in σ of the turbulence the basis was made for."""
 
     ratio: float = 0.0
-    """Largest averaged position of an outer actuator over ``turbulence``."""
+    """Largest averaged position of an outer actuator over what the inner ones show: their RMS, or
+    ``SLOW_TURBULENCE`` times that of their averaged positions, whichever is larger."""
 
     suspect_s: float = 0.0
     """For how long the ratio has been above ``SUSPECT_RATIO``."""
@@ -205,31 +211,36 @@ def observe_edge(health: EdgeHealth, block: FrameBlock, watch: EdgeWatch) -> Edg
     n_frames = np.diff([*range(0, block.n_frames, LOOK_FRAMES), block.n_frames])
     moved = block.commands_m[np.cumsum(n_frames) - 1][:, watch.modes]
     inner = np.einsum("km,km->k", moved @ watch.inner, moved)
-    each = zip(moved @ watch.outer.T, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
-    for outer, mean_square, lasted_s in each:
-        health = _seen(health, outer, float(mean_square), float(lasted_s), watch.memory_s)
+    each = zip(moved, inner, n_frames * (block.dt_ns * 1e-9), strict=True)
+    for command, mean_square, lasted_s in each:
+        health = _seen(health, watch, command, float(mean_square), float(lasted_s))
     return health
 
 
 def _seen(
     health: EdgeHealth,
-    outer: NDArray[np.float32],
+    watch: EdgeWatch,
+    command: NDArray[np.float32],
     inner: float,
     lasted_s: float,
-    memory_s: float,
 ) -> EdgeHealth:
-    """Return the health after positions of the ring that stand for so much time."""
-    fade = float(np.exp(-lasted_s / memory_s))
-    position = (1.0 - fade) * outer
-    if health.position is not None:
-        position += fade * health.position
-    power = fade * health.turbulence**2 + (1.0 - fade) * max(inner, 0.0)
+    """Return the health after a command that stands for so much time.
+
+    ``inner`` is the mean square of the inner actuators at that command.
+    """
+    fade = np.float32(np.exp(-lasted_s / watch.memory_s))
+    average = (1 - fade) * command
+    if health.command is not None and len(health.command) == len(command):
+        average += fade * health.command
+    power = float(fade) * health.turbulence**2 + float(1 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
-    ratio = float(np.abs(position).max()) / max(turbulence, 1e-3)
+    steady = float(np.sqrt(max(average @ watch.inner @ average, 0.0)))
+    scale = max(turbulence, SLOW_TURBULENCE * steady, 1e-3)
+    ratio = float(np.abs(watch.outer @ average).max()) / scale
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0
-    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR * memory_s
+    slipped = ratio > SLIPPED_RATIO or suspect_s > SUSPECT_FOR * watch.memory_s
     return EdgeHealth(
-        position=position,
+        command=average,
         turbulence=turbulence,
         ratio=ratio,
         suspect_s=suspect_s,

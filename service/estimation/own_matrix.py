@@ -79,6 +79,23 @@ LineariseAt = Callable[[Misregistration], Linearisation]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LeftOver:
+    """The part of the measured response of some modes that the model does not explain."""
+
+    columns: NDArray[np.intp]
+    """``(n,)`` modes."""
+
+    slopes: NDArray[np.float32]
+    """``(n_slopes, n)`` slope per metre."""
+
+    def added_to(self, linearisation: Linearisation) -> Linearisation:
+        """Return a linearisation whose matrix has it: the response as it was measured."""
+        matrix = linearisation.matrix.copy()
+        matrix[:, self.columns] += self.slopes
+        return replace(linearisation, matrix=matrix)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OwnMatrix:
     """The modes that the RTC's own matrix controls, as the model recognises them."""
 
@@ -102,6 +119,9 @@ class OwnMatrix:
 
     weights: tuple[float, ...] = ()
     """Weight of each mode of the basis for the measurement of α; empty if all count alike."""
+
+    left_over: LeftOver | None = None
+    """What the model leaves of the modes that it knows; None if it was not worked out."""
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -287,23 +307,6 @@ def weights_of_modes(found: OwnMatrix, power: NDArray[np.floating]) -> tuple[flo
     expected[columns] = misfit
     weights = 1.0 / (power * (WELL_EXPLAINED**2 + expected**2))
     return tuple((weights / weights.max()).tolist())
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LeftOver:
-    """The part of the measured response of some modes that the model does not explain."""
-
-    columns: NDArray[np.intp]
-    """``(n,)`` modes."""
-
-    slopes: NDArray[np.float32]
-    """``(n_slopes, n)`` slope per metre."""
-
-    def added_to(self, linearisation: Linearisation) -> Linearisation:
-        """Return a linearisation whose matrix has it: the response as it was measured."""
-        matrix = linearisation.matrix.copy()
-        matrix[:, self.columns] += self.slopes
-        return replace(linearisation, matrix=matrix)
 
 
 def left_over(

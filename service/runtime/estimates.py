@@ -202,14 +202,24 @@ async def read_own_matrix(
     matrix: NDArray[np.float32],
     state: TrackerState,
     workers: WorkerPort,
+    matrix_of: MatrixOf,
 ) -> list[Event]:
     """Return slopes, commands and modes as the matrix in use shows them.
 
-    One that the service has made and judged says nothing that it did not know, but for the first
-    that it meets: what the RTC's own said in another run went into it.
+    One that the service has made and judged says nothing that it did not know. After a restart the
+    matrix in use is one that an earlier run has made: it agrees with the model in everything. What
+    the model does not explain is then read from the RTC's own matrix, its ancestor in the archive.
     """
     if record.judged is not None and workers.first is not None:
         return []
+    events: list[Event] = []
+    origin = _origin_of(record, state)
+    if origin is not record:
+        try:
+            matrix, record = await asyncio.to_thread(matrix_of, origin.id), origin
+        except PyrcalError as error:
+            text = f"{origin.id}, the RTC's own, is not read again: {error}"
+            events.append(ev.LogEvent(name="slopes.unknown", text=text, level=Level.WARNING))
     registration = state.alpha.registration
     near = state.alpha.law.nominal if registration is None else registration.alpha
     try:
@@ -220,8 +230,8 @@ async def read_own_matrix(
                 OpticsWorker.recognise, matrix, near, dialect.rotation_rad
             )
     except PyrcalError as error:
-        return [ev.LogEvent(name="slopes.unknown", text=str(error), level=Level.WARNING)]
-    events: list[Event] = []
+        text = str(error)
+        return [*events, ev.LogEvent(name="slopes.unknown", text=text, level=Level.WARNING)]
     slopes = dialect.found if dialect.adopted else None
     if slopes is not None:
         text = f'orientation "auto": found {orientation.setting_written(slopes)} by {record.id}'
@@ -230,7 +240,8 @@ async def read_own_matrix(
         # a matrix that comes later finds the orientation settled, and names none
         workers.found_slopes = slopes or workers.found_slopes
         at, known = state.loop.config_id, workers.found_slopes
-        workers.first = partial(run_job, OpticsWorker.adopt, known, response, at)
+        left_over = None if own is None else own.left_over
+        workers.first = partial(run_job, OpticsWorker.adopt, known, response, at, left_over)
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} agrees with the instrument file"
@@ -251,6 +262,24 @@ async def read_own_matrix(
             )
         )
     return events
+
+
+def _origin_of(
+    record: products.ReconstructorRecord, state: TrackerState
+) -> products.ReconstructorRecord:
+    """Return the RTC's own matrix that a reconstructor descends from.
+
+    The record itself if its ancestors are no longer known, or are of another mode of the sensor.
+    """
+    ancestor = record
+    for _ in state.matrices.reconstructors:
+        if ancestor.parent is None:
+            return ancestor if ancestor.config_id == record.config_id else record
+        before = state.reconstructor(ancestor.parent)
+        if before is None:
+            break
+        ancestor = before
+    return record
 
 
 def window_lost(window: Telemetry, reason: str) -> Event:

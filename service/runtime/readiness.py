@@ -180,6 +180,9 @@ class ReadinessInputs:
     worker_problem: str = ""
     """What is wrong with the worker; empty: nothing."""
 
+    reading: bool = False
+    """The RTC's own reconstructor is being read, and windows wait for that."""
+
     @property
     def frames_come(self) -> bool:
         """Whether frames, used or not, came of late."""
@@ -207,6 +210,12 @@ def _for_the_worker(inputs: ReadinessInputs) -> Iterator[Prerequisite]:
         yield Prerequisite(
             name=alarms.WORKER_LOST, responsible=Responsible.WORKER, text=text, blocks=True
         )
+    if inputs.reading:
+        text = (
+            f"the RTC's own reconstructor {inputs.state.matrices.in_use} is being read: windows of "
+            "telemetry are fitted after that, from the registration that it shows"
+        )
+        yield Prerequisite(name="own-matrix", responsible=Responsible.WORKER, text=text)
     if inputs.state.matrices.making_since_ns_utc is not None:
         text = "a reconstructor is being computed and judged: wait"
         yield Prerequisite(name="matrix", responsible=Responsible.WORKER, text=text)

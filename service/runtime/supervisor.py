@@ -22,6 +22,7 @@ from service.errors import LinkError, PyrcalError, StorageError
 from service.estimation import dither_windows, frames, lockin, passive_sums, random_dither
 from service.estimation.description import Description
 from service.link import matrices, statistics
+from service.estimation.windows import RefusalKind
 from service.model.instrument import Instrument
 from service.runtime import archiving, command_results, readiness, worker
 from service.runtime.actions import Actions
@@ -49,6 +50,8 @@ GATHER_S = 0.16
 
 ANSWERED_WITHIN_S = 3.0
 """For the RTC, or the gate, to answer while whoever gave an order waits."""
+
+NOT_READ = "the RTC's own reconstructor had not been read yet: the window was given up"
 
 ASK_AGAIN_S = 0.02
 OPERATOR = Actor()
@@ -93,6 +96,10 @@ class Supervisor:
         self.refits = command_results.Refits()
         """Reconstructors that operators have ordered."""
         self._pending_window = PendingWindow()
+        self._n_readings = 0
+        self._own_matrix_read = asyncio.Event()
+        """Clear while the RTC's own reconstructor is being read and α is unknown."""
+        self._own_matrix_read.set()
         self._worker_load = WorkerLoadMeter(workers)
         self._trends = TrendSampler(
             state=lambda: self._engine.state,
@@ -147,6 +154,7 @@ class Supervisor:
             link=link,
             preparing=self._engine.bank is None,
             worker_problem=self._workers.problem,
+            reading=not self._own_matrix_read.is_set(),
         )
         return readiness.waiting_for(inputs)
 
@@ -330,6 +338,8 @@ class Supervisor:
             self._worker_load.was_late()
         given_up = self._pending_window.put(window)
         if given_up is not None:
+            if not self._own_matrix_read.is_set():
+                given_up = replace(given_up, reason=NOT_READ, kind=RefusalKind.VOID)
             self._post(ev.WindowLost(refused=given_up))
 
     async def _tick(self) -> None:
@@ -380,6 +390,8 @@ class Supervisor:
     async def _fit(self) -> None:
         while True:
             await self._pending_window.some()
+            # a fit about the nominal registration may end in a wrong place, and takes longer
+            await self._own_matrix_read.wait()
             async with self._workers.turn(worker.OpticsWorker.fit):
                 window = self._pending_window.take()
                 if window is None:
@@ -416,7 +428,13 @@ class Supervisor:
         self._start(type(effect).__name__, self._do(effect, self._engine.state))
 
     def swapped(self, in_use: str | None) -> None:
-        """Offer the matrix in use, and watch what it does."""
+        """Offer the matrix in use, and watch what it does.
+
+        While α is unknown, windows wait until the matrix has been read: it tells where fits begin.
+        """
+        if in_use is not None and self._engine.state.alpha.registration is None:
+            self._own_matrix_read.clear()
+        self._n_readings += 1
         self._start("the offer of the matrix in use", self._offer(in_use))
 
     def sensor_mode_changed(self, config_id: str) -> None:
@@ -446,13 +464,19 @@ class Supervisor:
                 await self._hear_out(in_use, matrix)
         except PyrcalError as error:
             self._note("reconstructor.not-offered", str(error), Level.WARNING)
+        finally:
+            self._n_readings -= 1
+            if not self._n_readings:
+                self._own_matrix_read.set()
 
     async def _hear_out(self, in_use: str, matrix: NDArray[np.float32]) -> None:
         """Learn from the matrix in use how the RTC lists its slopes and counts its commands."""
         record = self._engine.state.reconstructor(in_use)
         if record is None:
             return
-        for event in await read_own_matrix(record, matrix, self._engine.state, self._workers):
+        for event in await read_own_matrix(
+            record, matrix, self._engine.state, self._workers, self._actions.matrix
+        ):
             if self._engine.state.matrices.in_use == in_use:
                 self._post(event)
 

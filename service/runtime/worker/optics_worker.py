@@ -256,14 +256,18 @@ class OpticsWorker:
         slopes: SlopeRecipe | None,
         mode_response: NDArray[np.float64] | None = None,
         config_id: str | None = None,
+        left_over: LeftOver | None = None,
     ) -> None:
         """List slopes in this order from now on, and expect this response ``(n_modes,)`` of modes.
 
-        ``config_id`` is the sensor's mode that both are of. None leaves what it stands for as it
-        is.
+        ``config_id`` is the sensor's mode that both are of. ``left_over`` is what the model leaves
+        of the RTC's own matrix: the gate judges loops with it. None leaves what it stands for as
+        it is.
         """
         if self._model.instrument.sensor_modes and config_id is not None:
             self.enter_mode(config_id)
+        if left_over is not None:
+            self._left_over = left_over
         instrument, now = self._model.instrument, self._model.instrument.slopes
         if slopes is not None and replace(now, orientation=now.assumed_orientation) != slopes:
             instrument = replace(instrument, slopes=slopes)
@@ -300,7 +304,7 @@ class OpticsWorker:
             now = 1.0 if self._mode_response is None else self._mode_response
             self.adopt(None, now * gains)
         self._left_over = left_over(own, found, self._coarse.interaction_matrix(found.alpha))
-        return found, self._mode_response
+        return replace(found, left_over=self._left_over), self._mode_response
 
     def _settled_fit(
         self, spectra: Spectra, loop: ClosedLoop, start: Misregistration

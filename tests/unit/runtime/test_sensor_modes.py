@@ -241,7 +241,7 @@ async def test_a_second_matrix_of_the_rtc_does_not_make_workers_forget_the_orien
     record = SimpleNamespace(judged=None, id="own")
     for adopted in (True, False):
         workers.adopted = adopted
-        await read_own_matrix(record, np.zeros((1, 1), np.float32), state, workers)
+        await read_own_matrix(record, np.zeros((1, 1), np.float32), state, workers, None)
     assert workers.first.args[1] == found
 
 

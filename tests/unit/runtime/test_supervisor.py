@@ -629,3 +629,33 @@ async def test_a_token_without_a_message_has_the_link_opened_anew_and_is_told(
             await until(lambda: bridge.statistics().rtc_alive)
             token.undeclare()
             await until(lambda: not bridge.statistics().rtc_alive)
+
+
+async def test_a_window_waits_until_the_rtcs_own_matrix_has_been_read(supervisor, monkeypatch):
+    """A fit about the nominal registration may be far off; the matrix tells where to begin."""
+    done, fits = asyncio.Event(), []
+
+    async def read_slowly(*_):
+        await done.wait()
+
+    async def fit(window, *_):
+        fits.append(window)
+        return ev.LogEvent(name="fitted", text="")
+
+    monkeypatch.setattr(supervisor, "_hear_out", read_slowly)
+    monkeypatch.setattr("service.runtime.supervisor.fitted", fit)
+    supervisor._actions._remember("own", np.zeros((45, 224), np.float32))
+    async with running(supervisor):
+        supervisor.swapped("own")
+        windows = [SimpleNamespace(t_end_ns_utc=n * 60_000_000_000) for n in range(2)]
+        for window in windows:
+            supervisor.fit(window)
+        names = [wait.name for wait in supervisor.snapshot().waiting_for]
+        assert "own-matrix" in names
+        # the first is too old to be joined; that is no fault of the telemetry
+        assert supervisor.snapshot().tracker.windows.run == 0
+        await asyncio.sleep(0.2)
+        assert not fits
+        done.set()
+        await until(lambda: fits == windows[1:])
+        assert "own-matrix" not in [wait.name for wait in supervisor.snapshot().waiting_for]

@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
+from pyrcal_studies.campaign.observatory_link import OwnHands
+from service.errors import UnknownIdError
 from service.model.misregistration import Misregistration
+from service.runtime.estimates import read_own_matrix
 from service.runtime.worker import OpticsWorker
+from service.tracking.events import ModesRecognised
+from service.tracking.products import MatrixState, ReconstructorRecord
+from tests.states import tracker_state
 from tests.unit.runtime.small import (
     COMPUTE,
     N_CONTROLLED,
@@ -74,3 +80,55 @@ def test_a_new_worker_is_told_what_the_last_one_found(bench):
     another = OpticsWorker(small_instrument(), COMPUTE)
     another.adopt(None, response)
     np.testing.assert_allclose(another.response(ALPHA), bench.response(ALPHA), rtol=1e-5)
+
+
+def test_a_new_worker_judges_loops_with_the_measured_response_too(bench):
+    """What the model does not explain of the RTC's own matrix weakens the loop of its inverse."""
+    rng = np.random.default_rng(4)
+    response = bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    error = rng.standard_normal(response.shape)
+    error *= 0.4 * np.linalg.norm(response, axis=0) / np.linalg.norm(error, axis=0)
+    found, mode_response = bench.recognise(
+        np.linalg.pinv(response + error).astype(np.float32), None, None
+    )
+    another = OpticsWorker(small_instrument(), COMPUTE)
+    plain = made_by(another).gate.worst_pole_radius
+    another.adopt(None, mode_response, None, found.left_over)
+    radius = made_by(bench).gate.worst_pole_radius
+    assert made_by(another).gate.worst_pole_radius == pytest.approx(radius, abs=1e-3)
+    assert radius > plain + 0.01
+
+
+async def test_after_a_restart_the_rtcs_own_matrix_is_read_and_not_the_one_made_of_the_model(bench):
+    """The one in use agrees with the model in everything: it tells nothing of its error."""
+    rng = np.random.default_rng(4)
+    response = bench.response(Misregistration())[:, :N_CONTROLLED].astype(float)
+    error = rng.standard_normal(response.shape)
+    error *= 0.3 * np.linalg.norm(response, axis=0) / np.linalg.norm(error, axis=0)
+    matrices = {
+        "own": np.linalg.pinv(response + error).astype(np.float32),
+        "made": made_by(bench).matrix,
+    }
+    theirs, made = (
+        ReconstructorRecord(
+            id=name,
+            state=MatrixState.APPLIED,
+            n_modes=N_CONTROLLED,
+            created_ns_utc=0,
+            parent=parent,
+        )
+        for name, parent in (("own", None), ("made", "own"))
+    )
+    state = tracker_state(system="small", reconstructors=(theirs, made), in_use="made")
+
+    async def read(known):
+        workers = OwnHands(OpticsWorker(small_instrument(), COMPUTE))
+        found = await read_own_matrix(made, matrices["made"], state, workers, known)
+        return next(event for event in found if isinstance(event, ModesRecognised))
+
+    assert (await read(matrices.__getitem__)).misfit == pytest.approx(0.3, abs=0.03)
+
+    def lost(name):
+        raise UnknownIdError(name)
+
+    assert (await read(lost)).misfit < 0.02

@@ -122,6 +122,9 @@ def _not_told(fit: Fit) -> Iterator[str]:
     words = [one.words for one in fit.origins if one.correct and one.key != "orientation"]
     if words:
         yield f"{'found, not told':20s}{'; '.join(words)}"
+    if fit.unknown_not_found:
+        keys = ", ".join(fit.unknown_not_found)
+        yield f"{'unknown, not found':20s}{keys}: the matrix does not determine it"
 
 
 def _alternatives(fit: Fit) -> Iterator[str]:

@@ -37,7 +37,7 @@ from pyrcal.offline.methods import (
 )
 from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
-from pyrcal.offline.origins import origins
+from pyrcal.offline.origins import Origin, origins, unknown_not_found
 from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
 from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
 from pyrcal.offline.reference import checked
@@ -429,6 +429,11 @@ def _answer(
     )
     refusal, verdict = judged(findings)
     columns = tuple(strange_columns(solution, target))
+    found_origins: tuple[Origin, ...] = ()
+    if findings.explained:
+        found_origins = origins(
+            as_in_file.instrument, reported, slopes, optics, without, structured, seen.gains
+        )
     fit = Fit(
         alpha=solution.alpha,
         covariance=sure.covariance,
@@ -458,9 +463,8 @@ def _answer(
         image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
         # what noise determines is no finding
         optics=optics if findings.explained else (),
-        origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains)
-        if findings.explained
-        else (),
+        origins=found_origins,
+        unknown_not_found=unknown_not_found(as_in_file.instrument, found_origins),
         alternatives=tried,
         registration=Registration(
             determined=refusal is None,

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pyrcal.offline.instrument_checks import FileValuesFit
+from pyrcal.offline.origins import MAX_LOG_SIGMA, is_determined
 from pyrcal.offline.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
@@ -85,10 +86,15 @@ def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
 def _optics(findings: FitFindings) -> Iterator[str]:
     """Yield coupling and modulation that differ from the file, or that it left unknown."""
     for optic in findings.optics:
-        if optic.found is not None and optic.reported is None:
+        if optic.found is None or optic.reported is not None or optic.sigma > MAX_LOG_SIGMA:
+            continue
+        found = f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}"
+        if is_determined(optic, findings.with_file_values, findings.structure):
+            yield f"{found}: write it into the instrument file"
+        else:
             yield (
-                f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}: write it "
-                "into the instrument file"
+                f"{found}; {findings.structure:.0%} of the signal is left over and no noise, so it "
+                'may stand for errors of the model: leave it "unknown", or measure it'
             )
     wrong = [optic for optic in findings.optics if optic.notable]
     if not wrong or findings.with_file_values is None:
@@ -108,8 +114,8 @@ def _advice(without: FileValuesFit) -> str:
     if not without.is_undecided:
         return "correct the instrument file"
     return (
-        "large pokes, or pushes without pulls, do the same, so sigma allows for both: measure "
-        "again with smaller pokes, both ways, or make sure of these numbers"
+        "large pokes, pushes without pulls or other errors of the model do the same, so sigma "
+        "allows for both: do not change the file before these numbers are measured otherwise"
     )
 
 

@@ -33,6 +33,7 @@ KEYS = {
     "notes",
     "recommendation",
     "found_not_told",
+    "unknown_not_found",
     "alternatives",
     "left_over",
     "anamorphosis",

@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.alternatives import systematic_terms
 from pyrcal.offline.figures import shown_modes
 from pyrcal.offline.fit_file import fit_file
 from pyrcal.offline.fitted import Fit
@@ -250,13 +251,9 @@ def _of_bench(bench: Bench, fit: Fit) -> list[str]:
         strict=True,
     )
     left = "" if fit.left_over is None else fit.left_over.words
-    counted = sorted(
-        (one for one in fit.alternatives if one.sigma_share > 0.0),
-        key=lambda one: -float(np.max(np.abs(one.moved / fit.sigma))),
-    )
     terms = "; ".join(
-        f"{one.words} (at most {float(np.max(np.abs(one.moved / fit.sigma))):.1f} σ)"
-        for one in counted[:3]
+        f"{term.alternative.words} ({float(np.max(term.sigma / fit.sigma)):.1f} of σ)"
+        for term in systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)[:3]
     )
     return [
         f"## {bench.name}",

@@ -335,6 +335,7 @@ class FitDocument(BaseModel):
     """What to do with it, in one sentence: begins with "use it", "measure more" or "do not use"."""
 
     found_not_told: list[dict[str, Any]] = []
+    unknown_not_found: list[str] = []
     """What the matrix has told: key, found, told (as the file says it), how, and whether to correct
     the file."""
 

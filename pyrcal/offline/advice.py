@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import Alternative, moved_words, preference
+from pyrcal.offline.alternatives import Alternative, moved_words, preference, systematic_terms
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.left_over import left_over
 from pyrcal.offline.verdict import CANNOT_TELL, Refusal
@@ -113,13 +113,14 @@ def _uncertain(fit: Fit, edge: float, radius: float) -> str:
     found = fit.registration
     if found is None or _at_edge(found.sigma_statistical, radius) > 0.7 * edge:
         return f"{known}; average more, or push more modes"
-    counted = [one for one in fit.alternatives if one.sigma_share > 0.0]
-    most = max(counted, key=lambda one: _at_edge(one.moved, radius), default=None)
-    if most is None or _at_edge(most.moved, radius) < 0.5 * edge:
+    terms = systematic_terms(fit.alternatives, fit.residual_fraction, fit.sigma)
+    most = max(terms, key=lambda term: _at_edge(term.sigma, radius), default=None)
+    if most is None or _at_edge(most.sigma, radius) < 0.5 * edge:
         return f"{known}; the model differs from the bench, and more averaging does not help"
+    other = most.alternative
     return (
-        f"{known}; the matrix cannot tell {most.words} from what the file says, which would move "
-        f"it by {moved_words(most.moved)}"
+        f"{known}; the matrix cannot tell {other.words} from what the file says, which would move "
+        f"it by {moved_words(other.moved)}"
     )
 
 

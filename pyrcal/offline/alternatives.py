@@ -7,14 +7,14 @@ registration is held where the file has it; what is not is fitted as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.disjoint_sets import SIGNIFICANT
-from pyrcal.offline.instrument_checks import MIN_EXPLAINED, AsTold, FoundOptic, Rival
+from pyrcal.offline.instrument_checks import MIN_EXPLAINED, FileValuesFit, FoundOptic, Rival
 from pyrcal.offline.methods import Settled
 from pyrcal.offline.models import BETTER, FAR_BETTER, Optic
 from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil, gain_maps
@@ -86,23 +86,52 @@ class Alternative:
     is_number: bool = False
     """Whether it is a number at the value that explains most, of which the fit has another."""
 
-    @property
-    def sigma_share(self) -> float:
-        """Part of the square of its move that is in the systematic part of σ: 0 to 1."""
-        if not self.counts:
-            return 0.0
-        return 1.0 if self.preferred else OTHER_SHARE if self.undecided else 0.0
-
     def weight(self, residual_fraction: float) -> float:
         """Return the weight of the square of its move in σ, 0 to 1.
 
-        Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any number fitted
-        besides explains some of that by chance: less than so much is no evidence for it.
+        An explanation that the matrix prefers counts in full, one that is not excluded by its
+        probability. Models of one instrument differ by ``MIN_EXPLAINED`` of the signal, and any
+        number fitted besides explains some of that by chance: less is no evidence for it.
         """
+        if not self.counts or not (self.preferred or self.undecided):
+            return 0.0
         explained = residual_fraction
         if self.is_number and self.share is not None:
             explained *= float(np.sqrt(max(1.0 - self.share, 0.0)))
-        return self.sigma_share * min(1.0, explained / MIN_EXPLAINED) ** 2
+        probability = 1.0 if self.preferred else OTHER_SHARE
+        return probability * min(1.0, explained / MIN_EXPLAINED) ** 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SigmaTerm:
+    """An alternative that counts in the systematic part of σ."""
+
+    alternative: Alternative
+
+    sigma: Array
+    """``(4,)`` 1 σ that it adds, numeric units."""
+
+
+def systematic_terms(
+    tried: Sequence[Alternative], residual_fraction: float, sigma: Array
+) -> tuple[SigmaTerm, ...]:
+    """Return the alternatives that count in σ, the one that adds most first.
+
+    Parameters
+    ----------
+    tried
+        Every alternative.
+    residual_fraction
+        RMS of what the fit leaves over the RMS of the measurement.
+    sigma
+        ``(4,)`` 1 σ of the registration.
+    """
+    terms = [
+        SigmaTerm(alternative=one, sigma=np.sqrt(weight) * np.abs(one.moved))
+        for one in tried
+        if (weight := one.weight(residual_fraction)) > 0.0
+    ]
+    return tuple(sorted(terms, key=lambda term: -float(np.max(term.sigma / sigma))))
 
 
 def alternatives(
@@ -111,7 +140,7 @@ def alternatives(
     others: tuple[Rival, ...],
     pupils: tuple[TriedPupil, ...],
     optics: tuple[FoundOptic, ...],
-    without: AsTold | None,
+    without: FileValuesFit | None,
     arms_deg: tuple[float, ...] = (),
 ) -> tuple[Alternative, ...]:
     """Return every alternative that was tried, those that the matrix prefers first.
@@ -150,7 +179,7 @@ def alternatives(
 
 def off_centre(few: Few, others: tuple[Rival, ...]) -> Alternative | None:
     """Return a pupil off the middle that the matrix prefers, if a rival moves the pupil as well."""
-    if not any(one.believed and "stop" in one.change.words for one in others):
+    if not any(one.preferred and "stop" in one.change.words for one in others):
         return None
     return next((one for one in _that_can(_off_centre(few)) if one.preferred), None)
 
@@ -191,8 +220,8 @@ def _of_rival(rival: Rival, pupils: tuple[TriedPupil, ...]) -> Alternative:
         words=rival.change.words,
         share=rival.share,
         moved=rival.moved,
-        preferred=rival.believed,
-        undecided=not rival.believed and is_open(rival.lead),
+        preferred=rival.preferred,
+        undecided=not rival.preferred and is_open(rival.lead),
         key=rival.change.words,
         counts=True,
         is_number=any(one.words == rival.change.words for one in pupils),
@@ -348,7 +377,7 @@ def _ratio(chi: float, own: float) -> float:
 
 
 def _optics(
-    settled: Settled, optics: tuple[FoundOptic, ...], without: AsTold | None
+    settled: Settled, optics: tuple[FoundOptic, ...], without: FileValuesFit | None
 ) -> Iterator[Alternative]:
     """Yield coupling and modulation as the file says, and a modulation that is another."""
     stated = [one for one in optics if one.reported is not None]

@@ -1,17 +1,26 @@
 """Disjoint sets of modes, actuators and subapertures, each fitted alone: a block jackknife.
 
 A set is fitted by one step from the common solution with its own part of the normal equations, so
-that no model is computed again. Two kinds of sets are told apart. Sets that see the whole pupil
-evenly (a checkerboard, alternate sectors, rings, all sets of modes) repeat the whole fit, and their
-scatter is that of the registration. Halves and quadrants do not: a mirror that is drawn distorted
-moves opposite halves in opposite directions, which cancels in the whole. They are compared and
-reported, and do not enter σ. Nor would bow ties be of use: along one diagonal a rotation looks like
-a stretch.
+that no model is computed again. The σ of its step has three parts:
+
+- leaving out one of its modes at a time: noise, and errors of single modes;
+- leaving out one region of the pupil at a time, where sets see different parts of the pupil:
+  errors of the model that all modes share;
+- between two sets, the difference of how far a smooth distortion of the mirror moves them. The
+  distortion (second and third order) is fitted to the whole matrix: a relay or a drawing that is
+  not quite straight has other registrations in other parts of the pupil.
+
+Sets that see the whole pupil evenly (a checkerboard, alternate sectors, rings, all sets of modes)
+repeat the whole fit, and their scatter enters the σ of the registration. Halves and quadrants do
+not: a distorted mirror moves opposite halves in opposite directions, which cancels in the whole.
+They are compared and reported only. Bow ties would be of no use: along one diagonal a rotation
+looks like a stretch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +48,12 @@ N_SECTORS = 12
 HALVES = ("left and right half", "lower and upper half", "quadrants")
 """Partitions of the pupil whose sets see one side of it."""
 
+ACTUATORS = ("alternate sectors of actuators", "inner and outer actuators")
+"""Partitions of modes whose sets answer in different parts of the pupil."""
+
+DISTORTION_SIGMA_SUBAP = 0.1
+"""1 σ of each term of a smooth distortion, RMS over the pupil, before the matrix is seen."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DisjointSets:
@@ -51,26 +66,57 @@ class DisjointSets:
     """``(n_sets, 4)`` step of each set alone from the common solution, numeric units."""
 
     sigma: Array
-    """``(n_sets, 4)`` 1 σ of each step, from the scatter within the set."""
+    """``(n_sets, 4)`` 1 σ of each step, by leaving out modes and regions of the pupil."""
+
+    distorted: Array
+    """``(n_sets, 4)`` how far the mirror's distortion moves each set; 0 where all see the same."""
 
     jackknife: Array
     """``(4,)`` 1 σ of the registration by leaving out one set at a time."""
 
     @property
+    def ratios(self) -> Array:
+        """``(n_pairs, 4)`` difference of every two sets over their combined σ."""
+        return self._ratios(self.distorted)
+
+    @property
     def tension(self) -> Array:
         """``(4,)`` largest difference of two sets over their combined σ."""
-        found = np.zeros(4)
-        for k in range(len(self.steps)):
-            apart = np.abs(self.steps[k + 1 :] - self.steps[k])
-            both = np.hypot(self.sigma[k + 1 :], self.sigma[k])
-            ratios = np.divide(apart, both, out=np.zeros_like(apart), where=both > 0.0)
-            found = np.maximum(found, ratios.max(axis=0, initial=0.0))
-        return found
+        return np.asarray(self.ratios.max(axis=0, initial=0.0))
+
+    @property
+    def straight_tension(self) -> Array:
+        """``(4,)`` the same if the mirror were not distorted."""
+        return np.asarray(self._ratios(np.zeros_like(self.distorted)).max(axis=0, initial=0.0))
+
+    def _ratios(self, distorted: Array) -> Array:
+        first, second = np.triu_indices(len(self.steps), k=1)
+        apart = np.abs(self.steps[first] - self.steps[second])
+        variance = self.sigma[first] ** 2 + self.sigma[second] ** 2
+        both = np.sqrt(variance + (distorted[first] - distorted[second]) ** 2)
+        return np.divide(apart, both, out=np.zeros_like(apart), where=both > 0.0)
 
     @property
     def even(self) -> bool:
         """Whether each of its sets sees the whole pupil, so that its scatter is that of α."""
         return self.words not in HALVES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Distortion:
+    """A smooth distortion of the mirror, as the whole matrix has it."""
+
+    rms_subap: float
+    """RMS over the pupil of the displacement, shift to magnification taken out, subapertures."""
+
+    share: float
+    """χ² that it leaves, over what the fit leaves."""
+
+    moved: Array
+    """``(4,)`` how far the registration moves if it is fitted besides, numeric units."""
+
+    field: Array
+    """``(n_rows, 2)`` displacement along x and y where each slope is seen, subapertures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,72 +133,176 @@ class Normals:
     """``(n_parts,)`` parts with the same number are taken as dependent."""
 
     @classmethod
-    def of_modes(cls, seen: Projection) -> Normals:
-        """Return the normal equations of each mode."""
-        return cls(normals=seen.normals, scores=seen.scores, clusters=np.arange(len(seen.gains)))
+    def of_modes(cls, seen: Projection, rows: NDArray[np.bool_] | None = None) -> Normals:
+        """Return the normal equations of each mode, of some slopes ``(n_rows,)`` or of all."""
+        if rows is None:
+            normals, scores = seen.normals, seen.scores
+        else:
+            by_mode = seen.jacobian[:, rows].transpose(2, 0, 1)
+            normals = by_mode @ by_mode.transpose(0, 2, 1) * seen.weights[:, None, None]
+            scores = np.einsum("mks,sm->km", by_mode, seen.residual[rows] * seen.weights)
+        return cls(normals=normals, scores=scores, clusters=np.arange(len(seen.gains)))
 
     @classmethod
-    def of_rows(cls, seen: Projection, regions: Labels) -> Normals:
-        """Return the normal equations of each slope.
+    def of_rows(
+        cls, seen: Projection, regions: Labels, modes: NDArray[np.bool_] | None = None
+    ) -> Normals:
+        """Return the normal equations of each slope, of some modes ``(n_modes,)`` or of all.
 
         ``regions`` ``(n_rows,)`` are the clusters.
         """
-        root = np.sqrt(seen.weights)
-        by_row = seen.jacobian.transpose(1, 0, 2) * root
+        kept = slice(None) if modes is None else modes
+        root = np.sqrt(seen.weights[kept])
+        by_row = seen.jacobian[:, :, kept].transpose(1, 0, 2) * root
         return cls(
             normals=by_row @ by_row.transpose(0, 2, 1),
-            scores=np.einsum("skm,sm->ks", by_row, seen.residual * root),
+            scores=np.einsum("skm,sm->ks", by_row, seen.residual[:, kept] * root),
             clusters=regions,
         )
 
-    def compare(
-        self, partitions: Mapping[str, Labels], held: Array, pull: Array, noise: float
-    ) -> Iterator[DisjointSets]:
-        """Yield each partition with the steps of its sets.
+    def leave_one_out(
+        self, inside: NDArray[np.bool_], held: Array, pull: Array
+    ) -> tuple[Array, Array]:
+        """Return the step of some parts ``(n_parts,)``, and its 1 σ by leaving out clusters."""
+        _, cluster = np.unique(self.clusters[inside], return_inverse=True)
+        n_clusters = int(cluster.max()) + 1
+        normals = np.zeros((n_clusters, *self.normals.shape[1:]))
+        np.add.at(normals, cluster, self.normals[inside])
+        scores = np.array([np.bincount(cluster, row) for row in self.scores[:, inside]])
+        every, scored = normals.sum(axis=0) + held, scores.sum(axis=1) - pull
+        left = np.linalg.solve(every - normals, (scored[:, None] - scores).T[:, :, None])[:, :4, 0]
+        spread = np.sum((left - left.mean(axis=0)) ** 2, axis=0)
+        sigma = np.sqrt((n_clusters - 1) / n_clusters * spread)
+        return np.linalg.solve(every, scored)[:4], sigma
+
+    def distorted(self, inside: NDArray[np.bool_], held: Array, field: Array) -> Array:
+        """Return how far a displacement of each slope ``(n_parts, 2)`` moves some of them."""
+        normals = self.normals[inside]
+        along = np.einsum("ski,si->k", normals[:, :, :2], field[inside])
+        return np.asarray(np.linalg.solve(normals.sum(axis=0) + held, along)[:4])
+
+    def fit_distortion(
+        self, places: Array, held: Array, pull: Array, chi: float, noise: float
+    ) -> Distortion:
+        """Return the smooth distortion that explains most, every other unknown left free.
+
+        To first order a point displaced by u changes its slopes by the derivatives with the shift
+        times u, so that the parts of each slope hold all that is needed.
 
         Parameters
         ----------
-        partitions
-            Name, and the set of each part ``(n_parts,)``.
+        places
+            ``(n_rows, 2)`` where each slope is seen, pupil radii.
         held, pull
             Prior of the unknowns as normal equations: ``(n, n)`` and ``(n,)``.
+        chi
+            χ² that the fit leaves.
         noise
             Variance of a weighted residual.
         """
+        shapes = _smooth_shapes(places)
+        n, n_shapes = len(held), shapes.shape[1]
+        across = np.einsum("sa,ski->kai", shapes, self.normals[:, :, :2]).reshape(n, -1)
+        among = np.einsum("sa,sb,sij->aibj", shapes, shapes, self.normals[:, :2, :2], optimize=True)
+        scored = np.einsum("sa,is->ai", shapes, self.scores[:2]).ravel()
+        own = np.full(2 * n_shapes, noise / DISTORTION_SIGMA_SUBAP**2)
+        normal = np.block(
+            [
+                [self.normals.sum(axis=0) + held, across],
+                [across.T, among.reshape(2 * n_shapes, -1) + np.diag(own)],
+            ]
+        )
+        pulled = np.concatenate([self.scores.sum(axis=1) - pull, scored])
+        step = np.linalg.solve(normal, pulled)
+        field = shapes @ step[n:].reshape(n_shapes, 2)
+        return Distortion(
+            rms_subap=float(np.sqrt(np.mean(np.sum(field**2, axis=1)))),
+            share=max(1.0 - float(step @ pulled) / chi, 0.0) if chi > 0.0 else 1.0,
+            moved=step[:4],
+            field=field,
+        )
+
+
+def _smooth_shapes(places: Array) -> Array:
+    """Return terms of second and third order ``(n_rows, 7)``, RMS 1, free of lower orders."""
+    x, y = places.T
+    lower = [np.ones_like(x), x, y]
+    found = []
+    for term in (x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3):
+        base = np.column_stack(lower)
+        own = term - base @ np.linalg.lstsq(base, term, rcond=None)[0]
+        found.append(own / max(float(np.sqrt(np.mean(own**2))), 1e-12))
+        lower.append(own)
+    return np.column_stack(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SetComparison:
+    """A projection at its solution, ready to be compared set by set."""
+
+    seen: Projection
+
+    regions: Labels
+    """``(n_rows,)`` region of the pupil of each slope."""
+
+    held: Array
+    """``(n_unknowns, n_unknowns)`` prior of the unknowns as normal equations."""
+
+    pull: Array
+    """``(n_unknowns,)`` the prior's scores."""
+
+    noise: float
+    """Variance of a weighted residual."""
+
+    distortion: Distortion
+
+    def of_modes(self, partitions: Mapping[str, Labels], parts: Normals) -> Iterator[DisjointSets]:
+        """Yield partitions of the modes; ``parts`` are the normal equations of each mode."""
+        every = np.ones(len(self.regions), dtype=bool)
         for words, labels in partitions.items():
-            try:
-                yield self._compared(words, labels, held, pull, noise)
-            except np.linalg.LinAlgError:
-                continue  # a set that determines nothing says nothing
+            with suppress(np.linalg.LinAlgError):  # a set that determines nothing is left out
+                sets = []
+                for number in np.unique(labels):
+                    inside = labels == number
+                    step, sigma = parts.leave_one_out(inside, self.held, self.pull)
+                    moved = np.zeros(4)
+                    if words in ACTUATORS:
+                        by_row = Normals.of_rows(self.seen, self.regions, inside)
+                        _, common = by_row.leave_one_out(every, self.held, self.pull)
+                        sigma = np.hypot(sigma, common)
+                        moved = by_row.distorted(every, self.held, self.distortion.field)
+                    sets.append((step, self._at_least_noise(sigma, parts, inside), moved))
+                yield self._compared(words, labels, sets, parts)
+
+    def of_rows(self, partitions: Mapping[str, Labels], parts: Normals) -> Iterator[DisjointSets]:
+        """Yield partitions of the slopes; ``parts`` are the normal equations of each slope."""
+        every = np.ones(len(self.seen.gains), dtype=bool)
+        for words, labels in partitions.items():
+            with suppress(np.linalg.LinAlgError):
+                sets = []
+                for number in np.unique(labels):
+                    inside = labels == number
+                    step, sigma = parts.leave_one_out(inside, self.held, self.pull)
+                    by_mode = Normals.of_modes(self.seen, inside)
+                    _, single = by_mode.leave_one_out(every, self.held, self.pull)
+                    sigma = self._at_least_noise(np.hypot(sigma, single), parts, inside)
+                    moved = parts.distorted(inside, self.held, self.distortion.field)
+                    sets.append((step, sigma, moved))
+                yield self._compared(words, labels, sets, parts)
+
+    def _at_least_noise(self, sigma: Array, parts: Normals, inside: NDArray[np.bool_]) -> Array:
+        spread = np.linalg.inv(parts.normals[inside].sum(axis=0) + self.held)
+        return np.maximum(sigma, np.sqrt(np.diag(spread)[:4] * self.noise))
 
     def _compared(
-        self, words: str, labels: Labels, held: Array, pull: Array, noise: float
+        self, words: str, labels: Labels, sets: list[tuple[Array, Array, Array]], parts: Normals
     ) -> DisjointSets:
-        numbers = np.unique(labels)
-        normals = np.array([self.normals[labels == k].sum(axis=0) for k in numbers])
-        scores = np.array([self.scores[:, labels == k].sum(axis=1) for k in numbers])
-        every, scored = normals.sum(axis=0), scores.sum(axis=0)
-        steps, sigma, without = [], [], []
-        for k, number in enumerate(numbers):
-            spread = np.linalg.inv(normals[k] + held)
-            step = spread @ (scores[k] - pull)
-            inside = labels == number
-            about = self.scores[:, inside] - (self.normals[inside] @ step).T
-            _, cluster = np.unique(self.clusters[inside], return_inverse=True)
-            summed = np.array([np.bincount(cluster, row) for row in about])
-            n_clusters = summed.shape[1]
-            pulled = (spread @ summed)[:4]
-            scatter = np.sum(pulled**2, axis=1) * n_clusters / max(n_clusters - 1, 1)
-            steps.append(step[:4])
-            sigma.append(np.sqrt(np.maximum(scatter, np.diag(spread)[:4] * noise)))
-            left = every - normals[k] + held
-            without.append(np.linalg.solve(left, scored - scores[k] - pull)[:4])
-        n_sets, apart = len(numbers), np.array(without) - np.mean(without, axis=0)
+        steps, sigma, distorted = (np.array(values) for values in zip(*sets, strict=True))
+        blocks = Normals(normals=parts.normals, scores=parts.scores, clusters=labels)
+        every = np.ones(len(labels), dtype=bool)
+        _, jackknife = blocks.leave_one_out(every, self.held, self.pull)
         return DisjointSets(
-            words=words,
-            steps=np.array(steps),
-            sigma=np.array(sigma),
-            jackknife=np.sqrt((n_sets - 1) / n_sets * np.sum(apart**2, axis=0)),
+            words=words, steps=steps, sigma=sigma, distorted=distorted, jackknife=jackknife
         )
 
 
@@ -160,13 +310,14 @@ def jackknife_sigma(partitions: Sequence[DisjointSets]) -> Array:
     """Return ``(4,)`` 1 σ of the registration by all partitions of one kind.
 
     Each alone has few degrees of freedom, so their mean variance counts; but sets that differ
-    significantly show something that the others cannot see, and count by themselves.
+    significantly show something that the others cannot see, and count by themselves: a distortion
+    that explains their difference leaves the registration uncertain by as much.
     """
     found = [one for one in partitions if one.even]
     if not found:
         return np.zeros(4)
     squares = np.array([one.jackknife**2 for one in found])
-    tensions = np.array([one.tension for one in found])
+    tensions = np.array([one.straight_tension for one in found])
     alone = np.where(tensions > SIGNIFICANT, squares, 0.0).max(axis=0)
     return np.asarray(np.sqrt(np.maximum(squares.mean(axis=0), alone)))
 
@@ -185,9 +336,9 @@ def mode_partitions(target: Target, n_planes: int, *, by_actuator: bool) -> dict
         found[f"{n_combs} combs of modes"] = rank % n_combs
     if by_actuator:
         x, y = _centroids(target, n_planes)
-        found["alternate sectors of actuators"] = _sector(x, y) % 2
+        found[ACTUATORS[0]] = _sector(x, y) % 2
         away = np.hypot(x, y)
-        found["inner and outer actuators"] = (away > np.median(away)).astype(np.intp)
+        found[ACTUATORS[1]] = (away > np.median(away)).astype(np.intp)
     else:
         found["low and high modes"] = (2 * rank // n_modes).astype(np.intp)
     return {

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import moved_words
+from pyrcal.offline.alternatives import moved_words, systematic_terms
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport, orientation_words, verdict_line
@@ -122,6 +122,9 @@ def _not_told(fit: Fit) -> Iterator[str]:
     words = [one.words for one in fit.origins if one.correct and one.key != "orientation"]
     if words:
         yield f"{'found, not told':20s}{'; '.join(words)}"
+    if fit.unknown_not_found:
+        keys = ", ".join(fit.unknown_not_found)
+        yield f"{'unknown, not found':20s}{keys}: the matrix does not determine it"
 
 
 def _alternatives(fit: Fit) -> Iterator[str]:
@@ -135,11 +138,11 @@ def _alternatives(fit: Fit) -> Iterator[str]:
     yield f"{'rivals':20s}{len(tried)} tried, {named}"
     open_ = [one for one in tried if one.undecided]
     weights = [one for one in tried if one.share is None]
-    counted = [one for one in tried if one.sigma_share > 0.0]
-    for one in sorted(counted, key=lambda one: -float(np.max(np.abs(one.moved / sigma))))[:_TERMS]:
+    for term in systematic_terms(tried, fit.residual_fraction, sigma)[:_TERMS]:
+        one = term.alternative
         yield f"{'  in systematic':20s}{one.words}: {moved_words(one.moved)}"
     for words, group in (
-        ("as likely: would move it by up to", open_),
+        ("not excluded: would move it by up to", open_),
         ("other weights and modes: by up to", weights),
     ):
         if group:

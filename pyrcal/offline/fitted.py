@@ -139,6 +139,9 @@ class Fit(Determination):
     origins: tuple[Origin, ...] = ()
     """What of the instrument was found rather than told."""
 
+    unknown_not_found: tuple[str, ...] = ()
+    """Keys that the file calls unknown and that the matrix does not determine."""
+
     left_over: LeftOver | None = None
     """Where the residual is."""
 

@@ -28,9 +28,9 @@ NOTABLE = 0.03
 """A logarithm of the instrument's that differs by less from the file's is not worth a word."""
 
 MIN_EXPLAINED = 0.005
-"""RMS share of the signal that another instrument has to explain to be believed. What models of the
-same instrument differ by is of that size: with OOPAO's own Shack-Hartmann 0.2 % is left over, and
-another stop, by chance of the model's errors, explains 0.12 %."""
+"""RMS share of the signal that another instrument has to explain to be preferred. Models of one
+instrument differ by about as much: with OOPAO's own Shack-Hartmann 0.2 % is left over, and another
+stop, by chance of the model's errors, explains 0.12 %."""
 
 LITTLE_EXPLAINED = 0.3
 """Share of χ² left by another coupling or modulation above which it may stand for something else.
@@ -65,13 +65,13 @@ class Rival:
         return self.lead.share
 
     @property
-    def believed(self) -> bool:
-        """Whether it is the instrument, rather than the one of the file.
+    def preferred(self) -> bool:
+        """Whether the matrix prefers it to the instrument of the file.
 
         It leaves clearly less, by more than chance, and by more than models differ anyway.
         """
         return (
-            self.share < self.change.believed
+            self.share < self.change.max_misfit_ratio
             and self.lead.significance > SIGNIFICANT
             and self.explained > MIN_EXPLAINED
         )
@@ -118,7 +118,7 @@ class FoundOptic:
         return f"{self.key} = {self.found:.3g}"
 
     @property
-    def told_words(self) -> str:
+    def file_words(self) -> str:
         """The value in the file."""
         if self.reported is None:
             return "than the instrument file's" if self.found is None else "the file does not say"
@@ -132,8 +132,8 @@ class FoundOptic:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AsTold:
-    """The fit in which nothing of the instrument is unknown."""
+class FileValuesFit:
+    """The fit with coupling and modulation fixed to the values of the instrument file."""
 
     share: float
     """χ² left now, over what it leaves."""
@@ -142,8 +142,8 @@ class AsTold:
     """``(4,)`` by how much its registration is another, numeric units."""
 
     @property
-    def as_likely(self) -> bool:
-        """Whether what was found of the instrument explains too little to be a finding.
+    def is_undecided(self) -> bool:
+        """Whether the values that were fitted explain too little to correct the file.
 
         Pokes of a tenth of a wavelength, or pushed only, look like another modulation.
         """
@@ -161,7 +161,7 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
 
     found = [
         Rival(
-            change=Other(words=one.words, believed=FAR_BETTER),
+            change=Other(words=one.words, max_misfit_ratio=FAR_BETTER),
             lead=one.lead,
             moved=one.moved,
             explained=explained(one.lead),
@@ -174,7 +174,7 @@ def rivals(settled: Settled, few: Few, pupils: tuple[TriedPupil, ...]) -> tuple[
         lead = few.lead(matrix)
         moved = few.step(matrix)[:4] - few.step(few.own)[:4]
         found.append(Rival(change=change, lead=lead, moved=moved, explained=explained(lead)))
-    return tuple(sorted(found, key=lambda one: one.share / one.change.believed))
+    return tuple(sorted(found, key=lambda one: one.share / one.change.max_misfit_ratio))
 
 
 def doubt_of_width(settled: Settled, few: Few) -> Array:
@@ -218,11 +218,11 @@ def found_optics(models: FitModels, settled: Settled, sure: Uncertainty) -> tupl
     return tuple(found)
 
 
-def as_told(models: FitModels, settled: Settled) -> AsTold:
-    """Return the fit with the instrument that the file describes; ``models`` are its."""
+def fit_file_values(models: FitModels, settled: Settled) -> FileValuesFit:
+    """Return the fit with coupling and modulation fixed to those of the file's ``models``."""
     nothing = replace(settled.nuisances, optics=())
     there = refine(models, settled.target, settled.solution.alpha, nothing)
-    return AsTold(
+    return FileValuesFit(
         share=settled.solution.projection.chi / there.projection.chi,
         moved=there.vector - settled.solution.vector,
     )

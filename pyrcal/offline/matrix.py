@@ -19,8 +19,8 @@ from pyrcal.offline.fitted import Fit, Registration
 from pyrcal.offline.gain_causes import gain_causes
 from pyrcal.offline.instrument_checks import (
     MIN_EXPLAINED,
-    as_told,
     doubt_of_width,
+    fit_file_values,
     found_optics,
     rivals,
 )
@@ -37,7 +37,7 @@ from pyrcal.offline.methods import (
 )
 from pyrcal.offline.models import FitModels
 from pyrcal.offline.noise import structure
-from pyrcal.offline.origins import origins
+from pyrcal.offline.origins import Origin, origins, unknown_not_found
 from pyrcal.offline.pupil_checks import Few, left_by_light, tried_pupils
 from pyrcal.offline.pupil_width import SeenPupil, answers_of, seen_pupil
 from pyrcal.offline.reference import checked
@@ -47,6 +47,7 @@ from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
     OTHER_SHARE,
+    pupil_places,
     pupil_regions,
     uncertainty,
 )
@@ -382,6 +383,9 @@ def _answer(
         values,
         nuisances.prior,
         regions,
+        pupil_places(target.valid, n_planes, models.instrument.wfs.pupil_diameter / 2.0)[
+            target.rows
+        ],
         shift_subap=float(np.hypot(*solution.vector[:2])),
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
         magnification_floor=LOCAL_MAGNIFICATION_FLOOR
@@ -394,14 +398,14 @@ def _answer(
     )
     optics = found_optics(as_in_file, settled, before)
     stroke_known = _stroke_known(models.instrument)
-    without = as_told(as_in_file, settled) if any(one.notable for one in optics) else None
+    without = fit_file_values(as_in_file, settled) if any(one.notable for one in optics) else None
     left_map = _residual_map(found)
     arms_deg = tuple(arm.angle_deg for arm in arms_of(left_map))
     tried = alternatives(settled, few, others, pupils, optics, without, arms_deg)
     floor = min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
     moves = [doubt_of_width(settled, few), *(one.moved for one in tried)]
     shares = [OTHER_SHARE * floor, *(one.weight(residual_fraction) for one in tried)]
-    if without is not None and without.as_likely:
+    if without is not None and without.is_undecided:
         moves.append(without.moved)
         shares.append(OTHER_SHARE * floor)
     sure = before.with_moves(np.array(moves), np.array(shares))
@@ -418,13 +422,18 @@ def _answer(
         off_centre=off_centre(few, others),
         optics=optics,
         narrow=_narrow(settled),
-        as_told=without,
+        with_file_values=without,
         axes=untold,
         passes=usable.passes,
         stroke_known=stroke_known,
     )
     refusal, verdict = judged(findings)
     columns = tuple(strange_columns(solution, target))
+    found_origins: tuple[Origin, ...] = ()
+    if findings.explained:
+        found_origins = origins(
+            as_in_file.instrument, reported, slopes, optics, without, structured, seen.gains
+        )
     fit = Fit(
         alpha=solution.alpha,
         covariance=sure.covariance,
@@ -454,9 +463,8 @@ def _answer(
         image_offsets_px=_image_offsets(models.instrument, nuisances, solution),
         # what noise determines is no finding
         optics=optics if findings.explained else (),
-        origins=origins(as_in_file.instrument, reported, slopes, optics, seen.gains)
-        if findings.explained
-        else (),
+        origins=found_origins,
+        unknown_not_found=unknown_not_found(as_in_file.instrument, found_origins),
         alternatives=tried,
         registration=Registration(
             determined=refusal is None,

@@ -30,7 +30,7 @@ CHEAP = 2
 steps, the sensor's kind says how many are enough."""
 
 BETTER = 0.95
-"""Another instrument is believed when it leaves less than this share of χ². On the diffractive
+"""Another instrument is preferred when it leaves less than this share of χ². On the diffractive
 telescope the right stop has left 0.83 to 0.94 of what the wrong one does, noise included, from a
 shift of 0.08 subaperture on; at no shift the two differ by less than 0.01."""
 
@@ -72,8 +72,8 @@ class Other:
     words: str
     """Key and value, as the file would say them."""
 
-    believed: float
-    """Share of χ² below which it is believed rather than the file."""
+    max_misfit_ratio: float
+    """Largest χ² that it may leave, over what the file leaves, to be preferred."""
 
 
 def deciding_sampling(instrument: Instrument) -> int:
@@ -241,11 +241,11 @@ class FitModels:
         for words, recipe in kind_of(about).other_recipes(about.slopes).items():
             others[words] = replace(about, slopes=recipe)
         found = {
-            Other(words=words, believed=BETTER): replace(self, instrument=other)
+            Other(words=words, max_misfit_ratio=BETTER): replace(self, instrument=other)
             for words, other in others.items()
         }
         for words, sensor in kind_of(about).other_sensors(about.wfs).items():
-            other = Other(words=words, believed=FAR_BETTER)
+            other = Other(words=words, max_misfit_ratio=FAR_BETTER)
             found[other] = replace(self, instrument=replace(about, wfs=sensor))
         if isinstance(self.basis, ModalBasis):
             gaussian = isinstance(self.basis.surface, ThinPlate)
@@ -254,6 +254,6 @@ class FitModels:
             surface = mirror_surface(
                 replace(mirror, shape=replace(mirror.shape, influence=shape)), about.subaperture_m
             )
-            other = Other(words=f'influence = "{shape}"', believed=FAR_BETTER)
+            other = Other(words=f'influence = "{shape}"', max_misfit_ratio=FAR_BETTER)
             found[other] = replace(self, basis=self.basis.of_surface(surface))
         return found

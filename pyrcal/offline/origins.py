@@ -8,9 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.instrument_checks import FoundOptic
+from pyrcal.offline.instrument_checks import FileValuesFit, FoundOptic
 from service.model.instrument import Instrument
 from service.model.slopes import FLIPS, Orientation, SlopeRecipe
+
+MAX_STRUCTURE = 0.09
+"""RMS share of the signal left over and no noise up to which a number that the file does not have
+is a finding. Beyond, it may make up for errors of the model: on PAPYRUS, where 14 % is left over,
+every disjoint set finds a modulation of 10.6 λ/D, and the bench is set to 5."""
+
+MAX_LOG_SIGMA = 0.5
+"""1 σ of the logarithm of a number beyond which it was not found: half of what is allowed to one
+that is unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +52,8 @@ def origins(
     reported: SlopeRecipe,
     found: SlopeRecipe,
     optics: tuple[FoundOptic, ...],
+    with_file_values: FileValuesFit | None,
+    structure: float,
     gains: NDArray[np.float64],
 ) -> tuple[Origin, ...]:
     """Return what was found of the instrument and its slopes.
@@ -55,12 +66,20 @@ def origins(
         How slopes are listed, as asked for and as found.
     optics
         Numbers of the instrument fitted beside the registration.
+    with_file_values
+        The fit with those of the file; None where none differs notably.
+    structure
+        RMS share of the signal that is left over and is no noise.
     gains
         ``(n_used,)`` of the modes.
     """
     return (
         *_slopes(reported, found),
-        *map(_of_optic, (one for one in optics if one.found is not None)),
+        *(
+            _of_optic(one, determined=is_determined(one, with_file_values, structure))
+            for one in optics
+            if one.found is not None and one.sigma < MAX_LOG_SIGMA
+        ),
         *_wavelength(about, gains),
         *_strokes(about),
     )
@@ -92,14 +111,40 @@ def written(orientation: Orientation) -> str:
     return f"{{ {flips}, sign = {both[0] if both[0] == both[1] else both} }}"
 
 
-def _of_optic(one: FoundOptic) -> Origin:
+def is_determined(
+    one: FoundOptic, with_file_values: FileValuesFit | None, structure: float
+) -> bool:
+    """Return whether a number that was fitted is a finding, and not a stand-in for model errors.
+
+    A number of the file is corrected if the file's own leaves several times as much. One that the
+    file does not have is a finding if hardly more than noise is left over. That disjoint sets agree
+    on it proves nothing: errors of the model are the same in all of them.
+    """
+    if one.sigma > MAX_LOG_SIGMA:
+        return False
+    if one.reported is None or with_file_values is None:
+        return structure < MAX_STRUCTURE
+    return not with_file_values.is_undecided
+
+
+def unknown_not_found(about: Instrument, found: tuple[Origin, ...]) -> tuple[str, ...]:
+    """Return the keys that the file calls unknown and that the matrix does not determine.
+
+    The places of the pupil images are left out: they are fitted whenever the file has none.
+    """
+    keys = {one.key for one in found} | {"image_offsets_px"}
+    return tuple(key for key in about.unknown if key.rpartition(".")[2] not in keys)
+
+
+def _of_optic(one: FoundOptic, *, determined: bool) -> Origin:
     unknown = one.reported is None
+    doubt = "" if determined else ", may stand for errors of the model"
     return Origin(
         key=one.key,
         found=f"{one.found:.3g}",
         reported='"unknown"' if unknown else f"{one.reported:.3g}",
-        how=f"fitted, 1 sigma {one.found_sigma:.1g}",
-        correct=unknown or one.notable,
+        how=f"fitted, 1 sigma {one.found_sigma:.1g}{doubt if unknown or one.notable else ''}",
+        correct=determined and (unknown or one.notable),
     )
 
 

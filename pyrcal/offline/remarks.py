@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pyrcal.offline.instrument_checks import AsTold
+from pyrcal.offline.instrument_checks import FileValuesFit
+from pyrcal.offline.origins import MAX_LOG_SIGMA, is_determined
 from pyrcal.offline.verdict import NOTABLE_STRUCTURE, FitFindings, factor_of_passes
 from service.model.instrument import Instrument
 from service.model.kinds import SlopeOrder
@@ -85,30 +86,36 @@ def _mirrored(reported: SlopeRecipe, found: SlopeRecipe) -> Iterator[str]:
 def _optics(findings: FitFindings) -> Iterator[str]:
     """Yield coupling and modulation that differ from the file, or that it left unknown."""
     for optic in findings.optics:
-        if optic.found is not None and optic.reported is None:
+        if optic.found is None or optic.reported is not None or optic.sigma > MAX_LOG_SIGMA:
+            continue
+        found = f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}"
+        if is_determined(optic, findings.with_file_values, findings.structure):
+            yield f"{found}: write it into the instrument file"
+        else:
             yield (
-                f"{optic.found_words} was found, 1 sigma {optic.found_sigma:.2g}: write it "
-                "into the instrument file"
+                f"{found}; {findings.structure:.0%} of the signal is left over and no noise, so it "
+                'may stand for errors of the model: leave it "unknown", or measure it'
             )
     wrong = [optic for optic in findings.optics if optic.notable]
-    if not wrong or findings.as_told is None:
+    if not wrong or findings.with_file_values is None:
         return
-    found = " and ".join(f"{optic.found_words} ({optic.told_words})" for optic in wrong)
-    moved = findings.as_told.moved * BOUNDARY_SCALE
+    found = " and ".join(f"{optic.found_words} ({optic.file_words})" for optic in wrong)
+    there = findings.with_file_values
+    moved = there.moved * BOUNDARY_SCALE
     yield (
-        f"with {found} the misfit is {findings.as_told.share:.0%} of what it would be: the "
+        f"with {found} the misfit is {there.share:.0%} of what it would be: the "
         f"registration allows for it, which moved it by {moved[0]:.2g}, {moved[1]:.2g} "
-        f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; {_advice(findings.as_told)}"
+        f"subaperture, {moved[2]:.2g} deg, {moved[3]:.2g}; {_advice(there)}"
     )
 
 
-def _advice(without: AsTold) -> str:
+def _advice(without: FileValuesFit) -> str:
     """Return what to do about an instrument that was found unlike its file."""
-    if not without.as_likely:
+    if not without.is_undecided:
         return "correct the instrument file"
     return (
-        "large pokes, or pushes without pulls, do the same, so sigma allows for both: measure "
-        "again with smaller pokes, both ways, or make sure of these numbers"
+        "large pokes, pushes without pulls or other errors of the model do the same, so sigma "
+        "allows for both: do not change the file before these numbers are measured otherwise"
     )
 
 

@@ -107,6 +107,7 @@ def document(report: FitReport) -> dict[str, Any]:
             }
             for one in fit.origins
         ],
+        "unknown_not_found": list(fit.unknown_not_found),
         "alternatives": [_alternative(one, fit) for one in fit.alternatives],
         "left_over": None if fit.left_over is None else _left_over(fit.left_over),
         "notes": list(report.notes),

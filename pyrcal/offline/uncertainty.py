@@ -17,7 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.disjoint_sets import DisjointSets, Normals, jackknife_sigma
+from pyrcal.offline.disjoint_sets import (
+    DisjointSets,
+    Distortion,
+    Normals,
+    SetComparison,
+    jackknife_sigma,
+)
 from service.estimation.solver import Projection
 
 Array = NDArray[np.float64]
@@ -90,6 +96,9 @@ class Uncertainty:
     sets: tuple[DisjointSets, ...] = ()
     """Disjoint sets of modes, actuators and subapertures, each fitted alone."""
 
+    distortion: Distortion | None = None
+    """The smooth distortion of the mirror that explains most."""
+
     @property
     def sigma_statistical(self) -> Array:
         """``(4,)`` 1 σ from noise and the disagreement of disjoint sets."""
@@ -146,6 +155,7 @@ def uncertainty(
     values: Array,
     prior: Array,
     regions: NDArray[np.intp],
+    places: Array,
     *,
     shift_subap: float,
     radius_subap: float,
@@ -168,6 +178,8 @@ def uncertainty(
         ``(n_unknowns,)`` reciprocal variance of each unknown.
     regions
         ``(n_rows,)`` region of the pupil of each slope.
+    places
+        ``(n_rows, 2)`` where each slope is seen, pupil radii.
     shift_subap
         Length of the shift at the solution: part of the model's error grows with it.
     radius_subap
@@ -203,10 +215,16 @@ def uncertainty(
     from_model = np.diag(share**2 + floor**2 + far**2)
     pull = prior * noise * values
     by_row = Normals.of_rows(projection, regions)
-    sets = (
-        *by_mode.compare(mode_sets, held, pull, noise),
-        *by_row.compare(pupil_sets, held, pull, noise),
+    distortion = by_row.fit_distortion(places, held, pull, projection.chi, noise)
+    comparison = SetComparison(
+        seen=projection,
+        regions=regions,
+        held=held,
+        pull=pull,
+        noise=noise,
+        distortion=distortion,
     )
+    sets = (*comparison.of_modes(mode_sets, by_mode), *comparison.of_rows(pupil_sets, by_row))
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     statistical = from_modes
     for kind in (mode_sets, pupil_sets):
@@ -216,10 +234,17 @@ def uncertainty(
         covariance=statistical + from_model,
         statistical=statistical,
         sets=sets,
+        distortion=distortion,
         nuisance_sigma=np.sqrt(np.diag(every + by_region + spread * noise))[4:],
         subset_steps=steps,
         subset_covariance=covariances + from_model,
     )
+
+
+def pupil_places(valid: NDArray[np.bool_], n_planes: int, radius_subap: float) -> Array:
+    """Return where every signal is seen, ``(n_slopes, 2)`` along x and y, pupil radii."""
+    y, x = np.stack(np.nonzero(valid)) - (len(valid) - 1) / 2
+    return np.tile(np.column_stack([x, y]) / radius_subap, (n_planes, 1))
 
 
 def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative
-from pyrcal.offline.instrument_checks import AsTold, FoundOptic, Rival
+from pyrcal.offline.instrument_checks import FileValuesFit, FoundOptic, Rival
 from pyrcal.offline.methods import Landing
 from pyrcal.offline.pupil_width import SeenPupil
 from pyrcal.offline.solver import OPTIC_SIGMA, UNKNOWN_SIGMA, Solution
@@ -89,7 +89,7 @@ class FitFindings:
     """Other instruments, the one that explains the matrix best first."""
 
     off_centre: Alternative | None
-    """A pupil off the subapertures' middle, where a rival is believed that moves the pupil, too."""
+    """A pupil off the subapertures' middle, where another stop would move the pupil as well."""
 
     alternatives: tuple[Alternative, ...]
     """Every other explanation that was tried."""
@@ -100,8 +100,8 @@ class FitFindings:
     narrow: SeenPupil | None
     """A pupil's image that is narrower than the file says; None: it is as wide."""
 
-    as_told: AsTold | None
-    """The fit with all of these as the file says; None: they are, so far as the matrix tells."""
+    with_file_values: FileValuesFit | None
+    """The fit with all of these as in the file; None where none differs notably."""
 
     axes: str
     """Why the orientation cannot be told; empty: it can."""
@@ -223,14 +223,14 @@ def _another_pupil(findings: FitFindings) -> str:
 
 def _another_instrument(findings: FitFindings) -> str:
     for rival in findings.rivals:
-        if rival.believed and _displaces(findings, rival.moved):
+        if rival.preferred and _displaces(findings, rival.moved):
             return f"another instrument explains the matrix better: {_which(findings, rival)}"
     for optic in findings.optics:
         usual = OPTIC_SIGMA[optic.optic] if optic.reported is not None else UNKNOWN_SIGMA
         # a logarithm has no value for a modulation that is found to be none
         if abs(optic.change) > STRANGEST * usual and optic.found != 0.0:
             return (
-                f"only {optic.found_words} would explain the matrix, {optic.told_words}: the "
+                f"only {optic.found_words} would explain the matrix, {optic.file_words}: the "
                 "mirror, the sensor or the modes are not those of the instrument file"
             )
     return ""

@@ -33,6 +33,7 @@ KEYS = {
     "notes",
     "recommendation",
     "found_not_told",
+    "unknown_not_found",
     "alternatives",
     "left_over",
     "anamorphosis",
@@ -138,7 +139,7 @@ RIVALS = (
 def test_what_else_was_tried_is_counted_and_the_largest_move_named():
     text = table(a_report(a_fit(alternatives=RIVALS)))
     assert "3 tried, 1 preferred: see notes" in line(text, "rivals")
-    assert "as likely: would move it by up to 0.2 sigma (no anamorphosis fitted)" in text
+    assert "not excluded: would move it by up to 0.2 sigma (no anamorphosis fitted)" in text
     assert "other weights and modes: by up to 5.7 sigma (the lower half of the modes)" in text
 
 

@@ -125,6 +125,7 @@ _ACQUISITION_KEPT = (
     "found",
     "n_modes",
     "max_modes",
+    "lost_with",
     "matrix",
     "sent",
     "held_off",

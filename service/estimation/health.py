@@ -40,6 +40,12 @@ DIVERGING_RATIO = 10.0
 CALM_RATIO = 5.0
 """Below this a loop that was diverging counts as holding again."""
 
+LOST_RATIO = 100.0
+"""Times the expected turbulence from which no loop comes back by itself: it is opened at once."""
+
+LOST_S = 0.1
+"""Every frame must be beyond ``LOST_RATIO`` for so long: a single wrong frame opens no loop."""
+
 ABSURD_RATIO = 1e4
 """Times the expected turbulence that no mirror reaches: commands are in another unit."""
 
@@ -65,6 +71,12 @@ class LoopHealth(Detector):
     absurd: bool = False
     """Whether commands are beyond any mirror and came there at once, as no loop does."""
 
+    beyond_s: float = 0.0
+    """Duration for which every frame has been beyond ``LOST_RATIO``, seconds."""
+
+    lost: bool = False
+    """Whether that lasted for ``LOST_S`` since the loop began to diverge."""
+
     @override
     def begun_anew(self, loop: LoopContext, why: Change) -> LoopHealth:
         """Return it with nothing; what another matrix made of the loop says nothing of this one."""
@@ -85,7 +97,7 @@ class LoopHealth(Detector):
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Whether commands are in another unit, and whether the loop runs away."""
+        """Whether commands are in another unit, and whether the loop diverges or is lost."""
         absurd = (
             f"commands are {self.ratio:.3g} times what turbulence asks: {self.unit}; nothing is "
             "measured, made or sent until the RTC sends metres"
@@ -94,7 +106,15 @@ class LoopHealth(Detector):
             f"the loop is diverging: its high modes carry {self.ratio:.0f} times what turbulence "
             "asks of them; open the loop, lower the gain or control fewer modes"
         )
-        return absurd if self.absurd else None, diverging if self.diverging else None
+        lost = (
+            f"the loop is lost: its high modes carry {self.ratio:.0f} times what turbulence asks "
+            "of them; open the loop at once"
+        )
+        return (
+            absurd if self.absurd else None,
+            diverging if self.diverging else None,
+            lost if self.lost else None,
+        )
 
     @property
     def unit(self) -> str:
@@ -129,7 +149,18 @@ def observe(
     fade = float(np.exp(-block.n_frames * block.dt_ns * 1e-9 / memory_s))
     ratio = float(np.sqrt(fade * health.ratio**2 + (1.0 - fade) * power))
     limit = CALM_RATIO if health.diverging else DIVERGING_RATIO
-    return LoopHealth(ratio=ratio, diverging=not absurd and ratio > limit, absurd=absurd)
+    diverging = not absurd and ratio > limit
+    beyond_s = _beyond_s(health, levels, block.dt_ns * 1e-9)
+    lost = diverging and (health.lost or beyond_s >= LOST_S)
+    return LoopHealth(ratio=ratio, diverging=diverging, absurd=absurd, beyond_s=beyond_s, lost=lost)
+
+
+def _beyond_s(health: LoopHealth, levels: NDArray[np.float64], dt_s: float) -> float:
+    """Return for how long every frame has been beyond ``LOST_RATIO``, at the end of the block."""
+    below = np.flatnonzero(levels <= LOST_RATIO)
+    if len(below):
+        return (len(levels) - 1 - int(below[-1])) * dt_s
+    return health.beyond_s + len(levels) * dt_s
 
 
 def _absurd(health: LoopHealth, levels: NDArray[np.float64]) -> bool:

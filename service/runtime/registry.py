@@ -126,7 +126,14 @@ REGISTRY: Final = (
     Entry(Standstill, {alarms.SLOPES_STAND: "the slopes change again"}),
     Entry(DitherWatch, events=_dither),
     Entry(VibrationMonitor, events=_vibrations),
-    Entry(LoopHealth, {alarms.WRONG_UNIT: _IN_METRES, alarms.DIVERGING: "the high modes are calm"}),
+    Entry(
+        LoopHealth,
+        {
+            alarms.WRONG_UNIT: _IN_METRES,
+            alarms.DIVERGING: "the high modes are calm",
+            alarms.LOST: "the high modes are calm",
+        },
+    ),
     Entry(ControlLawCheck, {alarms.WRONG_LOOP: "the loop follows its status again"}),
     Entry(EdgeHealth, {alarms.EDGE_SLIP: "the outer ring is back"}),
     Entry(LoopCheck, {alarms.OFF_LOOP: "commands obey the loop equation again"}),

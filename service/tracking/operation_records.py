@@ -126,6 +126,10 @@ class Acquisition:
     max_modes: int | None = None
     """More than so many were refused by the gate, or have slipped; None: not yet."""
 
+    lost_with: str | None = None
+    """Id of the service's own matrix in use when the loop was lost, which is why ``max_modes`` is
+    half of its modes. None if the loop held, or ran on the RTC's own matrix."""
+
     command: str | None = None
     """Id of the change of the loop that was requested in this stage; None if there was none."""
 

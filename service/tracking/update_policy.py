@@ -230,6 +230,15 @@ def is_outdated(state: TrackerState, record: ReconstructorRecord) -> bool:
     return _apart(state, record, VERDICT_REACH)
 
 
+def is_beyond_verdict(state: TrackerState, record: ReconstructorRecord) -> bool:
+    """Return whether α is certainly outside the range for which this matrix was made and judged."""
+    registration = state.alpha.registration
+    if registration is None or record.alpha is None or record.sigma is None:
+        return False
+    moved = registration.alpha.distance(record.alpha) - 3.0 * registration.sigma
+    return bool(np.any(moved > 3.0 * record.sigma + REACH))
+
+
 def _apart(
     state: TrackerState, record: ReconstructorRecord, threshold: NDArray[np.float64]
 ) -> bool:

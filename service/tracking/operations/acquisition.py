@@ -111,7 +111,13 @@ def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> N
     if lost is not None:
         most = update_policy.half_of_modes(rtc.n_controlled)
         first = min(context.acquisition.n_modes, most)
-        stages.set_acquisition(context, replace(context.acquisition, max_modes=most, n_modes=first))
+        limited = replace(
+            context.acquisition,
+            max_modes=most,
+            n_modes=first,
+            lost_with=context.before.matrices.in_use,
+        )
+        stages.set_acquisition(context, limited)
         update_policy.limit_modes(context, most, f"{lost} with {rtc.n_controlled} modes")
     stages.wide_capture_stage(context, rtc)
 
@@ -119,7 +125,8 @@ def _begin(context: StepContext, rtc: Status, why: str, *, commanded: bool) -> N
 def _own_loop_lost(context: StepContext) -> str | None:
     """Return the alarm of a loop that did not hold on a matrix made for where the mirror is.
 
-    On as many modes it would not hold the next time; the RTC's own matrix says nothing of that.
+    On as many modes it would not hold the next time, unless the mirror turns out to be elsewhere
+    (``update_policy.is_beyond_verdict``). The RTC's own matrix says nothing of that.
     """
     state = context.state
     record = (

@@ -21,17 +21,27 @@ from service.estimation.windows import RefusalKind
 from service.tracking import commands as cmd
 from service.tracking import events as ev
 from service.tracking import validity
-from service.tracking.alarms import Interlock, alarm_blocks, blocking_alarm
+from service.tracking.alarms import LOST, Interlock, alarm_blocks, blocking_alarm
 from service.tracking.dither import request_dither, request_stop, stop_running_dither
 from service.tracking.dither_request import ACQUIRING_DITHER, Dither
-from service.tracking.operation_records import Acquisition, AcquisitionStage, LoopFound
+from service.tracking.operation_records import (
+    Acquisition,
+    AcquisitionStage,
+    LoopFound,
+    ProbationState,
+)
 from service.tracking.operator import set_loop
 from service.tracking.policy import SECOND_NS, Policy
 from service.tracking.reconstructors import forget_verdict
 from service.tracking.registration import Registration
 from service.tracking.state import Level, Mode, TrackerState
 from service.tracking.step_context import StepContext
-from service.tracking.update_policy import half_of_modes, limit_modes
+from service.tracking.update_policy import (
+    forget_limit,
+    half_of_modes,
+    is_beyond_verdict,
+    limit_modes,
+)
 from service.wire import DitherKind, DitherRequest, Status
 
 WINDOW_S = 2.0
@@ -44,7 +54,8 @@ CLOSING_GAIN = 0.3
 """Of every mode of a loop that was found open: its status does not tell the gains."""
 
 OUT_OF_HAND_S = 2.0
-"""For so long before the loop is opened by the service itself."""
+"""Duration of such an alarm before the service opens the loop itself. A lost one is opened at once,
+unless the service is going back to the matrix before, which takes less than this."""
 
 MISSES_BEFORE = 3
 """Windows in a row that found no registration, before the service acquires by itself."""
@@ -207,11 +218,21 @@ def why_needed(state: TrackerState, policy: Policy, now_ns: int) -> str | None:
         return None
     for alarm in state.alarms.active:
         lasted_ns = now_ns - alarm.since_ns_utc
-        if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= OUT_OF_HAND_S * SECOND_NS:
+        waits_s = 0.0 if alarm.name == LOST and not _goes_back(state) else OUT_OF_HAND_S
+        if alarm_blocks(alarm, Interlock.HOLD) and lasted_ns >= waits_s * SECOND_NS:
             return f"{alarm.name} for {lasted_ns / SECOND_NS:.0f} s"
     if missed_enough(state) and not state.loop.holds:
         return f"{acquisition.misses} windows in a row found no registration"
     return None
+
+
+def _goes_back(state: TrackerState) -> bool:
+    """Return whether the matrix before is on its way to the RTC, or has just come there."""
+    trial = state.operations.probation
+    return trial is not None and trial.state in {
+        ProbationState.ROLLING_BACK,
+        ProbationState.WATCHED,
+    }
 
 
 def missed_enough(state: TrackerState) -> bool:
@@ -290,8 +311,9 @@ def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = Fa
         fail_acquisition(context, f"{reason}, after {acquisition.attempt} attempts")
         return
     most = acquisition.max_modes
+    lost_with = acquisition.lost_with
     if slipped:
-        most = half_of_modes(acquisition.n_modes)
+        most, lost_with = half_of_modes(acquisition.n_modes), None
         limit_modes(context, most, reason)
     goal = acquisition.n_modes if acquisition.found is None else acquisition.found.n_controlled
     validity.invalidate_telemetry(context, "the acquisition had not begun anew")
@@ -306,6 +328,7 @@ def restart_acquisition(context: StepContext, reason: str, *, slipped: bool = Fa
             covariance=None,
             matrix=None,
             max_modes=most,
+            lost_with=lost_with,
             n_modes=min(acquisition.n_modes, most or goal),
         ),
     )
@@ -408,8 +431,28 @@ def on_wide_capture(context: StepContext, event: ev.WideCaptureFitted) -> None:
         nominal=context.alpha.law.nominal,
     )
     validity.store_registration(context, registration)
+    _lift_limit_of_jump(context)
     stop_running_dither(context)
     enter_stage(context, AcquisitionStage.PARTIAL, f"{place}: closing the loop")
+
+
+def _lift_limit_of_jump(context: StepContext) -> None:
+    """Allow all modes again where the loop was lost because the mirror had jumped.
+
+    The matrix that lost it was made for another registration, beyond what the gate had judged it
+    at: the loss says nothing of how many modes hold at this one.
+    """
+    acquisition = context.acquisition
+    record = context.state.reconstructor(acquisition.lost_with) if acquisition.lost_with else None
+    if record is None or acquisition.found is None:
+        return
+    if not is_beyond_verdict(context.state, record):
+        return
+    n_modes = acquisition.found.n_controlled
+    first = min(n_modes, FIRST_CLOSED)
+    set_acquisition(context, replace(acquisition, max_modes=None, n_modes=first, lost_with=None))
+    forget_limit(context)
+    context.log("modes.limit-lifted", f"the mirror has moved since {record.id}: {n_modes} modes")
 
 
 def on_missed(context: StepContext, reason: str) -> None:

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from service.control.loop import pole_radius
-from service.estimation.health import CALM_RATIO, DIVERGING_RATIO, LoopHealth, observe
+from service.estimation.health import (
+    CALM_RATIO,
+    DIVERGING_RATIO,
+    LOST_RATIO,
+    LOST_S,
+    LoopHealth,
+    observe,
+)
 from service.model.misregistration import Misregistration
 from tests.numerics import (
     N_CONTROLLED,
@@ -60,6 +67,25 @@ def test_a_loop_that_was_diverging_must_fall_to_half_the_limit_to_count_as_calm(
     assert after(diverging, between).diverging
     assert not after(LoopHealth(), between).diverging
     assert not after(after(diverging, between), 0.8 * CALM_RATIO).diverging
+
+
+def test_a_loop_a_hundred_times_beyond_is_lost_within_a_fifth_of_a_second():
+    """Two blocks of 0.1 s; at 0.7 of the limit it diverges and is not lost, however long."""
+    growing = after(LoopHealth(), 20.0, n_blocks=1)
+    seen = after(growing, 2.0 * LOST_RATIO, n_blocks=2)
+    assert seen.diverging
+    assert seen.lost
+    assert seen.beyond_s >= LOST_S
+    assert not after(growing, 0.7 * LOST_RATIO).lost
+
+
+def test_a_single_wrong_frame_loses_no_loop_and_a_calm_one_is_lost_no_more():
+    wrong = observe(LoopHealth(), times_expectation(5000.0, n_frames=1), VARIANCE, IN_LOOP)
+    assert wrong.diverging
+    assert not wrong.lost
+    lost = after(after(LoopHealth(), 20.0, n_blocks=1), 2.0 * LOST_RATIO)
+    assert lost.lost
+    assert not after(lost, 1.0).lost
 
 
 def test_only_the_upper_half_of_the_controlled_modes_is_watched():

@@ -42,6 +42,7 @@ FAR = Misregistration(
     shift_x_subap=1.2, shift_y_subap=-0.9, rotation_rad=np.deg2rad(4.0), magnification=0.97
 )
 DIVERGING = ev.ConditionChanged(name="loop-diverging", text="found")
+LOST = ev.ConditionChanged(name="loop-lost", text="found")
 CALM = ev.ConditionChanged(name="loop-diverging", text="gone", over=True)
 
 
@@ -77,6 +78,7 @@ class Acquiring(Story):
         self.session += 1
         self.tell(ev.SessionStarted(session=f"s{self.session}"))
         self.tell(CALM)
+        self.tell(replace(CALM, name="loop-lost"))
         return self.still_open()
 
     def still_open(self, **changes):
@@ -195,6 +197,13 @@ class TestByItself:
         story.tell(DIVERGING)
         assert not story.wait(OUT_OF_HAND_S - 1)
         story.wait(2)
+        assert story.stage is AcquisitionStage.OPENING
+        assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
+
+    def test_it_begins_at_once_when_the_loop_is_lost(self):
+        story = Acquiring()
+        story.tell(DIVERGING)
+        story.tell(LOST, 0.1)
         assert story.stage is AcquisitionStage.OPENING
         assert [asked.loop for asked in story.asked(LoopRequest)] == [Loop.OPEN]
 
@@ -419,6 +428,29 @@ class TestTrouble:
         assert story.state.operations.acquisition.max_modes == 200
         limit = story.state.matrices.mode_limit
         assert (limit.n_modes, limit.reason) == (200, "edge-slip with 400 modes")
+
+    @pytest.mark.parametrize(
+        ("to", "n_modes"),
+        [(moved(FAR, shift_x_subap=0.3), 400), (moved(FAR, shift_x_subap=0.02), 200)],
+    )
+    def test_a_loop_lost_because_the_mirror_jumped_is_closed_on_all_modes_again(self, to, n_modes):
+        """Where the mirror is where it was, all modes did not hold, and half of them follow."""
+        story = Acquiring(Mode.AUTO).to_widening()
+        story.see(FAR)
+        story.widen(400)
+        story.see(FAR, n_windows=3)
+        assert story.stage is AcquisitionStage.TRACKING
+        story.tell(DIVERGING)
+        story.tell(LOST)
+        assert story.state.matrices.mode_limit.n_modes == 200
+        story.open()
+        story.see_afar(to)
+        story.see_afar(to)
+        story.close(150)
+        story.see(to)
+        assert story.asked(ev.MakeMatrix)[-1].n_modes == n_modes
+        limit = story.state.matrices.mode_limit
+        assert limit is None if n_modes == 400 else limit.n_modes == 200
 
     def test_that_a_loop_slips_on_the_rtcs_own_matrix_says_nothing_of_the_modes(self):
         story = Acquiring(Mode.AUTO)

@@ -449,7 +449,7 @@ def _lift_limit_of_jump(context: StepContext) -> None:
     if not is_beyond_verdict(context.state, record):
         return
     n_modes = acquisition.found.n_controlled
-    first = min(n_modes, FIRST_CLOSED)
+    first = min(n_modes, FIRST_LOOP_MODES)
     set_acquisition(context, replace(acquisition, max_modes=None, n_modes=first, lost_with=None))
     forget_limit(context)
     context.log("modes.limit-lifted", f"the mirror has moved since {record.id}: {n_modes} modes")

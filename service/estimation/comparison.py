@@ -25,7 +25,7 @@ DECIDE_S = 4.0
 quarter of it, so the median does not see it."""
 
 LASTING_S = 2.0
-"""How long a large change must last to be acted on before that: longer than a gust."""
+"""Time for which a large change must last before an early decision: longer than a gust."""
 
 LASTING_SHARE = 0.8
 """Share of the parts of that time that must show it; a gust of a second fills 0.6 of them."""
@@ -125,7 +125,7 @@ class ProbationFinding:
     """RMS of its steps over that before, less what all modes have in common."""
 
     limit: float = 0.0
-    """Of that ratio: more is worse."""
+    """Limit of that ratio; a larger ratio is worse."""
 
     common_ratio: float = 0.0
     """RMS of the steps over those before: the median of all modes."""
@@ -134,15 +134,15 @@ class ProbationFinding:
     """RMS of all slopes over that before."""
 
     lost: bool = False
-    """Whether the loop does no longer what a loop is for: without it the wavefront would be no
-    worse."""
+    """True if the loop has stopped correcting: the wavefront would be no worse without it."""
 
     residual_ratio: float | None = None
-    """RMS of the residual, as both matrices read it, over that before, seeing taken out; as the one
-    before reads it alone where nobody knows the numbers of the other; None: of neither."""
+    """RMS of the residual as both matrices measure it, divided by that before the swap, with seeing
+    taken out. If the numbers of the new matrix are unknown, as the previous matrix measures it;
+    None if neither is known."""
 
     residual_limit: float | None = None
-    """Of that ratio: more is worse; None as above."""
+    """Limit of that ratio; a larger ratio is worse. None if the ratio is None."""
 
     ring_ratio: float | None = None
     """RMS of the outer ring against the mirror inside, over that before; None: too few modes."""
@@ -157,7 +157,8 @@ class Part:
     """``(n_modes + 3,)`` of squares: steps of each mode, metres²; slopes, ring, mirror inside."""
 
     residual: Residual | None = None
-    """As the matrix reads it that is believed; None: it is not known, or no frame was looked at."""
+    """Residual as the reference matrix measures it; None if the matrix is unknown or there were no
+    frames."""
 
     peak: float = 0.0
     """Largest sum of squares of one frame's slopes."""
@@ -184,7 +185,7 @@ class Before:
 
     id: str
     modes: NDArray[np.intp]
-    """In the loop with it."""
+    """Modes in the loop with it."""
 
     part_s: float
     """Length of a part, seconds."""
@@ -203,7 +204,7 @@ class Before:
     """Groups that the median is of."""
 
     level: ResidualLevel | None = None
-    """Of the residual; None if it is not known."""
+    """Level of the residual; None if unknown."""
 
     peak: float = 0.0
     """Largest sum of squares of one frame's slopes."""
@@ -363,7 +364,7 @@ class _Ground(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Look:
-    """How a series of power ratios is read: as the decision, or before it."""
+    """Rule for evaluating a series of power ratios: for the decision, or for an early one."""
 
     n_last: int
     """Parts that a large change must have lasted."""

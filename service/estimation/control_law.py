@@ -44,7 +44,7 @@ MORE_TAPS = 4
 """Frames beyond the stated delay: it may be longer, or the mirror may lag."""
 
 EXPLAINED = 0.002
-"""Largest share of the steps' power that a mode may leave over to be believed."""
+"""Largest fraction of the steps' power that a mode may leave unexplained to be used."""
 
 LEAK_TOLERANCE = 0.004
 GAIN_TOLERANCE = 0.15
@@ -119,7 +119,7 @@ class ControlLawCheck(Detector):
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Whether the loop differs from the status."""
+        """Return the description of a disagreement with the status, or None."""
         wrong = (
             f"the RTC's loop is not what its status says: {'; '.join(self.errors[-1:])}; mend "
             "its status, or its loop"
@@ -137,7 +137,7 @@ class IdentifiedLaw:
 
     delay_frames: float
     wrong: str = ""
-    """What differs, found and stated; empty: nothing."""
+    """Difference with found and reported value; empty if there is none."""
 
 
 def follow(law: ControlLawCheck, block: FrameBlock, loop: ClosedLoop) -> ControlLawCheck:
@@ -193,7 +193,7 @@ class _Fits:
     """The law of every mode watched, ``(n_watched,)`` each."""
 
     clear: NDArray[np.bool_]
-    """Whether the mode moves and follows a law."""
+    """True for each mode that moves and follows a law."""
 
     leak: Array
     leak_sigma: Array

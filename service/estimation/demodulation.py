@@ -1,9 +1,9 @@
-"""Demodulate telemetry at lines and at frequencies beside them.
+"""Demodulate telemetry at lines and at frequencies next to them.
 
-Against its line every bin beside it turns slowly: within a stretch of frames the window's weight
-``h_k``, ``h_k cos(v k)`` and ``h_k sin(v k)``, whatever the offset v, are combinations of a few
-smooth shapes. Frames are multiplied with each line times each of these; the bins follow from those
-sums, a tenth as many as there are frames. Nothing is left out: shapes weaker than rounding are.
+Relative to its line every side bin rotates slowly. Within a segment of frames the window's weight
+``h_k``, ``h_k cos(v k)`` and ``h_k sin(v k)`` are, for any offset v, combinations of a few smooth
+shapes. Frames are multiplied by each line times each of these shapes. The bins follow from these
+sums, a tenth as many as there are frames, up to rounding.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 SIDE_OFFSETS_HZ = np.concatenate([np.arange(-20.0, -2.0), np.arange(3.0, 21.0)])
-"""Where the noise is measured, relative to each dither line: 36 bins; 6 were too few."""
+"""Frequencies at which the noise is measured, relative to each dither line. 36 bins; 6 were too
+few."""
 
 SEGMENT_S = 0.12
-"""Of frames: with longer ones it takes more shapes, with shorter ones more sums."""
+"""Duration of a segment. Longer segments need more shapes, shorter ones more sums."""
 
 MIN_SEGMENT = 16
 
 FAINTEST_SHAPE = 1e-7
-"""Of the strongest: what weaker ones have in a bin is rounding."""
+"""Shapes weaker than this fraction of the strongest are below rounding in every bin."""
 
 _AT_ONCE = 256
 """Columns that are added at once: products of all would take twice the memory of their sums."""
@@ -38,7 +39,7 @@ _N_SHAPES = 1 + 2 * len(_BESIDE_HZ)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemodulationBank:
-    """Lines, and ``SIDE_OFFSETS_HZ`` beside each, in a Hann window."""
+    """Lines, and ``SIDE_OFFSETS_HZ`` next to each, in a Hann window."""
 
     lines_hz: tuple[float, ...]
     frame_rate_hz: float

@@ -21,7 +21,7 @@ a wider one the wind takes as much longer to cross a mode."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Actuators:
-    """Where the actuators are, and how far each mode moves them."""
+    """Positions of the actuators, and the amplitude of each in each mode."""
 
     positions: NDArray[np.float64]
     """``(n_actuators, 2)`` in any unit."""
@@ -38,7 +38,7 @@ class Actuators:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Description:
-    """What the service must know of the model to check telemetry against it."""
+    """Parameters of the model that telemetry is checked against."""
 
     n_slopes: int
     n_modes: int
@@ -46,10 +46,10 @@ class Description:
     """``(n_modes,)`` expected variance of each mode under the instrument's turbulence."""
 
     actuators: Actuators | None = None
-    """None: the modes are measured surfaces, and nobody knows the actuators behind them."""
+    """None if the modes are measured surfaces whose actuators are unknown."""
 
     mode_information: NDArray[np.float64] | None = None
-    """``(n_modes, 4, 4)`` what a dither of each mode tells of α; None: not worked out."""
+    """``(n_modes, 4, 4)`` information on α in a dither of each mode; None if not computed."""
 
     products: NDArray[np.float32] | None = None
     """``(n_modes, n_modes)`` DᵀD at ``start``, slope² per metre²; None: not worked out."""
@@ -58,15 +58,15 @@ class Description:
     """What the signals are."""
 
     diameter_m: float = EDGE_MEMORY_OF_M
-    """Of the pupil."""
+    """Diameter of the pupil, metres."""
 
     start: Misregistration = field(default_factory=Misregistration)
-    """Where a fit starts while nothing is known of α: the mirror's nominal rotation."""
+    """Start of a fit while α is unknown: the mirror's nominal rotation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EdgeWatch:
-    """Where the actuators of one mirror stand for a modal command, in σ of turbulence."""
+    """Positions of one mirror's actuators for a modal command, in σ of turbulence."""
 
     modes: NDArray[np.intp]
     """``(n_watched,)`` those of the loop that are not left out."""
@@ -75,8 +75,8 @@ class EdgeWatch:
     """``(n_outer, n_watched)`` of the outermost ring."""
 
     inner: NDArray[np.float32]
-    """``(n_watched, n_watched)`` mean products of all others: a form of the command, their
-    mean square, which tells how strong the turbulence is tonight."""
+    """``(n_watched, n_watched)`` mean products of all other actuators: a quadratic form of the
+    command that gives their mean square, a measure of the present turbulence."""
 
     memory_s: float = EDGE_MEMORY_S
     """Over which positions are averaged."""

@@ -35,7 +35,7 @@ class DitherWindows(Estimator):
     """None: no dither plays, none that can be read, or its end would cut the next window."""
 
     ended: tuple[Window, ...] = ()
-    """In the last block."""
+    """Windows that ended in the last block."""
 
     @classmethod
     @override
@@ -75,5 +75,5 @@ class DitherWindows(Estimator):
     @property
     @override
     def marks(self) -> Mark:
-        """Whether windows are being cut."""
+        """Return the mark that windows are being cut, if they are."""
         return UNMARKED if self.cutter is None else Mark.WINDOWS

@@ -24,9 +24,10 @@ diffractive telescope, two truths and two models (docs/results/night.md)."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BiasBlock:
-    """How far one way of reading ordinary telemetry may be off, steadily: a block in the filter.
+    """Possible constant bias of an estimate from ordinary telemetry.
 
-    Of the shifts, subapertures, rotation, radians, and magnification, a ratio.
+    A block of the filter's state. Units: subapertures for the shifts, radians for the rotation, a
+    ratio for the magnification.
     """
 
     name: str
@@ -34,10 +35,10 @@ class BiasBlock:
     """1 σ that no estimate of this kind may go below without a dither."""
 
     over_scatter: tuple[float, ...]
-    """By how many times its own scatter it may be off beyond that."""
+    """Multiples of its own scatter that the bias may have beyond that."""
 
     wander: tuple[float, ...]
-    """By how many times its own scatter it may be off beside what is known of the bias."""
+    """Multiples of its own scatter by which the bias may change."""
 
     @property
     def shapes(self) -> tuple[tuple[float, ...], ...]:
@@ -80,18 +81,18 @@ class Estimate(Determination):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PassiveEstimate(Estimate):
-    """What ordinary telemetry says of the registration.
+    """A registration estimated from ordinary telemetry.
 
-    The covariance is of the scatter alone: the bias is not in it. A misfit of NaN: too young to
-    tell.
+    The covariance describes the scatter alone, not the bias. A misfit of NaN means too little
+    telemetry.
     """
 
     bias: BiasBlock = PASSIVE_BIAS
-    """Which bias it has."""
+    """Kind of its bias."""
 
     @property
     def bias_excess(self) -> NDArray[np.float64]:
-        """``(4,)`` variance that the scatter tells the bias to have beyond its floor."""
+        """Return ``(4,)`` variance of the bias beyond its floor, as the scatter indicates it."""
         return np.asarray(np.diag(self.covariance) * np.square(self.bias.over_scatter))
 
     @property
@@ -108,7 +109,8 @@ class DitheredEstimate(Estimate):
     """One window's estimate, which may enter the registration."""
 
     lag_frames: NDArray[np.float64]
-    """How far slopes lag commands; 0 when the columns are aligned as the wire demands."""
+    """Frames by which slopes lag commands; 0 if the columns are aligned as the contract requires.
+    """
 
     t_ns_utc: int
     """End of the window."""
@@ -142,17 +144,17 @@ class DitheredEstimate(Estimate):
 
     @property
     def strong(self) -> NDArray[np.bool_]:
-        """``(n,)`` which gains are of modes that tell of α."""
+        """Return ``(n,)`` True for gains of modes that contain information on α."""
         which = np.ones(len(self.optical_gain), dtype=bool)
         which[: len(self.modes)] = [mode not in self.weak for mode in self.modes]
         return which
 
 
 def model_error(covariance: NDArray[Any], misfit: float) -> NDArray[Any]:
-    """Return ``(4,)`` the 1 σ by which the model leads a window astray, numeric units.
+    """Return ``(4,)`` 1 σ of the error that the model causes in a window, numeric units.
 
-    As much as it leaves unexplained: bright stars show what a faint one's noise hides, and neither
-    needs to be told which telescope it is. It does not average down, for the next window has the
-    same.
+    It is as large as what the model leaves unexplained: a bright star shows what the noise of a
+    faint one hides, so the telescope need not be known. It does not average out, because the next
+    window has the same error.
     """
     return np.sqrt(MODEL_ERROR * max(misfit - 1.0, 0.0) * np.diag(covariance))

@@ -57,7 +57,7 @@ class FrameBlock:
 
     @property
     def is_dithered(self) -> bool:
-        """Whether a dither moves anything: an RTC may always send its columns."""
+        """Return True if a dither moves any mode; an RTC may send the columns without one."""
         dither = self.dither_m
         return dither is not None and bool(dither[-1:].any() or dither.any())
 

@@ -1,13 +1,14 @@
 """One Kalman filter for α and the biases of passive estimates.
 
-Under frozen flow the passive watchdog reads ``α + b``: a look scatters by 0.3 to 0.5 % of a
-subaperture and is wrong by up to 9 % on the diffractive telescope, 24 % on the linear plant
-(docs/results/passive.md), steadily, until wind, flux or gain change. A dithered window reads α
-alone. Between them b is learnt, and a sparse dither then suffices.
+Under frozen flow the passive estimate measures ``α + b``: an estimate scatters by 0.3 to 0.5 % of a
+subaperture and is biased by up to 9 % on the diffractive telescope, 24 % on the linear plant
+(docs/results/passive.md). The bias is constant until wind, flux or gain change. A dithered window
+measures α alone. Between windows b is learnt, so that a sparse dither suffices.
 
-b has four parts. Those of rotation and magnification are small, but no more than the shifts' do
-they average out over consecutive looks, as a noise would. How large b may be each look's own
-scatter tells: what it tells beyond all looks before is new, and may have changed b by as much.
+b has four components. Those of rotation and magnification are small, but like those of the shifts
+they do not average out over consecutive estimates as noise would. The scatter of each estimate
+indicates how large b may be; an increase beyond all earlier values is new information, and may mean
+that b has changed by as much.
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ JUMP_THRESHOLD = 23.5
 """Normalised innovation squared that four degrees of freedom exceed once in 10 000."""
 
 JUMP_INFLATION = 10.0
-"""After a jump each parameter may have moved by this many σ of the innovation."""
+"""Standard deviations of the innovation by which each parameter may have moved after a jump."""
 
 STRETCH_SIGMA = 0.02
 """1 σ of an anamorphosis about the nominal one before anything was measured."""
 
 STRETCH_RATE = 1e-4 / np.sqrt(60.0)
-"""Its random walk after one second: optics are stretched where they stand, not by the night."""
+"""Random walk of the anamorphosis after one second. It changes slowly: optics are stretched where
+they are mounted, not in the course of a night."""
 
 SCATTER_LEARNING = 0.05
 """Weight of the newest in how much windows, and looks, scatter: twenty are remembered."""
@@ -39,17 +41,17 @@ SCATTER_LEARNING = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bias:
-    """What one kind of passive estimate has told of its bias, besides mean and covariance."""
+    """State of the bias of one kind of passive estimate, besides mean and covariance."""
 
     block: BiasBlock = PASSIVE_BIAS
     """Which bias it is."""
 
     excess: Array = field(default_factory=lambda: np.zeros(4))
-    """``(4,)`` variance of the bias beyond its floor that looks have told of, and that is in the
-    covariance or has been learnt away since."""
+    """``(4,)`` variance of the bias beyond its floor that estimates have indicated, and that is in
+    the covariance or has been learnt since."""
 
     scatter: float = 1.0
-    """How much more looks scatter than their covariances say, in variance; never less than 1."""
+    """Ratio of the scatter of estimates to their covariances, in variance; at least 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,7 +62,7 @@ class Joint:
     """``(n_alpha + 4 N,)`` α in numeric units, then the bias of each passive estimate."""
 
     covariance: Array
-    """Of all of them."""
+    """Covariance of all parameters."""
 
     n_alpha: int = 4
     """Numbers of α: 6 with its anamorphosis."""
@@ -119,7 +121,7 @@ class Drift:
     """``(4,)`` random walk σ after one second, numeric units."""
 
     bias_memory_s: float = 3600.0
-    """Time after which what was learnt of the bias is worth 1/e."""
+    """Time after which the information learnt about the bias has decayed to 1/e."""
 
 
 def begin_joint(measured: Array, covariance: Array) -> Joint:
@@ -147,9 +149,10 @@ def expecting(joint: Joint, nominal: Array) -> Joint:
 
 
 def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint:
-    """Return the estimate with nothing known of a bias any more, or yet; α stands.
+    """Reset a bias to unknown; α is unchanged.
 
-    ``excess`` ``(4,)`` is the bias' variance beyond its floor by the look at hand, if any.
+    ``excess`` ``(4,)`` is the variance of the bias beyond its floor, indicated by the present
+    estimate if there is one.
     """
     excess = np.zeros(4) if excess is None else excess
     place, n_states, biases = joint.place(block), len(joint.mean), joint.biases
@@ -166,10 +169,10 @@ def forget(joint: Joint, block: BiasBlock, excess: Array | None = None) -> Joint
 
 
 def allowing(joint: Joint, block: BiasBlock, excess: Array) -> Joint:
-    """Return the estimate with the covariance of a bias enlarged by so much excess scatter.
+    """Increase the covariance of a bias by the excess scatter.
 
-    Only what is more than looks before have told is added: a steady wind adds it once, and what
-    has been learnt of the bias stays learnt.
+    Only the excess beyond earlier values is added: a steady wind adds it once, and what was learnt
+    about the bias is kept.
     """
     known, place, covariance = joint.bias_of(block), joint.place(block), joint.covariance.copy()
     more = np.maximum(excess - known.excess, 0.0)
@@ -201,9 +204,9 @@ def predicted(joint: Joint, drift: Drift, elapsed_s: float, flexure: Array | Non
 def innovation(
     prior: Joint, measured: Array, noise: Array, block: BiasBlock | None = None
 ) -> float:
-    """Return how far a measurement lies from the prior: squared, normalised, expected 4.
+    """Return the squared, normalised innovation of a measurement; its expectation is 4.
 
-    Of a passive estimate with this bias; None: of a dithered window.
+    With a bias, of a passive estimate; without, of a dithered window.
     """
     sees = prior.seen(block)[: len(measured)]
     difference = measured - sees @ prior.mean

@@ -1,9 +1,10 @@
-"""Registration from windows of sines.
+"""Registration from windows of sinusoidal dither.
 
-Telemetry is demodulated, as it comes, at the dither's frequencies and beside them, where the noise
-is read off. The command carries turbulence, so regressing slopes on commands is biased (by 6 % of a
-subaperture on a faint star). What the closed loop makes of the known dither alone is therefore the
-instrumental variable; only its correlation with the slopes is used.
+Telemetry is demodulated as it arrives, at the frequencies of the dither and at frequencies next to
+them, where the noise is measured. The command contains turbulence, so a regression of slopes on
+commands is biased (by 6 % of a subaperture on a faint star). The response of the closed loop to the
+known dither is therefore used as instrumental variable: only its correlation with the slopes
+enters.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ from service.model.interaction import Linearisation
 Array = NDArray[Any]
 
 CUT_PERIODS = 0.01
-"""Of a line, by which a window may be too long or too short: a rate of the RTC's that differs by
-parts per million. The Hann window keeps what that costs below 1e-4 of the amplitude."""
+"""Fraction of a period by which a window may be too long or too short, when the frame rate differs
+from its nominal value by parts per million. The Hann window keeps the error below 1e-4 of the
+amplitude."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +126,8 @@ class LockInSums:
     """Sums so far."""
 
     slopes: Array
-    """As :meth:`DemodulationBank.empty` has them, like the commands; added to in place."""
+    """Sums in the layout of :meth:`DemodulationBank.empty`, like those of the commands; modified in
+    place."""
 
     commands: Array
     dither: Array
@@ -157,7 +160,7 @@ class LockIn(WindowCutter[LockInPlan, LockInSums, Spectra]):
 
     @override
     def close(self, window: Window[LockInSums]) -> Spectra | WindowRefused:
-        """Return the finished window, or why its dither is not the one asked for."""
+        """Return the finished window, or the reason why its dither differs from the request."""
         plan, sums = self.plan, window.sums
         real, imaginary = np.split(sums.dither, 2)
         dither = (real + 1j * imaginary).astype(np.complex64)
@@ -205,22 +208,23 @@ N_STEPS = 5
 """Gauss-Newton steps inside one linearisation: gains and α are multiplied with one another."""
 
 _MAX_TERMS = 40
-"""Of a series; one that needs more is given up, and the loop's equations are solved."""
+"""Largest number of terms of a series. If more are needed, the loop's equations are solved instead.
+"""
 
 _GROWN = 10.0
 """A term this much larger than the first is one of a series that does not end."""
 
 _ROUNDING = 1e-7
-"""Of single precision."""
+"""Relative rounding error of single precision."""
 
 LIKER = 3.0
 """Another mode explains more of a line than the line's own by this factor, if it is that mode."""
 
 CERTAIN = 6.0
-"""And more than it explains beside the line, root mean square."""
+"""A mode is identified if it explains this many times the root mean square next to the line."""
 
 WEAK = 0.3
-"""Of the strongest line's amplitude: weaker ones have a tenth of its weight, and less."""
+"""Lines weaker than this fraction of the strongest have less than a tenth of its weight."""
 
 MAX_LAG_FRAMES = 0.2
 """A larger lag between slopes and commands: the columns are not aligned as the wire demands."""
@@ -244,10 +248,10 @@ class LockInEstimate(DitheredEstimate):
 def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop) -> LockInEstimate:
     """Estimate α from one window, to first order about the linearisation.
 
-    Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per
-    line; C the command at the line, Z the instrument, ``F(v) = [γ S_j v, D v, i D v]``,
-    ``r = S - γ D(α) C``. Where slopes are not equally noisy, Z is weighted by their variance. When
-    ``step`` is not small the caller linearises anew at the estimate.
+    Solves ``Re(F(Z)* F(C)^T) x = Re(F(Z)* r)`` by Gauss-Newton for α and one complex gain per line.
+    C is the command at the line, Z the instrument, ``F(v) = [γ S_j v, D v, i D v]``, ``r = S - γ
+    D(α) C``. If the slopes have different noise, Z is weighted by their variance. If ``step`` is
+    not small, the caller linearises again at the estimate.
     """
     window, every_mode = spectra, linearisation.matrix
     spectra, linearisation = _of_moved_modes(spectra, linearisation, loop)
@@ -297,7 +301,7 @@ def fit_window(spectra: Spectra, linearisation: Linearisation, loop: ClosedLoop)
 
 
 _FEW_MOVED = 6
-"""Fewer than one mode in so many: then it pays to leave out those that stand still."""
+"""If fewer than one mode in this many moves, the others are left out of the products."""
 
 
 def _of_moved_modes(
@@ -388,10 +392,10 @@ def _modulus_sigma(gains: Array, covariance: Array) -> Array:
 
 
 def _answers_as(spectra: Spectra, matrix: Array) -> tuple[int, ...]:
-    """Return the mode of the model that each line's slopes are most like.
+    """Return the mode of the model that the slopes of each line resemble most.
 
-    Another than the line's own only where it explains far more, and far more than beside the line.
-    Empty: the matrix has the dithered modes alone, and tells nothing of others.
+    A mode other than the line's own is returned only if it explains far more, and far more than
+    next to the line. Empty if the matrix contains the dithered modes alone.
     """
     slopes, own = spectra.slopes, np.argmax(np.abs(spectra.dither), axis=1)
     if tuple(own.tolist()) != spectra.plan.modes:
@@ -427,7 +431,7 @@ def _regressors(images: Array, gain: complex, step: Array) -> Array:
 
 
 def _unknowns(line: int, n: int) -> Array:
-    """Return where the unknowns of a line stand among all: ``n`` are common, the gain its own."""
+    """Return the indices of a line's unknowns: ``n`` are common to all, its gain is its own."""
     return np.array([*range(n), n + 2 * line, n + 1 + 2 * line])
 
 
@@ -455,10 +459,10 @@ def _side_bins(
     gains: Array,
     step: Array,
 ) -> tuple[Array, float, Array]:
-    """Return the covariance of the score, from the bins beside the lines, and the misfit.
+    """Return the covariance of the score, from the bins next to the lines, and the misfit.
 
-    What remains there after the same model is noise with the very spectrum the lines suffer from.
-    The third is the share ``(n_lines,)`` of each line's power that is neither noise nor model.
+    The residual of the same model there is noise with the spectrum that the lines have. The third
+    value is the fraction ``(n_lines,)`` of each line's power that is neither noise nor model.
     """
     n = len(step) + 2 * len(gains)
     spread = np.zeros((n, n))

@@ -22,11 +22,12 @@ SAME_DELAY = 0.05
 SAME_LEAK = 1e-6
 
 SAME_RATE = 1e-5
-"""Relative: a rate that is measured, and not nominal, is told differently every time."""
+"""Relative difference of two frame rates that are considered equal: a measured rate varies from one
+status to the next."""
 
 
 def closed_loop(rtc: Status, cm_id: str, matrix: NDArray[np.float32]) -> ClosedLoop:
-    """Return the loop that a status tells and a matrix ``(n_controlled, n_slopes)`` closes."""
+    """Return the loop closed by a status and a matrix ``(n_controlled, n_slopes)``."""
     return ClosedLoop(
         cm_id=cm_id,
         reconstructor=matrix,
@@ -93,7 +94,7 @@ def _same_state(one: Status, other: Status) -> bool:
 
 
 def why_open(rtc: Status) -> str:
-    """Return what to tell of a loop with no mode in it."""
+    """Return the message for a loop that controls no mode."""
     return "the loop is open" if rtc.loop == Loop.OPEN else "all gains of the loop are 0"
 
 

@@ -1,14 +1,13 @@
-"""Compare commands with the RTC's loop law ``c[k+d] = leak c[k+d-1] - g R s[k]``.
+"""Compare commands with the loop law that the RTC reports: ``c[k+d] = leak c[k+d-1] - g R s[k]``.
 
-Telemetry holds the commands after clipping, and names the reconstructor, gains and delay that made
-them. Where they do not follow from the slopes the mirror is saturated, or the RTC's account of
-itself is wrong.
+Telemetry contains the commands after clipping, and names the reconstructor, gains and delay that
+produced them. If they do not follow from the slopes, the mirror is saturated or the RTC reports a
+wrong loop.
 
-Every mode is looked at, on a few frames. Both sides are differenced twice: what else moves the
-mirror (turbulence played on it by day, a vibration) is slow, the sensor's noise is not. Then a mode
-that takes the share r of its steps shows r, whatever the turbulence does. A command that stays
-exactly where it was though it was asked to move is at a limit. ``control_law`` looks at a few
-modes, on every frame.
+Every mode is checked on a few frames. Both sides are differenced twice: other motions of the mirror
+(turbulence played on it by day, a vibration) are slow, the sensor's noise is fast. A mode that
+takes the fraction r of its steps then shows r, whatever the turbulence does. A command that does
+not change although it should is at a limit. ``control_law`` checks a few modes on every frame.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ WINDOW_SAMPLES = 5
 """Frames of a window that must have been looked at before it can be said to be off the loop."""
 
 AT_EASE_S = 1.3
-"""A loop that was just found to do as it is told to is not asked again before."""
+"""A loop that was found correct is not checked again for this time."""
 
 TOLERANCE = 0.2
 """A mode that takes less than 0.8 or more than 1.2 of its steps does not obey."""
@@ -58,7 +57,7 @@ COMMON_TOLERANCE = 0.12
 LARGEST_DELAY_FRAMES = 8
 
 HELD_SHARE = 0.1
-"""Of the samples in which a mode may stay where it is though asked to move."""
+"""Fraction of the samples in which a mode may stay constant although it should move."""
 
 _STILL_M = 1e-12
 """Steps of a mode smaller than this, RMS, are rounding."""
@@ -74,7 +73,7 @@ _SPANS_NAMED = 6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopCheck(Detector):
-    """Samples of a loop that has not changed, and what the last of them told."""
+    """Samples of an unchanged loop, and the result of the last of them."""
 
     resets = Change.GONE | Change.LOOP | Change.STANDSTILL
     unless = Mark.STANDS
@@ -98,7 +97,7 @@ class LoopCheck(Detector):
     """Up to here the commands were found to obey the loop."""
 
     residual: CommandResidual | None = None
-    """How the commands fail to obey the loop; None: they obey, or nobody knows."""
+    """Departure of the commands from the loop law; None if they agree or it is unknown."""
 
     @classmethod
     @override
@@ -148,7 +147,7 @@ class LoopCheck(Detector):
     @property
     @override
     def conditions(self) -> tuple[str | None, ...]:
-        """Whether the commands fail to obey."""
+        """Return the description of a disagreement, or None."""
         return (None if self.residual is None else self.residual.text,)
 
 
@@ -186,10 +185,11 @@ class _Batch:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CommandResidual:
-    """How far each mode departs from the loop law."""
+    """Departure of each mode from the loop law."""
 
     share: NDArray[np.float64]
-    """``(n_controlled,)`` of the steps asked for; 1: obeys, NaN: was asked for none."""
+    """``(n_controlled,)`` fraction of the steps that the law requires; 1 if it agrees, NaN if there
+    were no steps."""
 
     held: NDArray[np.float64]
     """``(n_controlled,)`` share of the frames in which it did not move at all."""
@@ -201,7 +201,7 @@ class CommandResidual:
 
     @property
     def holds(self) -> bool:
-        """Whether every mode obeys."""
+        """Return True if every mode obeys the law."""
         return not self.disobeys.any()
 
     @property
@@ -284,10 +284,11 @@ class _Products:
 
     n_samples: int
     asked: Array
-    """``(_TAPS, _TAPS, n_modes)`` steps asked for by one frame and another, metres²."""
+    """``(_TAPS, _TAPS, n_modes)`` products of the required steps of one frame and another, metres².
+    """
 
     common: Array
-    """``(_TAPS, n_modes)`` steps asked for and taken."""
+    """``(_TAPS, n_modes)`` products of required and actual steps."""
 
     taken: Array
     """``(n_modes,)`` steps taken."""
@@ -312,7 +313,7 @@ class _Products:
         )
 
     def power(self, weights: Array) -> Array:
-        """Return ``(n_modes,)`` of what is asked for by frames with these weights."""
+        """Return ``(n_modes,)`` power of the required steps for frames with these weights."""
         return np.asarray(np.einsum("i,j,ijm->m", weights, weights, self.asked))
 
 
@@ -348,9 +349,10 @@ def _shares(products: _Products, weights: Array) -> tuple[Array, Array]:
 
 
 def _lag(products: _Products, loop: ClosedLoop) -> Array:
-    """Return ``(_TAPS,)`` weights of the frames, adding up to 1: how late the modes are.
+    """Return ``(_TAPS,)`` weights of the frames, with sum 1: the delay of the modes.
 
-    Fitted with every mode counting alike; where the fit is no delay the status' word stands.
+    Fitted with equal weight for all modes. If the result is no delay, the delay in the status is
+    used.
     """
     late = loop.delay_frames - int(loop.delay_frames)
     scale = np.trace(products.asked) + products.n_samples * _STILL_M**2

@@ -1,10 +1,10 @@
 """Registration from far away: smooth modes dithered with the loop open.
 
-With the loop open a dithered line is a measured column of the interaction matrix, so that no loop
-has to be known, let alone be stable, and the fit is that of a small matrix: Gauss-Newton steps,
-halved where they make it worse, every column with a gain of its own. An open loop leaves the
-pyramid a seventh of its response in 1" seeing and another mean shape of it: the result is good to
-some per cent of a subaperture, which is what closing a loop takes.
+With the loop open, a dithered line is a measured column of the interaction matrix. No loop has to
+be known or stable, and the fit is that of a small matrix: Gauss-Newton steps, halved when they
+increase the misfit, with a free gain per column. An open loop leaves the pyramid a seventh of its
+response in 1" seeing, and changes the shape of the response. The result is accurate to some per
+cent of a subaperture, which is sufficient to close a loop.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ APPROACHED = np.array([0.02, 0.02, np.deg2rad(0.1), 2e-3])
 """A step shorter than this leaves the rest to the finer model (numeric units)."""
 
 LIMIT = np.array([3.0, 3.0, np.deg2rad(20.0), 0.15])
-"""Nobody looks further than this from the nominal registration (numeric units)."""
+"""Largest distance from the nominal registration that is searched (numeric units)."""
 
 UNEXPLAINED = 0.2
 """Largest share of the columns' power, noise taken off, that the right registration may leave."""
@@ -45,7 +45,8 @@ FAINTEST = 5.0
 LARGEST_GAIN = 3.0
 
 FARTHEST_SUBAP = 3.0
-"""Light that says the pupil lies further off is another instrument's."""
+"""Largest shift of the pupil that its light may indicate; beyond it the light is of another
+instrument."""
 
 _TURNS_RAD = np.deg2rad([5.0, -5.0])
 
@@ -69,7 +70,8 @@ class WideCaptureSearch:
     """Range and models of the search."""
 
     coarse: InteractionModel
-    """Of the dithered modes alone, columns in the order of the lines. Coarse: leads."""
+    """Coarse model of the dithered modes alone, columns in the order of the lines. It leads the
+    search."""
 
     fine: InteractionModel
     """The same, fine: decides."""
@@ -129,10 +131,10 @@ def not_found(reason: str, spectra: Spectra) -> WindowRefused:
 
 
 def _columns(spectra: Spectra) -> tuple[Columns, Array]:
-    """Return what the lines show of the interaction matrix, and the power of each one's noise.
+    """Return the measured columns of the interaction matrix, and the noise power of each.
 
-    The slopes at the lines over the known dither; the noise ``(n_lines,)`` is that of the bins
-    beside.
+    Slopes at the lines divided by the known dither; the noise ``(n_lines,)`` is that of the side
+    bins.
     """
     lines = np.arange(len(spectra.plan.modes))
     known = spectra.dither[lines, list(spectra.plan.modes)].astype(complex)
@@ -157,7 +159,7 @@ def _unexplained(columns: Columns, noise: Array, matrix: Array) -> float:
 
 
 def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | None:
-    """Return why an estimate is not believed, or None."""
+    """Return the reason why an estimate is rejected, or None."""
     estimate = found.estimate
     gains = np.abs(estimate.optical_gain)
     if estimate.gain_sigma is not None and np.any(gains < FAINTEST * estimate.gain_sigma):
@@ -182,12 +184,12 @@ def _why_not(found: WideCaptureEstimate, search: WideCaptureSearch) -> str | Non
 def far_starts(
     instrument: Instrument, flux: bytes | None, nominal: Misregistration | None = None
 ) -> tuple[Misregistration, ...]:
-    """Return where to start from when nothing is known, the likeliest first.
+    """Return starting points for an unknown registration, the most likely first.
 
-    With the mirror as stop the image of the pupil moves with it, so that its mean light tells the
-    shift where a sensor can say how; rotation and magnification it does not tell. ``flux`` is as
-    the RTC sends it, in its own axes: it is used where these are the conventions'. ``nominal`` is
-    where the mirror should be; None: as the instrument file has it.
+    With the mirror as stop, the pupil image moves with the mirror, so its mean light measures the
+    shift if the sensor supports it, but neither rotation nor magnification. ``flux`` is as the RTC
+    sends it, in its own axes; it is used if these are the conventions'. ``nominal`` is the expected
+    registration; None for that of the instrument file.
     """
     nominal = nominal or instrument.start
     turned = [replace(nominal, rotation_rad=nominal.rotation_rad + turn) for turn in _TURNS_RAD]

@@ -1,17 +1,17 @@
 """Find axes and signs of slopes, and a rough rotation, from the lowest modes.
 
-Which way the RTC counts rows and columns, which light it counts as positive and how the mirror is
-turned all show in tip, tilt and the few shapes after them. The gains of all shapes share one sign
-here: with a free sign for each, four orientations explain any matrix equally well, and tip and tilt
-alone leave two that differ by half a turn.
+The RTC's order of rows and columns, its sign of light and the mirror's rotation all appear in tip,
+tilt and the few shapes after them. The gains of all shapes share one sign here. With a free sign
+for each, four orientations explain any matrix equally well, and tip and tilt alone leave two that
+differ by half a turn.
 
-Turning the mirror by a quarter and the axes of the slopes back is no change that any measurement
-could see. Among such equivalents the nominal rotation of the mirror decides when it is told; else
-the orientation with the fewest flips, and the least rotation among those.
+Rotating the mirror by 90 deg and the axes of the slopes back cannot be detected by any measurement.
+Among such equivalent orientations the nominal rotation of the mirror decides if it is known;
+otherwise the orientation with the fewest flips, and among those the smallest rotation.
 
-The smoothest shapes that a set of modes can make lead from afar. The lowest Karhunen-Loeve modes
-are such shapes already; a user's own modes, or single actuators, must be combined. The combination
-is the same for the model and for the measured columns.
+The smoothest shapes that a set of modes can form are correct from far away. The lowest
+Karhunen-Loeve modes are such shapes; a user's own modes, or single actuators, are combined to form
+them. The combination is the same for the model and for the measured columns.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ ANGLES_RAD = np.deg2rad(np.arange(0.0, 360.0, 6.0))
 NOMINAL = Misregistration()
 
 MIN_LEAD = 0.08
-"""Another class of orientations must correlate worse by this much to be told apart."""
+"""Smallest difference of the correlations by which two classes of orientations are distinguished.
+"""
 
 MIN_CORRELATION = 0.4
 """Below, no orientation explains the lowest orders."""
@@ -71,7 +72,7 @@ class Pose:
 
     @property
     def mirrored(self) -> bool:
-        """Whether the grid of the slopes is seen as in a looking-glass."""
+        """Return True if the grid of the slopes is mirrored."""
         return self.n_changes % 2 == 1
 
     @property
@@ -284,7 +285,7 @@ class _Turned:
 
 
 DEGREE = 5
-"""Of the polynomials that stand for the lowest orders: 20 without piston."""
+"""Degree of the polynomials that represent the lowest orders: 20 without piston."""
 
 REPRESENTED = 0.5
 """Least share of a smooth shape's amplitude that the modes must be able to make."""

@@ -39,8 +39,8 @@ N_TAPS = 11
 """Longer filters know turbulence from noise no better, and lose more frames at every gap."""
 
 CORNER = 0.08
-"""Of the frame rate. Above 0.1 a bright star leaves too little signal; below 0.06 a wind of 20 m/s
-is let in."""
+"""Corner of the high-pass filter as a fraction of the frame rate. Above 0.1 a bright star leaves
+too little signal; below 0.06 turbulence in a wind of 20 m/s passes."""
 
 BAND_FRAMES = 32
 """Filtered in one product: more are mostly products with nothing, fewer mostly calls."""
@@ -49,13 +49,16 @@ MIN_DELAY_FRAMES = 2
 """With less the instrument may not look ahead, and a tenth of the signal is left."""
 
 _LOOP_GAIN = 0.35
-"""Of a loop at gain 0.6 and an optical gain of 0.6: where its noise is amplified."""
+"""Gain of a loop with gain 0.6 and optical gain 0.6: frequencies at which its noise is amplified.
+"""
 
 _TURBULENCE_SLOPE = 34.0 / 3.0
-"""Of the squared temporal spectrum of a mode above its corner: twice 17/3 (Conan et al. 1995)."""
+"""Slope of the squared temporal power spectrum of a mode above its corner frequency: twice 17/3
+(Conan et al. 1995)."""
 
 _LOWEST = 0.015
-"""Of the frame rate: below it turbulence is as strong as here."""
+"""Lowest frequency as a fraction of the frame rate. Below it turbulence is assumed to be as strong
+as at it."""
 
 TAPER_FRAMES = 32
 """Frames over which a run of telemetry fades in after a gap, and out before the next. Turbulence is
@@ -73,18 +76,18 @@ SAMPLE_FRAMES = 128
 """One sample in as many frames."""
 
 SHRUNK = 0.2
-"""Share of the correlations between parameters that is not believed. They are estimated from the
-few errors of columns that are independent of one another, and what seems known best of all is what
-chance has made small: one look in 60 lay five of its own σ away in such a direction."""
+"""Fraction by which correlations between parameters are reduced. They are estimated from the few
+independent errors of columns, so directions that appear best known are partly known by chance: one
+estimate in 60 was 5 σ off in such a direction."""
 
 MIN_SAMPLES = 8
-"""Fewer filtered frames do not tell how noisy the slopes are."""
+"""Smallest number of filtered frames from which the noise of the slopes is estimated."""
 
 _REACH = N_TAPS - 1
 """Frames besides its own that a filtered one is made of."""
 
 _RANK = 1e-6
-"""Of the largest singular value: what is smaller is rounding."""
+"""Singular values below this fraction of the largest are rounding errors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,11 +167,12 @@ class Passive(PassiveSums):
     """Frames after which a sample's weight has fallen to 1/e."""
 
     delay_frames: float = 2.0
-    """Of the loop; with less than two nothing is summed."""
+    """Delay of the loop. Below two frames nothing is summed."""
 
     sums: tuple[NDArray[np.float32], ...] = ()
-    """Of s z^T ``(n_slopes, n_instruments)``, metres, of c z^T ``(n_modes, n_instruments)`` and of
-    z z^T, metres²; z are the filtered commands of the instruments. Empty: of no frame."""
+    """Sums of s z^T ``(n_slopes, n_instruments)``, metres, of c z^T ``(n_modes, n_instruments)``
+    and of z z^T, metres²; z are the filtered commands of the instruments. Empty if there are no
+    frames."""
 
     samples: tuple[tuple[Array, Array], ...] = ()
     """Filtered slopes ``(n_slopes,)`` and commands ``(n_modes,)`` of single frames."""
@@ -181,7 +185,7 @@ class Passive(PassiveSums):
     """Modes outside the loop that move in them."""
 
     begun: bool = False
-    """Whether frames of this run have been multiplied."""
+    """True if frames of this run have been multiplied."""
 
     @classmethod
     @override
@@ -233,16 +237,17 @@ class Passive(PassiveSums):
 
     @property
     def instrument_filter(self) -> HighPass:
-        """What makes instruments of the commands."""
+        """Return the high-pass filter that converts commands to instruments."""
         return high_pass(self.delay_frames)
 
     @property
     def instruments(self) -> NDArray[np.intp]:
-        """Modes whose filtered commands are summed with everything, ``(n_instruments,)``, rising.
+        """Return the modes whose filtered commands are correlated with everything, increasing.
 
-        All, unless no memory could tell that many. Then as many as have twice the frames that are
-        needed at every look, evenly spread: thousands would cost two cores and say nothing, and
-        low modes alone know little of a shift.
+        ``(n_instruments,)``. All modes, as long as the memory suffices. Otherwise modes evenly
+        spread over the basis, half as many as the frames of an estimate could support: thousands
+        would use two cores without improving α, and low modes alone contain little information on
+        the shift.
         """
         every = np.arange(self.n_modes)
         if self.memory_frames + CHUNK_FRAMES >= MIN_FRAMES_PER_MODE * self.n_modes:
@@ -409,12 +414,12 @@ def passive_matrix(state: Passive) -> PassiveMatrix | None:
 
 
 def fit(state: Passive, linearisation: Linearisation) -> PassiveEstimate | None:
-    """Fit α and a free gain per mode to the noisy matrix; None when too few frames came.
+    """Fit α and a free gain per mode to the noisy matrix; None if there are too few frames.
 
-    By :mod:`service.estimation.solver`, each mode weighted by its noise. The errors of the columns
-    are not independent (Q), nor are those of the slopes (S): fast turbulence looks like modes. With
-    both, ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; the residual tells S. ``SHRUNK`` of its
-    correlations is taken away.
+    Uses :mod:`service.estimation.solver`, each mode weighted by its noise. The errors of the
+    columns are correlated (Q), and so are those of the slopes (S), because fast turbulence
+    resembles modes. With both, ``Cov = A^-1 (J w) (S x Q) (J w)^T A^-1``; S is estimated from the
+    residual. Its correlations are reduced by ``SHRUNK``.
     """
     found = passive_matrix(state)
     if found is None:
@@ -451,10 +456,11 @@ def _seen_by(matrix: Array, some: NDArray[np.intp], carried: Array) -> Array:
 def fit_matrix(
     found: PassiveMatrix, model: Array, derivatives: Array, near: Misregistration
 ) -> PassiveEstimate:
-    """Fit α and a free gain per column to a noisy matrix, about ``near``.
+    """Fit α and a free gain per column to a noisy matrix, near ``near``.
 
-    ``model`` is what it should be there, ``derivatives`` ``(4, ...)`` how that changes with α. The
-    misfit is the variance of an error where the shape has 1: nobody here knows the noise.
+    ``model`` is the model's matrix there, ``derivatives`` ``(4, ...)`` its derivatives by α. The
+    misfit is the variance of the errors in units of the given shape, because their noise is
+    unknown.
     """
     noise = np.diag(found.shape)
     # a mode that never moves has no noise, and no weight

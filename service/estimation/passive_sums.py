@@ -17,15 +17,15 @@ from service.estimation.loop import why_open
 from service.model.interaction import Linearisation
 
 PASSIVE_INTERVAL_S = 4.0
-"""Between two looks of the passive watchdog, and of telemetry in each: a jump is to be seen within
-5 s."""
+"""Duration of telemetry in a passive estimate, and interval between two: a jump must be detected
+within 5 s."""
 
 MIN_PASSIVE_S = 3.0
-"""Of telemetry, beside a dither."""
+"""Shortest telemetry for an estimate next to a dither."""
 
 RESTS, LONG_RESTS = 1, 3
-"""Intervals left out after a look beside a dither, and while its windows are accepted: they show a
-jump sooner than a look does."""
+"""Intervals skipped after an estimate next to a dither, and while its windows are accepted: windows
+detect a jump sooner than a passive estimate."""
 
 MIN_FRAMES_PER_MODE = 5
 """Fewer effective frames leave the command covariance too noisy to invert."""
@@ -93,11 +93,11 @@ class PassiveSums(Estimator):
     def close(
         self, loop: LoopContext, marks: Mark, *, has_windows: bool
     ) -> tuple[Self, Self | str | None]:
-        """Return sums begun anew, and the old ones, or why there is no look yet.
+        """Return reset sums with the finished ones, or the reason why there is no estimate yet.
 
-        No two looks then share telemetry: their errors are independent, and one that lies wholly
-        after a jump says so. Beside a dither some telemetry is left out, more where windows have
-        told of α just now; None: that is why. A rest ends early when they no longer do.
+        Two estimates never share telemetry, so that their errors are independent and an estimate
+        entirely after a jump shows it. Next to a dither some telemetry is skipped, more if windows
+        have recently measured α; the reason is then None. The pause ends early when they stop.
         """
         beside, now_ns = Mark.WINDOWS in marks, loop.received_ns_utc
         rests = has_windows and beside and not self._oversleeps(now_ns)

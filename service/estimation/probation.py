@@ -56,7 +56,7 @@ HISTORY_S = 10.0
 """Telemetry with the matrix before from which the noise of a healthy loop is measured."""
 
 PART_S = 0.1
-"""Between two looks."""
+"""Duration of a part, between two evaluations."""
 
 LONGEST_PART_S = 0.2
 """A block that lasts longer makes more than one part."""
@@ -68,7 +68,7 @@ MIN_BEFORE_S = 0.8
 """Telemetry with the matrix before; with less nothing is said."""
 
 SETTLING_S = 0.03
-"""After a swap the loop goes over from one equilibrium to the other."""
+"""Time after a swap in which the loop changes from one equilibrium to the other."""
 
 LAG = 5
 """Frames: what rings at a tenth of the frame rate shows twice, what is slow not at all. An optical
@@ -85,7 +85,7 @@ RETURNED_S = 1.0
 """With the matrix before in use again, until the loop is said to be as it was, or lost."""
 
 RETURNED_PARTS = 10
-"""Last parts by which that is told."""
+"""Number of the last parts that decide if the loop has returned."""
 
 _REACH = LAG + 1
 _SAMPLED = 4
@@ -105,23 +105,24 @@ class Comparison(Detector):
     only_closed = True
 
     cm_id: str | None = None
-    """Of the last block."""
+    """Reconstructor of the last block."""
 
     modes: NDArray[np.intp] | None = None
-    """In the loop, by the last block."""
+    """Modes in the loop in the last block."""
 
     tail: FrameBlock | None = None
     """The last frames, as many as a step and its change reach back; None if the last block had
     fewer."""
 
     session: str | None = None
-    """Of the last block."""
+    """Session of the last block."""
 
     n_skipped: int = 0
     """Frames since the swap that do not count yet."""
 
     parts: tuple[Part, ...] = ()
-    """Of the matrix in use, oldest first, as many as may count; the last one is under way."""
+    """Parts with the matrix in use, oldest first, up to the number that counts; the last is
+    incomplete."""
 
     before: Before | None = None
     """None: nothing is being compared."""
@@ -133,10 +134,11 @@ class Comparison(Detector):
     """The matrix in use, where it is not the reader's: it has read the telemetry before, too."""
 
     healthy: Before | None = None
-    """What the last matrix found worse was compared with: the next one is compared with it, too."""
+    """Reference of the last matrix that was judged worse; the next matrix is compared with it as
+    well."""
 
     returned: bool = False
-    """Whether it is: the one in use has taken the place of a worse one."""
+    """True if the matrix in use replaced a worse one."""
 
     n_runaway: int = 0
     """Frames looked at in a row that are beyond all before."""
@@ -145,7 +147,7 @@ class Comparison(Detector):
     """Modes that a dither has moved: they do not count."""
 
     found: ProbationFinding | None = None
-    """Of the last swap; None: it is being looked at, or there was none."""
+    """Result for the last swap; None if it is under way or there was none."""
 
     of_loop: Status | None = None
     """The loop that both must be of, but for how many modes are controlled."""

@@ -33,7 +33,7 @@ from service.model.interaction import Linearisation
 Array = NDArray[Any]
 
 FRAMES_PER_MODE = 4
-"""A window shorter than this many frames per dithered mode cannot tell the modes apart."""
+"""A window with fewer frames per dithered mode than this cannot separate the modes."""
 
 N_BATCHES = 24
 """Parts of a window whose scatter gives the covariance."""
@@ -74,7 +74,7 @@ class RandomPlan(WindowPlan):
 
     @property
     def late_columns(self) -> NDArray[np.intp]:
-        """Which of the dithered modes also show a response one frame late, ``(n_late,)``."""
+        """Return the dithered modes that also respond one frame later, ``(n_late,)``."""
         n_late = min(len(self.modes), LATE_MODES)
         return np.linspace(0, len(self.modes) - 1, n_late).astype(np.intp)
 
@@ -147,7 +147,7 @@ class RandomDither(WindowCutter[RandomPlan, Correlations | None, Correlated]):
 
     @override
     def close(self, window: Window[Correlations | None]) -> Correlated | WindowRefused:
-        """Return the finished window, or why its dither is not the one asked for."""
+        """Return the finished window, or the reason why its dither differs from the request."""
         sums = window.sums
         if sums is None:
             reason = "no two frames of the window came one after the other: check the link"
@@ -221,7 +221,7 @@ SIGNIFICANT = 5.0
 """σ of a response that counts as seen."""
 
 WHITE_PARTS = 24
-"""What is known beforehand of the scatter, that noise is nearly white, counts as so many parts."""
+"""Weight, in parts, of the prior that the noise is nearly white."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -264,10 +264,10 @@ class RandomEstimate(DitheredEstimate):
     """``(n_dithered,)`` 1 σ of each gain."""
 
     def gains_by_group(self, n_groups: int) -> tuple[tuple[int, ...], Array, Array]:
-        """Return modes, gains and their 1 σ of at most so many groups of neighbours, in order.
+        """Return modes, gains and 1 σ of at most ``n_groups`` groups of neighbouring modes.
 
-        One mode among hundreds says little of its gain, and neighbours have nearly the same: they
-        are averaged by their noise, and the middle one stands for all.
+        One mode among hundreds contains little information on its gain, and neighbours have nearly
+        equal gains. They are averaged by their noise, and the middle mode represents the group.
         """
         order = np.argsort(self.modes)
         groups = [g for g in np.array_split(order, min(n_groups, len(order))) if len(g)]

@@ -33,10 +33,10 @@ class Reference:
     """``(n_columns,)`` 1 σ of one element of each column, in the matrix's unit; None: unknown."""
 
     double_pass: bool = False
-    """Whether the light met the mirror twice: the matrix is then twice the model's."""
+    """True if the light met the mirror twice, so that the matrix is twice the model's."""
 
     left_out: tuple[str, ...] = ()
-    """What was no measurement and is gone, and why: one sentence for each kind."""
+    """Columns that were no measurement and are removed, with the reason: one sentence per kind."""
 
     @property
     def columns(self) -> NDArray[np.intp]:

@@ -1,15 +1,16 @@
-"""Measure what a closed loop leaves of turbulence.
+"""Measure the turbulence that a closed loop leaves.
 
-**Its residual, seeing taken out.** A matrix that is believed reads the residual from the slopes,
-whichever matrix closes the loop. With the command taken off, it is the turbulence itself; how far
-that moves in a few hundredths of a second tells how hard the loop's work is just now. Both are
+**Residual with seeing taken out.** A reference matrix measures the residual from the slopes,
+whichever matrix closes the loop. After the command is subtracted, the result is the turbulence
+itself; its motion in a few hundredths of a second measures how demanding it is at present. Both are
 compared mode by mode.
 
-A loop brings to zero what its own matrix reads, modes beyond the controlled ones included: each
-matrix finds its own loop better. So both read both loops, and what they agree on counts.
+A loop brings to zero what its own matrix measures, modes beyond the controlled ones included, so
+each matrix finds its own loop better. Both matrices therefore measure both loops, and the agreement
+of the two counts.
 
-**Its rejection.** The residual as the loop itself reads it, over its commands, tells whether it
-holds well.
+**Rejection.** The residual as the loop itself measures it, divided by its commands, shows if the
+loop holds well.
 """
 
 from __future__ import annotations
@@ -53,18 +54,18 @@ class Residual:
 
     n_seen: int
     seen: Array
-    """Of the residual."""
+    """Power of the residual."""
 
     n_moved: int
     moved: Array
-    """Of how far the turbulence has moved between samples."""
+    """Power of the turbulence's motion between samples."""
 
     commanded: Array
-    """Of the command, over the samples of ``seen``."""
+    """Power of the command, over the samples of ``seen``."""
 
     own: Array | None = None
-    """Of the residual as the loop's own matrix reads it; None: it is the one that is believed, or
-    its numbers are not known."""
+    """Power of the residual as the loop's own matrix measures it; None if that is the reference
+    matrix, or its numbers are unknown."""
 
     kept: tuple[NDArray[np.float32], ...] = ()
     """``(n, n_slopes)`` each: some of the samples themselves."""
@@ -201,7 +202,7 @@ class ResidualLevel:
 
 
 def stride_frames(dt_ns: int) -> int:
-    """Return how many frames lie between two samples."""
+    """Return the number of frames between two samples."""
     return max(round(SAMPLE_S * 1e9 / dt_ns), 1)
 
 
@@ -219,11 +220,11 @@ def total_of(parts: tuple[Residual, ...]) -> Residual | None:
 
 
 def ratio(before: Residual, after: Residual, modes: NDArray[np.intp]) -> float:
-    """Return the residual's power in these modes over that before, seeing taken out.
+    """Return the residual's power in these modes relative to that before, seeing taken out.
 
-    Where the matrix that closes the loop has read both, it is the geometric mean of both readings.
-    How the turbulence moves in a mode that runs away is told wrongly: no mode is forgiven more than
-    twice what the median mode is.
+    If the matrix that closes the loop has measured both, the geometric mean of both measurements is
+    returned. The motion of the turbulence is measured wrongly in a mode that diverges, so no mode
+    is corrected by more than twice the median mode's factor.
     """
     if not len(modes) or not after.n_seen:
         return 1.0
@@ -304,7 +305,7 @@ class Rejection(Detector):
 
     @property
     def holds(self) -> bool | None:
-        """Whether the loop holds well; None: too little telemetry."""
+        """Return True if the loop holds well; None if there is too little telemetry."""
         if self.residual is None or self.commanded is None or self.lasts_s < MEMORY_S:
             return None
         commanded = np.maximum(self.commanded, 1e-40)

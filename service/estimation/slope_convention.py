@@ -1,10 +1,10 @@
 """Check the RTC's slopes and commands against the instrument file.
 
-An RTC whose slopes have the other sign, other axes or another order, or whose commands are in
-nanometres, closes its own loop as well as any other: what it says agrees with itself. Only beside
-the model does it show, and a matrix made by the model would throw its loop open. Two things tell:
-the matrix it runs with, whose inverse is the interaction matrix as that RTC knows it, and the
-slopes that answer a dither.
+An RTC whose slopes have the opposite sign, other axes or another order, or whose commands are in
+nanometres, closes its own loop without any problem, because it is consistent with itself. The error
+shows only in comparison with the model, and a matrix made by the model would open its loop. Two
+sources are compared: the matrix in use, whose inverse is the interaction matrix as that RTC knows
+it, and the slopes that respond to a dither.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ REACH_RAD = np.deg2rad(30.0)
 """Rotations further than this from where a fit starts are another mounting, or other axes."""
 
 LARGEST_CONDITION = 100.0
-"""Of a reconstructor that is inverted: beyond it noise is all that would come out."""
+"""Largest condition number of a reconstructor that is inverted; beyond it the inverse is noise."""
 
 RESEMBLANCE = 0.5
-"""Least correlation of a dither's answer with the model under axes that are to be believed."""
+"""Smallest correlation of a dither's response with the model for axes to be accepted."""
 
 ADVANTAGE = 2.0
 """The stated ones must do worse by this factor."""
 
 _ONE_MODE = 2
-"""Of more lines than this one that contradicts alone is a mode that answers otherwise: other axes
-turn about half of them. The next modes that are dithered tell if it was the axes after all."""
+"""If more than this number of lines respond, a single contradicting line is a mode with a wrong
+response: wrong axes turn about half of them. The next dithered modes decide if it was the axes."""
 
 LAGS = np.arange(-3.0, 3.1, 0.5)
 """Frames by which slopes may lag the commands of their row and still be recognised."""
@@ -69,16 +69,16 @@ class SlopeConvention:
     """The RTC's order, signs and unit as its matrix shows them."""
 
     wrong: str = ""
-    """What was found, what the file says, and what to write; empty: they agree."""
+    """Finding, what the file states, and the change to make; empty if they agree."""
 
     found: SlopeRecipe | None = None
     """Order and orientation of the slopes, if they were clear."""
 
     adopted: bool = False
-    """Whether the model lists its slopes like that from now on: the file says "auto"."""
+    """True if the model uses this slope order from now on, because the file says "auto"."""
 
     rotation_rad: float | None = None
-    """Rough rotation of the mirror by the same witness; None: it does not tell."""
+    """Rough rotation of the mirror from the same source; None if it cannot be determined."""
 
 
 def of_reconstructor(

@@ -39,7 +39,7 @@ SETTLED = np.array([5e-4, 5e-4, np.deg2rad(5e-4), 1e-5])
 """A fine step shorter than this is the last."""
 
 LIMIT = np.array([4.0, 4.0, np.inf, 0.25])
-"""No registration lies further from the nominal one (numeric units; any rotation may)."""
+"""Largest distance from the nominal registration (numeric units; rotation is not limited)."""
 
 MAX_FAR_STEPS = 12
 _HALVINGS = 3
@@ -62,8 +62,8 @@ class Columns:
     """``(n_slopes,)`` slopes that count."""
 
     signed: bool = True
-    """Whether a gain may be negative; if not, such a column has nothing in common with the model,
-    and does not pull."""
+    """True if a gain may be negative. Otherwise such a column has no response in common with the
+    model and does not enter."""
 
     def project(self, model: NDArray[Any], derivatives: NDArray[Any]) -> Projection:
         """Return the gains, residual and Jacobian of a model ``(n_slopes, n_columns)``.

@@ -21,11 +21,11 @@ class ClosedLoop(ControlLoop):
     """``(n_controlled, n_slopes)`` metres per slope; row i commands mode i."""
 
     cm_id: str | None = None
-    """Of the reconstructor; None: the RTC does not know."""
+    """Id of the reconstructor in use; None if the RTC does not know it."""
 
 
 SETTLING_S = 0.3
-"""Of the loop, after a dither has begun, before the first window."""
+"""Settling time of the loop after a dither has begun, before the first window."""
 
 OTHER_SESSION = "the RTC has restarted since"
 """Why a window is of no use: what it holds belongs to the session before."""
@@ -60,9 +60,10 @@ class WindowPlan:
     """No window starts before this frame: the dither is on and the loop has settled."""
 
     def refusal(self, applied_m: NDArray[Any], lines: tuple[str, ...] = ()) -> str | None:
-        """Return why a dither of ``applied_m`` ``(n_modes,)`` RMS is not the one asked for.
+        """Return the reason why a dither differs from the request, or None.
 
-        None: it is. ``lines`` says of every mode where in frequency it was looked for.
+        ``applied_m`` ``(n_modes,)`` is its RMS; ``lines`` gives, for every mode, the frequencies
+        that were examined.
         """
         ratio = applied_m / np.array(self.amplitude_m)
         weak = ratio.min() < AMPLITUDE_RATIO[0]
@@ -83,7 +84,7 @@ HEARD_LINES = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExpectedDither:
-    """A dither as the service asked for it."""
+    """A dither as the service requested it."""
 
     modes: tuple[int, ...]
     """0-based basis indices."""
@@ -100,22 +101,22 @@ class ExpectedDither:
     """First frame that holds it, and the first that holds it no more."""
 
     own: tuple[bool, ...]
-    """Whether a mode is outside the loop: all that its command does is the dither. In the loop it
-    is amplified, and its column alone tells how strong it is."""
+    """True for each mode outside the loop, whose command consists of the dither alone. In the loop
+    the dither is amplified, and its amplitude is known from its column only."""
 
     response: tuple[float, ...] = ()
-    """Of each mode, the sum of the squares of the slopes it makes, per metre²; empty: not known."""
+    """Sum of the squared slopes of each mode, per metre²; empty if unknown."""
 
     id: str = ""
     plan: WindowPlan | None = None
-    """How its windows are cut; None: they cannot be."""
+    """Plan of its windows; None if it has none."""
 
     why_unreadable: str = ""
     """Why."""
 
     @property
     def audible(self) -> list[int]:
-        """Which of the modes asked for are looked for in the slopes."""
+        """Return the requested modes whose response in the slopes can be measured."""
         if not self.frequency_hz or not self.response:
             return []
         expected = np.square(self.amplitude_m) * self.response
@@ -124,7 +125,7 @@ class ExpectedDither:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Telemetry:
-    """Which telemetry a finished window is of."""
+    """Identity of the telemetry in a finished window."""
 
     session: str
     cm_id: str | None
@@ -138,7 +139,7 @@ class Telemetry:
     """Frames that never came."""
 
     plan: WindowPlan
-    """What it was cut by."""
+    """Plan by which it was cut."""
 
     n_windows: int = 1
     """Windows, one after the other, that are joined here."""
@@ -178,7 +179,7 @@ class RefusalKind(StrEnum):
 
 
 Why = tuple[RefusalKind, str]
-"""Of what kind a refusal is, and what is said of it."""
+"""Kind of a rejection, and its text."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,10 +187,10 @@ class WindowRefused:
     """A window that gave no estimate."""
 
     reason: str
-    """What was found, and what to do about it."""
+    """Description of the cause, and what to do about it."""
 
     t_ns_utc: int
-    """When it was given up."""
+    """Time of the rejection."""
 
     kind: RefusalKind = RefusalKind.OTHER
 
@@ -214,7 +215,7 @@ class Window(Generic[S]):
 
     dt_ns: int
     sums: S
-    """What the estimator has made of the frames so far."""
+    """Sums of the estimator over the frames so far."""
 
     n_missing: int = 0
     """Frames before ``next_seq`` that never came."""
@@ -290,7 +291,7 @@ class WindowCutter(Generic[P, S, F]):
         raise NotImplementedError
 
     def close(self, window: Window[S]) -> F | WindowRefused:
-        """Return what came of a window, or why its dither is not the one asked for."""
+        """Return the result of a window, or the reason why its dither differs from the request."""
         raise NotImplementedError
 
     def begun_anew(self, first_seq: int) -> Self:

@@ -1,9 +1,9 @@
-"""Bring matrices into cacao's streams.
+"""Write matrices into cacao's streams.
 
-cacao copies its modes when the process that multiplies them starts, and looks at the streams no
-more. So a matrix is in use when that process is another one than it was when the streams were
-written, and not before. Which it is lies in a folder, and outlives this program. What acts at once
-and belongs to it (:mod:`cacao_bridge.parts`) follows then; a program that ends in between does the
+cacao copies its modes when the process that multiplies them starts, and does not read the streams
+again. A matrix is therefore in use once that process is another than when the streams were written.
+The process is recorded in a folder and survives this program. Parts of the calibration that act at
+once (:mod:`cacao_bridge.parts`) are written afterwards; a program that ends in between writes the
 rest when it runs again.
 """
 
@@ -33,7 +33,7 @@ _log = structlog.get_logger("cacao")
 _STATE: Final = "state.json"
 _CONSENT: Final = "apply"
 _ORDER: Final = "order"
-"""Which matrix of the folder an operator wants, with all that is kept with it."""
+"""File that names the matrix an operator wants, with everything that belongs to it."""
 
 _KEYWORD: Final = "PYRCAL"
 
@@ -125,7 +125,7 @@ class Calibration:
             _log.warning("parts.set", id=owed)
 
     def _obey(self) -> None:
-        """Let the matrix that an operator wants wait, its consent given."""
+        """Prepare the matrix that an operator has approved."""
         path = self._folder / _ORDER
         if not path.exists():
             return
@@ -207,7 +207,7 @@ class Calibration:
 
 
 def keep(folder: Path, matrix: Reconstructor) -> None:
-    """Write the numbers, and their sources beside them."""
+    """Write the numbers, with their sources."""
     numbers, name = io.BytesIO(), matrix.manifest.id
     np.save(numbers, matrix.matrix, allow_pickle=False)
     replace_file(folder / f"{name}.npy", numbers.getvalue())

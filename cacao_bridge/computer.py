@@ -36,17 +36,17 @@ Array32 = NDArray[np.float32]
 _log = structlog.get_logger("cacao")
 
 _PAUSE_S: Final = 0.02
-"""Between two looks where rings are long: 50 messages a second."""
+"""Pause between two reads of long rings: 50 messages a second."""
 
 _STANDS_S: Final = 1.0
-"""Without a frame, until a counter is said to stand."""
+"""Time without a frame after which a counter is reported as stopped."""
 
 _RATE_S: Final = 4.0
 _RATE_TOLERANCE: Final = 0.1
 _CLOCK_SHARE: Final = 0.02
 _CLOCK_STEP_NS: Final = 100_000_000
 _LEAD_S: Final = 0.1
-"""Between a dither's acceptance and its first frame: its answer is there before."""
+"""Time between the acceptance of a dither and its first frame: the reply must arrive before it."""
 
 _LEAK_SPREAD: Final = 0.004
 
@@ -63,7 +63,7 @@ class Cacao:
         self._calibration = Calibration(settings, self.identity)
         n_slopes = len(self._calibration.index)
         self._whole = np.array_equal(self._calibration.index, np.arange(n_slopes))
-        """Whether all of a frame is slopes."""
+        """True if all values of a frame are slopes."""
         self._projection = np.linalg.pinv(
             self._calibration.dm_modes.reshape(self._loop.n_modes, -1).astype(np.float64)
         ).astype(np.float32)
@@ -83,7 +83,7 @@ class Cacao:
         self._n_next: int | None = None
         self._streams: dict[str, Stream] = {}
         self.complaint = ""
-        """What is wrong with the streams, for people; empty: nothing."""
+        """Problem with the streams, for people; empty if there is none."""
         self.n_lost = 0
         """Frames of slopes that were overwritten before they were read."""
         self._unlink()
@@ -97,7 +97,7 @@ class Cacao:
         self._slopes_at: int | None = None
         self._commands_at: int | None = None
         self._moves = False
-        """Whether the newest command is anything but 0."""
+        """True if the newest command is not zero."""
         self._offset: int | None = self._loop.counter_offset
         self._moved_s = {"slopes": time.monotonic(), "commands": time.monotonic()}
         self._clock: tuple[int, int] | None = None
@@ -105,7 +105,7 @@ class Cacao:
 
     @property
     def unlinked(self) -> bool:
-        """Whether there are no streams to read."""
+        """Return True if there are no streams to read."""
         return not self._streams
 
     @property
@@ -295,7 +295,7 @@ class Cacao:
 
     @property
     def known(self) -> bool:
-        """Whether the matrix that cacao multiplies with is known; before, there is no RTC."""
+        """Return True if the matrix in use is known; before that the bridge is no RTC."""
         return self._calibration.in_use is not None
 
     @property
@@ -331,7 +331,7 @@ class Cacao:
 
     @property
     def has_news(self) -> bool:
-        """Whether a matrix was taken up and not reported yet."""
+        """Return True if a swap is not reported yet."""
         return bool(self._swaps)
 
     def take_swaps(self) -> list[tuple[str, int]]:

@@ -1,8 +1,9 @@
 """Play the dither frame by frame into a channel of the mirror.
 
-What is written while the newest frame of slopes is k goes onto the mirror together with the loop's
-answer to k. A frame that is seen too late finds the value of the one before still there, and that
-is what is remembered of it: the columns hold what was played, not what was asked for.
+A value written while the newest frame of slopes is k goes onto the mirror together with the loop's
+answer to k. If a frame is noticed too late, the value of the previous frame is still in the
+channel, and that value is recorded for it: the telemetry contains what was played, not what was
+requested.
 """
 
 from __future__ import annotations

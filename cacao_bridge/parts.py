@@ -1,7 +1,7 @@
-"""What of a calibration acts at once in cacao: the gains of the modes, the reference of the slopes.
+"""Parts of a calibration that act at once in cacao: gains of the modes, reference of the slopes.
 
-They are set when cacao has taken up the matrix that they belong to, and what was there before is
-kept under the name of the matrix before.
+They are set when cacao has taken up the matrix that they belong to. The previous values are kept
+under the name of the previous matrix.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from service.files.durable import replace_file
 Array32 = NDArray[np.float32]
 
 GAINS, REFERENCE = "gain_factor", "reference_slopes"
-"""Of a bundle."""
+"""Names in a bundle."""
 
 
 class Parts:
@@ -32,7 +32,7 @@ class Parts:
 
     @property
     def takes(self) -> frozenset[str]:
-        """What of a bundle this loop has a place for."""
+        """Return the parts of a bundle that this loop can use."""
         can = {GAINS: self._names.gains and self._loop.gain > 0.0, REFERENCE: self._names.reference}
         return frozenset(name for name, has in can.items() if has)
 

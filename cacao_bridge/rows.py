@@ -1,9 +1,9 @@
 """Pair each frame of slopes with the command on the mirror.
 
-cacao counts each stream by itself. A command answers a frame of slopes; which one its trace tells.
-It is on the mirror ``delay_frames`` exposures later, so row k holds slopes k and the command that
-answers k - delay: of a delay of 1.7 frames seven tenths of the older of two commands. Both count by
-the frame of slopes that they answer, and a row leaves when all of it is there.
+cacao counts each stream separately. A command answers a frame of slopes, which its trace names. It
+is on the mirror ``delay_frames`` exposures later, so row k contains slopes k and the command that
+answers k - delay; with a delay of 1.7 frames, seven tenths of the older of two commands. Both are
+counted by the frame of slopes that they answer. A row is sent when it is complete.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Rows:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Discard all rows and begin again."""
         self._of_slopes, self._of_commands = np.full((2, self._kept), _NEVER)
         self._dither_m[:] = 0.0
         self.next = self._newest = -1

@@ -33,26 +33,28 @@ class WireTable(Table):
     """The ``{system}`` of the keys: ``[instrument] name`` of the instrument file."""
 
     basis_id: Opaque
-    """Of the modes: give another one when they, their order or their scale change."""
+    """Name of the modal basis. Choose another when the modes, their order or their scale change."""
 
     config_id: Opaque
-    """Of the sensor: give another one when mask, reference, binning or modulation change."""
+    """Name of the sensor configuration. Choose another when mask, reference, binning or modulation
+    change."""
 
 
 class StreamsTable(Table):
     """Names of cacao's streams; they differ between its versions and between loops."""
 
     directory: str = ""
-    """Where they lie; empty: ``$MILK_SHM_DIR``, else ``/milk/shm``."""
+    """Folder of the streams; empty for ``$MILK_SHM_DIR``, else ``/milk/shm``."""
 
     slopes: Name = "aol1_imWFS2"
-    """What modes_wfs multiplies, reference subtracted."""
+    """Slopes that modes_wfs multiplies, reference subtracted."""
 
     commands: Name = "aol1_modevalDM"
-    """What the loop commands: one number a mode, or the mirror's actuators."""
+    """Commands of the loop: one number per mode, or the mirror's actuators."""
 
     multiplied: Name = "aol1_modevalWFS"
-    """What the process writes that multiplies slopes: its restart is when a matrix is taken up."""
+    """Output of the process that multiplies slopes. Its restart shows that a matrix was taken up.
+    """
 
     modes_wfs: Name = "aol1_modesWFS"
     """The reconstructor, one slice a mode: written here."""
@@ -64,10 +66,10 @@ class StreamsTable(Table):
     """Gain of each mode; empty: ``[loop] gain``."""
 
     reference: Optional = ""
-    """What is subtracted from the slopes, like ``aol1_wfsrefc``; empty: it is nobody's here."""
+    """Reference subtracted from the slopes, like ``aol1_wfsrefc``; empty if this loop has none."""
 
     factors: Optional = "aol1_mmult"
-    """What each mode's command is multiplied by in every frame; empty: ``[loop] leak``."""
+    """Factor of each mode's command in every frame; empty to use ``[loop] leak``."""
 
     dither: Optional = ""
     """A channel of the mirror that is the bridge's own, like ``dm01disp05``; empty: no dither."""
@@ -82,21 +84,22 @@ class LoopTable(Table):
 
     n_slopes: Counted
     n_modes: Counted
-    """Of the whole basis, controlled or not."""
+    """Number of modes of the basis, controlled or not."""
 
     metre_per_unit: Positive
     """OPD of a mode whose command is 1, metres; cacao's mirrors count in micrometres."""
 
     commands_are: Literal["modes", "actuators"] = "modes"
     counter_offset: int | None = None
-    """Counter of a frame of ``slopes`` less that of the ``commands`` that answer it; left out: as
-    the commands' trace tells."""
+    """Counter of a frame of ``slopes`` minus that of the ``commands`` that answer it. If left out,
+    it is read from the commands' trace."""
 
     law: Literal["mult c - gain m", "mult (c - gain m)"] = "mult c - gain m"
-    """How the modal filter integrates: that of today's cacao, or the one of before."""
+    """Law of the modal filter: that of today's cacao, or the earlier one."""
 
     gain: Annotated[float, Field(ge=0.0)] = 0.0
-    """Of every mode where there is no stream of gains; and what a bundle's factors multiply."""
+    """Gain of every mode if there is no stream of gains; otherwise the factor of a bundle's gains.
+    """
 
     leak: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
     max_dither_m: Annotated[float, Field(ge=0.0)] = 50e-9
@@ -116,7 +119,8 @@ class CalibrationTable(Table):
     """NumPy file ``(n_slopes,)``: places of the slopes in a frame; empty: all of it is slopes."""
 
     interlock: Literal["operator", "restart"] = "operator"
-    """Whether the streams are written when an operator says so, or as soon as a matrix came."""
+    """When the streams are written: after an operator's order, or as soon as a matrix has arrived.
+    """
 
 
 class Settings(Table):

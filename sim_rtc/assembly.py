@@ -65,7 +65,7 @@ class Telescope:
     detector: Detector
     identity: Identity
     reconstructor: Reconstructor
-    """In use at the start: for a perfect registration, by the nominal model."""
+    """Matrix in use at the start: for nominal registration, from the nominal model."""
 
     settings: LoopSettings
     weights: NDArray[np.float64]
@@ -78,7 +78,8 @@ class Telescope:
     """Limits and lag of the mirror; None: it obeys at once."""
 
     move: Callable[[NDArray[np.float64]], float] | None
-    """Moves the mirror's image by ``(4,)``, numeric units, and tells when; None: nothing can."""
+    """Moves the mirror's image by ``(4,)``, numeric units, and returns the time of arrival; None if
+    the telescope has no such stage."""
 
     def computer(self, blocks: Iterator[Block]) -> RealTimeComputer:
         """Return a computer that runs on these blocks of the feed."""
@@ -96,9 +97,9 @@ class Telescope:
 
 
 def _modes(options: Options, instrument: Instrument) -> Basis:
-    """Return the modes of the mirror, from the folder that the service keeps its own in.
+    """Return the modes of the mirror, from the folder in which the service caches its own.
 
-    They are found on the finest subapertures: coarser ones could not tell them from one another.
+    They are computed for the finest sensor mode, because a coarser one could not distinguish them.
     """
     kept = DiskCache(usual_folder(os.environ)).basis(instrument)
     if isinstance(kept, ModalBasis) or options.plant == "measured":
@@ -141,9 +142,9 @@ def _binned(options: Options, basis: Basis, instrument: Instrument) -> tuple[Bas
 
 
 def at_held_rate(options: Options, instrument: Instrument) -> Options:
-    """Return the options with the highest frame rate that this machine holds, at most theirs.
+    """Return the options with the highest frame rate that this machine sustains, at most theirs.
 
-    Where that is too low for a dither, the loop keeps the rate asked for, in slow motion.
+    If that is too low for a dither, the loop keeps the requested rate, in slow motion.
     """
     instrument = _supported(options, instrument)
     n_modes = instrument.modes.n_modes
@@ -177,7 +178,7 @@ def in_sensor_mode(options: Options, instrument: Instrument) -> Instrument:
 
 
 def most_of(instrument: Instrument) -> int | None:
-    """Return how many modes the mode of a sensor lets be controlled; None: nobody says."""
+    """Return the number of modes that the sensor mode permits; None if it states none."""
     if not instrument.sensor_modes or instrument.loop is None:
         return None
     return instrument.loop.n_controlled
@@ -388,10 +389,10 @@ def build_plant(
 
 
 def departures_of(options: Options, instrument: Instrument) -> Imperfections:
-    """Return how the telescope departs from its drawing: with an optical gain where it has one.
+    """Return the imperfections of the telescope, with an optical gain if it has one.
 
-    A linear plant invents that of a pyramid. A centroid moves as far in turbulence as without:
-    where none is asked for, its gain is 1.
+    A linear plant has the optical gain of a pyramid as a parameter. A centroid moves as far in
+    turbulence as without, so its gain is 1 unless another is requested.
     """
     found = options.imperfections
     if options.optical_gain is not None or kind_of(instrument).loses_gain:

@@ -128,7 +128,7 @@ class Fault:
 
     kind: FaultKind
     time_s: float
-    """When it begins, seconds of loop time."""
+    """Start of the fault, seconds of loop time."""
 
     values: tuple[float, ...]
     """One for each argument of its form, defaults filled in."""

@@ -10,14 +10,14 @@ from threadpoolctl import threadpool_limits
 from sim_rtc.computer.feed import message_frames
 
 RATES_HZ = (1000.0, 800.0, 500.0, 400.0, 250.0, 200.0, 100.0, 50.0, 20.0, 10.0)
-"""Those that are tried, below the one that is asked for."""
+"""Frame rates that are tried, below the requested one, hertz."""
 
 DITHERED_FROM_HZ = 200.0
 """Below it the lines of a dither do not fit under the loop's own bandwidth."""
 
 SHARE = 0.4
-"""Of a core that a frame's products may take: the turbulence takes as much again, and the service
-beside needs the rest of what this machine has free."""
+"""Fraction of a core that the products of a frame may use. The turbulence uses as much again, and
+the service needs the rest of a machine of two cores."""
 
 MEASURED_S = 0.5
 

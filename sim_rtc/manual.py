@@ -164,7 +164,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
-    """As wide as the rest of the manual, whatever the terminal."""
+    """Formats help in the width of the manual, independently of the terminal."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=34, width=100)

@@ -27,7 +27,7 @@ from sim_rtc.telescope.scene import Elevation, Scene, SceneKind, Spiders
 from sim_rtc.telescope.sky import DAYTIME_LINES, SeeingSchedule, VibrationLine
 
 USUAL_MODES, FAR_MODES = 400, 120
-"""In the loop at the start, of an instrument that has so many."""
+"""Modes in the loop at the start, if the instrument has as many: registered, and far from it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -559,7 +559,7 @@ class Options:
 
     @property
     def needs_drive(self) -> bool:
-        """Whether a linear plant must follow its mirror frame by frame."""
+        """Return True if a linear plant must follow its mirror frame by frame."""
         return self.rise_ms > 0.0 or self.mirror_limits != MirrorLimits()
 
     @property

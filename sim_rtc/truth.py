@@ -173,7 +173,7 @@ class TruthRecorder(Background):
         self._last = last
 
     def _alpha(self, batch: Batch) -> dict[str, float | None]:
-        """Return the true registration; None for each number that nobody knows."""
+        """Return the true registration; None for each parameter that is not known."""
         options = self._options
         if options is not None and options.plant == "measured" and options.alpha is None:
             return dict.fromkeys(PARAMETERS)

@@ -37,23 +37,24 @@ TAKE_FRAMES: Final = 512
 """Frames copied under one hold of the lock, so that ingest never waits for long."""
 
 LEFT_AS_THEY_CAME: Final = 16
-"""Batches that nobody has looked at; each is done many times as quickly right after another one."""
+"""Batches that are kept undecoded until they are needed; decoding many in a row is far quicker."""
 
 STATUS_INTERVAL_S: Final = 0.45
-"""Between two statuses that say the same: of more, the latest is taken when it is over."""
+"""Interval between two statuses of the same content; of more frequent ones only the latest is used.
+"""
 
 CHANGES: Final = 10
 """Statuses that say something else each, which are taken within that time all the same."""
 
 COALESCED: Final = "spared"
-"""What became of a status that a later one made superfluous."""
+"""Outcome of a status that a later one made superfluous."""
 
 PLACED: Final = {
     "duplicate": "they had come before",
     "late": "their place in the sequence had been passed",
     "nonfinite": "a slope or a command is not finite",
 }
-"""What becomes of frames in the sequence besides being used, and what is then wrong with them."""
+"""Outcomes of frames in the sequence other than being used, with their description."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,7 +74,7 @@ class _Put:
 
     event: LinkEvent
     ring: FrameRing | None
-    """That held the frames of then; None: none had come."""
+    """Ring with the frames of that time; None if there were none."""
 
     end: int
     """Frames before this one came before it."""
@@ -301,8 +302,8 @@ class Intake:
     def drain(self, *, before_events: bool = False) -> list[FrameBlock]:
         """Return copies of the frames that are due, in order; see :meth:`FrameRing.take`.
 
-        ``before_events``: only those that came before the oldest event which nobody has fetched.
-        What it tells is not so of them: it may be the end of the dither that they hold.
+        With ``before_events``, only those that arrived before the oldest pending event. The event
+        does not apply to them: it may be the end of the dither that they contain.
         """
         self._rung = False
         blocks: list[FrameBlock] = []
@@ -330,9 +331,10 @@ class Intake:
         return events
 
     def _take_coalesced(self, *, at_once: bool = False) -> None:
-        """Take the last of a flood of statuses in once it is due, or before what it said next.
+        """Process the last of a flood of statuses once it is due, or before the RTC's next message.
 
-        Told after its word on a matrix, or its end, it would deny what has happened since.
+        A status older than the last acknowledgement, or than the end of the session, would revert
+        the state.
         """
         with self._lock:
             data, last_s = self._coalesced, self._last_status_s

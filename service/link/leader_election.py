@@ -1,4 +1,4 @@
-"""Which RTC session counts, and which service drives it."""
+"""Decide which RTC session counts, and which service drives it."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     import zenoh
 
 NAME: Final = re.compile(r"[0-9]{1,19}-[0-9a-f]{1,32}")
-"""When a service came, nanoseconds since the Unix epoch, and its zenoh id."""
+"""Start of a service, nanoseconds since the Unix epoch, and its zenoh id."""
 
 RECEIVED_WITHIN_S: Final = 5.0
 """A service that gives no name is there for so long after its last word."""
 
 UNDER_WAY_S: Final = 0.3
-"""For the tokens of services that came at the same time."""
+"""Time for the tokens of services that started at the same time to arrive."""
 
 GRACE_S: Final = 1.0
 """Messages of a session that has ended may still be on their way for this long."""
 
 SILENCE_S: Final = 2.0
-"""Another session is believed once the one that counts has been silent for this long."""
+"""Silence of the current session after which another session is accepted."""
 
 REMEMBERED: Final = 16
 """Most other sessions that are kept apart."""
@@ -41,17 +41,17 @@ class SessionDecision:
     """Verdict on a message of a session."""
 
     accepted: bool
-    """Whether it belongs to the session that counts."""
+    """True if it belongs to the session that counts."""
 
     changed: bool = False
-    """Whether it starts a session."""
+    """True if it begins a session."""
 
     other_session: str | None = None
     """The session that is interleaved with the one that counts: there are two RTCs."""
 
 
 class SessionWatch:
-    """A session counts until it falls silent; one that speaks beside it is a second RTC."""
+    """A session counts until it falls silent; another one next to it is a second RTC."""
 
     __slots__ = (
         "_left",
@@ -129,7 +129,7 @@ class LeaderElection:
         self.name = ""
         self.drives = False
         self.contract_held = False
-        """Whether somebody holds the token of the contract; it may be this service."""
+        """True if a service holds the token of the contract; it may be this one."""
 
     def join(self, found: Iterable[str], own_id: str, now_ns: int) -> str:
         """Take a name after all that are there, and return it."""
@@ -195,7 +195,7 @@ class Standby:
 
     @property
     def drives(self) -> bool:
-        """Whether this service drives the RTC: it alone commands and publishes."""
+        """Return True if this service drives the RTC: only then it commands and publishes."""
         return self._election.drives
 
     def join(
@@ -266,7 +266,7 @@ class Standby:
         self._settle()
 
     def _settle(self) -> None:
-        """Drive or stand by as the order says, and report what is new."""
+        """Drive or stand by according to the order, and report changes."""
         with self._lock:
             if self._session is None:
                 return

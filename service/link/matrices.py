@@ -38,7 +38,8 @@ class MeasuredMatrix:
 
 
 LinkEvent = Event | MeasuredMatrix
-"""What the RTC sends besides frames; a matrix is an event for the tracker once it is archived."""
+"""Messages of the RTC other than frames; a matrix becomes an event for the tracker once archived.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +52,7 @@ class Offer:
 
     parts: tuple[bytes, ...]
     offered_s: float
-    """When, on a monotonic clock."""
+    """Time of the offer, on a monotonic clock."""
 
     @classmethod
     def of(cls, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> Self:

@@ -19,19 +19,20 @@ HELD: Final = 1
 VOID: Final = 2
 
 LEAP: Final = "leap"
-"""In a word, why frames are kept until more have come."""
+"""Reason for which frames are held back until more have arrived."""
 
 LEAP_S: Final = 10.0
-"""Of frames: a longer leap of the sequence is believed only when more batches confirm it."""
+"""Longest leap of the sequence that is accepted at once, in seconds of frames; a longer one needs
+more batches to confirm it."""
 
 CONFIRMATIONS: Final = 2
 """Batches that must go on where a leap has led."""
 
 Places = slice | NDArray[np.int64]
-"""Where frames are; a slice, where they lie in a row, is much quicker."""
+"""Indices of frames; a slice, if they are contiguous, is much faster."""
 
 COUNTED: Final = ("received", "lost", "recovered", "duplicate", "late", "nonfinite", "overwritten")
-"""What becomes of frames; :class:`~service.link.statistics.LinkStatistics` says what each means."""
+"""Outcomes of frames; :class:`~service.link.statistics.LinkStatistics` describes each."""
 
 
 class FrameRing:

@@ -23,7 +23,7 @@ from service.link.guard import OPEN, LinkSecurity
 from service.wire.signing import Signatures
 
 HISTORY_S = 0.5
-"""Telemetry asked for when the service comes late: asking for all of an RTC's cache stalled its
+"""Telemetry requested when the service starts late. Requesting all of an RTC's cache stalled its
 sender for seconds."""
 
 RX_BUFFER_BYTES = 16 * 65_535
@@ -35,19 +35,19 @@ MAX_MESSAGE_BYTES = 2 * max(wire.CHUNK_LIMIT, wire.BATCH_LIMIT)
 any size travels in parts. zenoh's own limit is 1 GB for each sender, and that memory is kept."""
 
 TOKENS_TIMEOUT_S = 1.0
-"""For the routers to say which tokens are there; they do within milliseconds."""
+"""Time for the routers to report which tokens exist; they answer within milliseconds."""
 
 RETRY = {"period_init_ms": 200, "period_increase_factor": 1.5, "period_max_ms": 1000}
 """Back-off of a client that lost its router; zenoh's own is 3 s at the first loss."""
 
 ABSENT_PAUSE_S: Final = 0.3
-"""Before a command is repeated: an RTC that is not there makes a query end at once."""
+"""Pause before a command is repeated: a query to an absent RTC ends at once."""
 
 OPTIONAL: Final = (wire.CommandKind.RAMP,)
 """Commands that an RTC need not know."""
 
 MATRIX_TIMEOUT_S: Final = 2.0
-"""For the RTC to answer with a manifest or a part of its matrix."""
+"""Time for the RTC to answer with a manifest or a chunk of its matrix."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +76,7 @@ class Endpoint:
     """Most memory for it."""
 
     recovery_s: float = 0.5
-    """How long frames behind a hole wait for zenoh to recover what is missing."""
+    """Time for which frames after a gap wait until zenoh has recovered the missing ones."""
 
     reorder_s: float = 0.02
     """The same when the RTC's publisher keeps no history, so that only order may differ."""
@@ -88,7 +88,7 @@ class Endpoint:
     """Times a command without an answer is sent, with the same id."""
 
     offer_s: float = 60.0
-    """A published reconstructor can be asked for at least this long; the current one always."""
+    """Time for which a published reconstructor can be requested; the current one always can."""
 
 
 def open_session(endpoint: Endpoint) -> zenoh.Session:

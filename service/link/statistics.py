@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from typing import Final
 
 RECENT_S: Final = 2.0
-"""What came within this time says how the telemetry is now."""
+"""Messages of this last period describe the present telemetry."""
 
 BIN_S: Final = 0.25
-"""What came within this time is summed."""
+"""Interval over which messages are summed."""
 
 USED: Final = "used"
-"""What became of a message, or a frame, that was taken in."""
+"""Outcome of a message or frame that was accepted."""
 
 MALFORMED: Final = "malformed"
-"""What became of one that broke the contract."""
+"""Outcome of one that broke the contract."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,10 +34,11 @@ class Disposition:
     """Frames, or messages, in the last ``RECENT_S``."""
 
     age_s: float
-    """Since the last one."""
+    """Time since the last one, seconds."""
 
     text: str
-    """Of the last one: what was found and what was expected; empty: nothing was wrong."""
+    """Description of the last one: what was found and what was expected; empty if nothing was
+    wrong."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +54,7 @@ class Refusal:
 
     n: int
     age_s: float
-    """Since the last time."""
+    """Time since the last occurrence, seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,10 +118,10 @@ class LinkStatistics:
     """Counts since the service started, of all sessions together."""
 
     rtc_alive: bool
-    """Whether the RTC's liveliness token is there."""
+    """True if the RTC's liveliness token exists."""
 
     session: str | None
-    """The session that counts; None: none has been heard."""
+    """Session that counts; None if there is none."""
 
     basis_id: str | None
     """Expected of every message; None: the first one seen will be adopted."""
@@ -159,10 +160,10 @@ class LinkStatistics:
     statuses_received: int
     acknowledgements_received: int
     acknowledgements_unknown: int
-    """Those for an id this process has never offered."""
+    """Acknowledgements of an id that this process has never offered."""
 
     events_dropped: int
-    """Events that gave way because nobody took them."""
+    """Events dropped because nothing read them."""
 
     callback_errors: int
     """Faults of the service itself while it took a message in; they are logged."""
@@ -171,7 +172,7 @@ class LinkStatistics:
     """Seconds since the last frame arrived, by arrival; None: none has."""
 
     dispositions: tuple[Disposition, ...] = ()
-    """What has become of frames and messages, by kind and outcome, the most frequent first."""
+    """Outcomes of frames and messages by kind, the most frequent first."""
 
     status_age_s: float | None = None
     """Seconds since the last status of this session was taken in; None: none has been."""
@@ -187,7 +188,7 @@ class LinkStatistics:
     messages. It compares two clocks when the RTC runs on another machine."""
 
     refusals: tuple[Refusal, ...] = ()
-    """What was refused on a secured link of late, the last first."""
+    """Refusals on a secured link in the last minute, latest first."""
 
     ending_certificates: tuple[EndingCertificate, ...] = ()
-    """Those that end soon or have ended, the first to end first."""
+    """Certificates that end soon or have ended, the first to end first."""

@@ -26,7 +26,7 @@ MAX_DITHER_AMPLITUDE_M = 50e-9
 MAX_DITHER_DURATION_S = 3600.0
 
 _MOST_ENDED = 4
-"""Ended measurements kept for whoever sends them."""
+"""Finished measurements kept until they are sent."""
 
 
 class Activities:
@@ -39,10 +39,10 @@ class Activities:
         self._measurement: Measurement | None = None
         self._closes_again = False
         self.ended: deque[Measurement] = deque(maxlen=_MOST_ENDED)
-        """Measurements that have ended, for whoever sends them."""
+        """Finished measurements that are not sent yet."""
         self._ramp: GainRamp | None = None
         self.late_dither_frames = 0
-        """After the announced frame, that dithers to come really begin."""
+        """Frames by which future dithers begin after the announced frame."""
 
     @property
     def dither(self) -> DitherStatus | None:
@@ -53,7 +53,7 @@ class Activities:
 
     @property
     def telemetry_dithers(self) -> bool:
-        """Whether added commands count as a dither; strokes in open loop do not."""
+        """Return True if added commands are a dither; strokes in open loop are not."""
         return self._measurement is None or not self._measurement.needs_open_loop
 
     def in_the_loops_way(self) -> str:

@@ -31,10 +31,10 @@ Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 BATCH_FRAMES = 10
-"""Frames the loop processes together unless told otherwise: one message on the wire."""
+"""Frames that the loop processes together by default: one message on the link."""
 
 _MESSAGE_S = 0.05
-"""Of telemetry in a message where frames come fast: the longer, the less a frame costs."""
+"""Duration of telemetry in a message at high frame rates; a longer message costs less per frame."""
 
 _MOST_MESSAGE_FRAMES = 50
 """More are refused by the wire."""
@@ -138,7 +138,7 @@ class PhaseBlock(Block):
     optics: DiffractiveOptics
     detector: PixelDetector
     rng: np.random.Generator
-    """Of the photons; used by the loop's thread alone."""
+    """Random numbers of the photons; used by the loop's thread only."""
 
     @property
     @override
@@ -169,7 +169,7 @@ class Source(TypedDict):
     frame_rate_hz: float
     jump_times_s: tuple[float, ...]
     rng: np.random.Generator
-    """Of the detector's noise."""
+    """Random numbers of the detector's noise."""
 
 
 class Feed(ABC):

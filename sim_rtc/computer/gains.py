@@ -33,7 +33,7 @@ A second of turbulence makes that of tip and tilt differ by a fifth and more by 
 """
 
 _SETTLING_S = 0.2
-"""Between a new gain and the first slopes that are judged."""
+"""Time between a new gain and the first slopes that are evaluated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,7 @@ class GainRamp:
     ) -> None:
         """Take the present gains, one per mode; at most half of the frames settle."""
         self.name = request.id
-        """Of the request."""
+        """Id of the request."""
         self._settled = np.array(gains)
         self._groups = tuple(slice(first, last + 1) for first, last in request.groups)
         self._gains = request.gains
@@ -74,7 +74,7 @@ class GainRamp:
 
     @property
     def done(self) -> bool:
-        """Whether every group has its gain."""
+        """Return True if every group has its gain."""
         return self._group == len(self._groups)
 
     @property

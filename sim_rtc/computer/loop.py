@@ -1,9 +1,9 @@
 """The modal integrator, in blocks of frames.
 
-``c[k+d] = leak c[k+d-1] - gain R s[k]``, the dither added to what is applied and never fed back.
-A linear plant gives ``R s = R s_open + (R D) c``: the first term is one product for many frames,
-the second a small one for each ``d`` of them, whose commands are decided already, and the slopes
-themselves follow at the end. Any other plant is asked for its slopes frame by frame.
+``c[k+d] = leak c[k+d-1] - gain R s[k]``. The dither is added to the applied command and never fed
+back. For a linear plant ``R s = R s_open + (R D) c``: the first term is one product for many
+frames, the second a small one for each ``d`` of them, whose commands are already determined. The
+slopes themselves follow at the end. Any other plant computes its slopes frame by frame.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class LoopBlock:
     """``(n_frames, n_modes)`` on the mirror during each exposure, dither included, clipped."""
 
     dither_m: Array32 | None
-    """``(n_frames, n_modes)`` its dither part: what was asked for, as the mirror follows it."""
+    """``(n_frames, n_modes)`` dither part, as requested and as the mirror follows it."""
 
     n_clipped: int = 0
     """Commands that met a limit of the mirror."""
@@ -128,13 +128,12 @@ class ModalLoop:
         played_m: Array32 | None = None,
         open_modes: Array32 | None = None,
     ) -> LoopBlock:
-        """Run the frames whose slopes, mirror apart, are ``open_slopes`` ``(n_frames, n_slopes)``.
+        """Run the frames with open-loop slopes ``open_slopes`` ``(n_frames, n_slopes)``.
 
         ``dither_m`` and ``played_m`` are ``(n_frames, n_modes)``, added to the integrator's
-        command: the dither is told on the wire, what is played is not.
-        A command beyond the stroke limit is clipped, in the integrator too: a loop that diverges
-        stays finite and recovers.
-        ``open_modes`` are ``open_slopes @ R.T`` where they are known already.
+        command. The dither is reported on the link, the played turbulence is not. A command beyond
+        the stroke limit is clipped, in the integrator too, so that a diverging loop stays finite
+        and recovers. ``open_modes`` are ``open_slopes @ R.T`` if they are known already.
         """
         matrix, modal_response = terms.slopes_per_command, terms.modal_response
         if matrix is None or modal_response is None:

@@ -47,11 +47,11 @@ class Measurement:
     ) -> None:
         self.request = request
         self.session = ""
-        """In which it has ended."""
+        """Session in which it ended."""
         self.failure = ""
         """Why there is no matrix; empty: there may be one."""
         self.needs_open_loop = request.pattern is not Pattern.SINE
-        """Whether the loop must not answer the strokes."""
+        """True if the loop must not respond to the strokes."""
         self.start_seq = 0
         self._strokes = strokes
         self._solver = solver
@@ -146,7 +146,7 @@ class MeasurementRules:
     """Limits and shapes that measurements use."""
 
     n_modes: int
-    """Of the whole basis."""
+    """Number of modes of the basis."""
 
     n_slopes: int
     frame_rate_hz: float

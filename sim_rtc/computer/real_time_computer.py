@@ -50,7 +50,8 @@ _LEAD_BATCHES = 1
 is there before them."""
 
 _SETTLING_FRAMES = 20
-"""Between the opening of the loop and the first stroke: the mirror comes to rest."""
+"""Frames between the opening of the loop and the first stroke, in which the mirror comes to rest.
+"""
 
 
 class RealTimeComputer:
@@ -171,7 +172,7 @@ class RealTimeComputer:
 
     @property
     def has_news(self) -> bool:
-        """Whether a matrix was swapped in or measured and not reported yet."""
+        """Return True if a swap or a measured matrix is not reported yet."""
         return bool(self._swaps or self._activities.ended)
 
     def take_swaps(self) -> list[tuple[str, int]]:

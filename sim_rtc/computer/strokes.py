@@ -1,8 +1,7 @@
-"""The strokes of a measurement, and the matrix from their answers.
+"""The strokes of a measurement, and the matrix computed from the response.
 
-Nothing here knows the plant, and the commands that count are not those that were asked for but
-those in the telemetry: a slow, clipped or otherwise disturbed mirror measures as well as a
-perfect one.
+This module does not know the plant. The commands are those in the telemetry, not those that were
+requested, so a slow, clipped or otherwise disturbed mirror is measured as well as a perfect one.
 """
 
 from __future__ import annotations
@@ -61,7 +60,7 @@ class Tones:
     """``(n_tones,)`` frequency over the frame rate, below 1/2."""
 
     n_modes: int
-    """Of the whole basis."""
+    """Number of modes of the basis."""
 
     n_frames: int
 
@@ -134,8 +133,9 @@ _SILENT = 1e-6
 class Regression:
     """Least squares of slopes on commands: ``D = (sum s c^T) (sum c c^T)^-1``.
 
-    All modes that moved are in the equations, those that were not asked for as well: a mirror that
-    does something else at the same time, like a disturbance it plays, does not bias the columns.
+    All modes that moved are in the equations, including those that were not requested. A mirror
+    that moves otherwise at the same time, like by turbulence that it plays, does not bias the
+    columns.
     """
 
     def __init__(self, modes: tuple[int, ...], *, n_modes: int, n_slopes: int) -> None:

@@ -32,7 +32,8 @@ class LoopSettings:
 
     closed: bool = True
     n_controlled_next: int
-    """What a command has asked for; takes effect with the next matrix of that many rows."""
+    """Number of modes requested by a command; takes effect with the next matrix of that many rows.
+    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,7 +132,7 @@ class Pace:
         """Frames of batches that were finished after the next one was due."""
 
         self.behind_s = 0.0
-        """How late the last batch was, seconds."""
+        """Delay of the last batch, seconds."""
 
     def wait(self, stopped: threading.Event) -> None:
         """Wait until the next batch has been exposed."""

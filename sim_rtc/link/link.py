@@ -32,7 +32,8 @@ from sim_rtc.telescope.detector import Detector
 _log = structlog.get_logger("sim_rtc")
 
 _BACKLOG_S = 1.0
-"""Of telemetry that waits for the publishing thread; beyond it the oldest is dropped, counted."""
+"""Telemetry that may wait for the publishing thread, seconds. Beyond it the oldest is dropped and
+counted."""
 
 
 class Link(Background):

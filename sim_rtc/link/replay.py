@@ -45,12 +45,12 @@ _log = structlog.get_logger("sim_rtc")
 
 REFUSAL: Final = "unsupported: a replay"
 SERVICE_WITHIN_S: Final = 20.0
-"""How long a service is waited for that says what it knows: before, it could fit nothing."""
+"""Time to wait for a service that reports its state: before, it could fit nothing."""
 
 _RETRY_S = 0.2
 _BATCHES_PER_S = 100.0
 _LINGER_S = 0.5
-"""For the last messages to leave."""
+"""Time for the last messages to leave."""
 
 
 class Replay:

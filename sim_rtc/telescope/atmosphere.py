@@ -174,11 +174,12 @@ _TAPS = np.arange(-1, 3)
 
 _ROWS_TOGETHER = 128
 _LENGTH = 1.5
-"""Of a transform, over that of the window: longer ones need more memory, shorter ones more of
-them."""
+"""Length of a transform relative to the window. Longer transforms need more memory, shorter ones
+are more numerous."""
 
 _OUTPUTS_TOGETHER = 1024
-"""Of a matrix, transformed at a time: all of an ELT's would take 16 GB for 5 that are kept."""
+"""Outputs of a matrix transformed together. All of an ELT's would take 16 GB for 5 that are kept.
+"""
 
 _BLOCKS_TOGETHER = 10
 """Blocks answered at a time: the spectra are read from memory once for all of them."""
@@ -265,8 +266,8 @@ class FrozenLayer:
     def phases(self, steps: NDArray[np.intp], weights: Array32, *, apart: bool = False) -> Array32:
         """Return sums of the OPD at steps, ``(n_frames, n_points)``, metres, without their piston.
 
-        ``steps`` and ``weights`` are ``(n_frames, n_steps)``. Frames that lie ``apart`` are read
-        themselves, of others the steps that they lie between: these are fewer.
+        ``steps`` and ``weights`` are ``(n_frames, n_steps)``. Frames that are far ``apart`` are
+        read themselves. For others only the steps around them are read, which are fewer.
         """
         known, place = np.unique(steps, return_inverse=True)
         near = np.zeros((len(steps), len(known)), dtype=np.float32)

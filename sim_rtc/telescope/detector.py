@@ -104,7 +104,7 @@ class Detector:
         self._normal = _normal_values(2**16)
 
     def flux(self, images: Array) -> bytes | None:
-        """Return electrons per frame as a status tells them; None: nobody could read them."""
+        """Return electrons per frame as a status reports them; None if there are none."""
         if self._light is None or isinstance(self._light, CannotTell):
             return None
         counts = self._light.counts(images * self.electrons_per_frame)
@@ -186,7 +186,7 @@ FLAO_PRESETS = (
     Preset(faintest=14.5, frame_rate_hz=500.0, binning=3, n_controlled=66),
     Preset(faintest=16.5, frame_rate_hz=200.0, binning=5, n_controlled=36),
 )
-"""After FLAO's practice: 30, 15, 10 and few subapertures across as the star gets fainter."""
+"""FLAO's practice: 30, 15, 10 and fewer subapertures across as the star gets fainter."""
 
 
 def preset_for(magnitude: float) -> Preset:

@@ -1,8 +1,8 @@
 """A telescope that propagates the whole field for every frame.
 
-Its optical gain is what the residual wavefront makes of it. It shares nothing of the service's
-model but the drawing: another pupil grid, other influence functions, uneven light, actuators out
-of place.
+Its optical gain results from the residual wavefront. It shares only the nominal geometry with the
+service's model: it has another pupil grid, other influence functions, uneven light, and displaced
+actuators.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _HALF = 0.5
 """Share of a map's point from which on it is lit."""
 
 _FEW_MODES = 32
-"""Dithered modes beyond the controlled ones that are worth picking out."""
+"""Largest number of dithered modes beyond the controlled ones that are selected by index."""
 
 
 class DiffractiveSensor(Protocol):
@@ -88,10 +88,11 @@ class DiffractiveOptics(Optics):
     """``(n, n)`` mask of the subapertures that give slopes."""
 
     errors: SlopeErrors
-    """What happens to light and slopes that were right."""
+    """Errors of the light and of the slopes."""
 
     light_at_rest: float
-    """Of a flat wavefront in all images together, dead pixels included, in the sensor's unit."""
+    """Light of a flat wavefront in all images together, dead pixels included, in the sensor's unit.
+    """
 
     slopes_at_rest: Array32
     """``(n_slopes,)`` of a flat wavefront, the reference: subtracted from all others."""

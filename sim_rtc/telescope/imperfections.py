@@ -1,8 +1,8 @@
-"""How the telescope departs from its drawing.
+"""Imperfections of the telescope relative to its nominal geometry.
 
-One record for every plant. A calibration must survive all of it, so each is an option with a
-default. ``realistic`` is a mix of them all, except for errors of the modes' shapes, which rehearse
-a bench whose model is poor, and for pupil images beside the pixel grid.
+There is one record for all plants. A calibration must tolerate all of them, so each is an option
+with a default. ``realistic`` is a mix of all except two: errors of the modes' shapes, which
+simulate a bench with a poor model, and displaced pupil images.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ Array32 = NDArray[np.float32]
 
 _NCPA_ORDER = 4
 _NCPA_FIRST_SHAPE = 3
-"""Piston and the tilts are left out: an offset of the image is nobody's aberration."""
+"""First shape of the non-common path aberration. Piston and tilts are excluded: an offset of the
+image is no aberration."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imperfections:
-    """Departures of the plant from the drawing."""
+    """Imperfections of the plant relative to the nominal geometry."""
 
     unevenness: float = 0.10
     """Largest departure of the illumination from its mean, ratio of the flux."""
@@ -95,7 +96,7 @@ SETS = {
 
 
 _WHOLE_BYTES = 1e9
-"""A larger array is worked through in parts: it would stand in memory five times."""
+"""Size above which an array is processed in parts, because it would be in memory five times."""
 
 _COLUMNS = 1024
 
@@ -118,7 +119,7 @@ class SlopeErrors:
         ``pixels`` is ``(n_pixels, n_valid)``.
         """
         self.recipe = recipe
-        """What the sensor makes of the light."""
+        """Computes signals from the light."""
         n_valid = pixels.shape[1]
         angle = np.deg2rad(imperfections.slope_rotation_deg)
         self._cosine, self._sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))

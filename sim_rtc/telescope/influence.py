@@ -1,7 +1,7 @@
 """Influence functions from a file.
 
-The cube holds one map for each actuator. Between its points the surface is a cubic B-spline;
-beyond its edge, where nobody knows the mirror, it goes on at the height of the edge.
+The cube contains one map per actuator. Between its points the surface is a cubic B-spline. Beyond
+its edge, where the mirror is unknown, it continues at the height of the edge.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class InfluenceCube:
     """The mirror's surface for each actuator, centred in the arrays."""
 
     maps: Array
-    """``(n_actuators, ny, nx)`` OPD per OPD asked of the actuator; a row lies along x."""
+    """``(n_actuators, ny, nx)`` OPD per OPD commanded to the actuator; a row is along x."""
 
     pitch_m: float
     """Distance of neighbouring points in the pupil plane."""

@@ -1,8 +1,8 @@
 """Spots of a Shack-Hartmann for any wavefront, and their centroids.
 
-Nothing of the service's model is in it but the drawing: light between the points of the pupil is
-interpolated straight, on a regular grid under each lenslet, propagated whole, and summed on pixels;
-centroids are those of noisy pixels, their threshold that of each spot in each frame.
+It shares only the nominal geometry with the service's model. The wavefront is interpolated linearly
+between the points of the pupil onto a regular grid under each lenslet, propagated as a whole, and
+summed on pixels. Centroids are those of noisy pixels, with a threshold for each spot in each frame.
 """
 
 from __future__ import annotations

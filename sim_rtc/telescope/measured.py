@@ -50,7 +50,7 @@ BENCH_M = 0.5
 """A pupil below this diameter is a bench's, which no star shines on."""
 
 TELESCOPE_M = 8.0
-"""Diameter of the telescope that a bench stands for unless ``--sky-diameter`` is given."""
+"""Diameter of the telescope that a bench represents unless ``--sky-diameter`` is given."""
 
 _PLAUSIBLE_SIZE = 3.0
 """Ratio of measured to modelled responses, or its inverse, from which on units are in doubt."""
@@ -71,7 +71,7 @@ class MeasuredMatrix:
     """Digest of the file, 64 hexadecimal digits."""
 
     notes: tuple[str, ...]
-    """What was decided about the file, one sentence each."""
+    """Decisions about the file, one sentence each."""
 
 
 def read_measured_matrix(
@@ -214,7 +214,7 @@ class MeasuredPlant(Plant):
 
     @property
     def knows_orientation(self) -> bool:
-        """Whether the instrument file says how the RTC lists its slopes."""
+        """Return True if the instrument file states the RTC's slope order."""
         return self._instrument.slopes.orientation is not None
 
     @property

@@ -121,9 +121,9 @@ class TensionedPlate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DrawnSurface:
-    """The drawing's own influence functions, on actuators that may be switched off.
+    """Nominal influence functions, on actuators that may be switched off.
 
-    A thin plate without one of them bends as the others tell it; a Gaussian is then just missing.
+    Without one of its actuators a thin plate bends as the others determine; a Gaussian is absent.
     """
 
     mirror: Mirror
@@ -222,10 +222,10 @@ class MirrorLimits:
 
 
 class MirrorDrive:
-    """Turns the commanded modes into those on the mirror: limits first, then the lag.
+    """Converts the commanded modes into those on the mirror: limits first, then the lag.
 
-    A first-order response spends part of every exposure on its way: what counts, and what the
-    telemetry tells, is the mean over the exposure.
+    With a first-order response the mirror moves during part of every exposure. The slopes, and the
+    telemetry, contain the mean over the exposure.
     """
 
     def __init__(

@@ -44,7 +44,7 @@ class Optics(ABC):
     """The telescope's effect on a wavefront at one registration."""
 
     alpha: Misregistration
-    """Where the mirror truly lies on the sensor."""
+    """True registration of the mirror on the sensor."""
 
     opd_per_command: Array32
     """``(n_points, n_modes)`` OPD at the plant's pupil points per metre of command, as seen."""
@@ -72,7 +72,7 @@ class Optics(ABC):
 
 
 class Departures(TypedDict, total=False):
-    """Departures of a telescope from the drawing; only the random numbers are needed."""
+    """Imperfections of a telescope; only the random numbers are required."""
 
     rng: Required[np.random.Generator]
     imperfections: Imperfections
@@ -101,10 +101,10 @@ class Plant(ABC):
     """``(n_subapertures, n_subapertures)`` mask of the subapertures that give slopes."""
 
     pixels: NDArray[np.intp]
-    """``(n_pixels, n_valid)`` where their pixels stand in the light."""
+    """``(n_pixels, n_valid)`` indices of their pixels in the light."""
 
     slope_errors: SlopeErrors
-    """What the sensor makes of correct light and slopes."""
+    """Errors of light and slopes."""
 
     sensor_opd_m: Array32
     """``(n_points,)`` static OPD that the sensor sees and the science does not."""
@@ -135,7 +135,7 @@ class Plant(ABC):
         return (alpha.shift_x_subap, alpha.shift_y_subap)
 
     def _on_mirror(self, alpha: Misregistration) -> Array:
-        """Return where each point of the pupil lies on the mirror, ``(n_points, 2)``."""
+        """Return the position of each point of the pupil on the mirror, ``(n_points, 2)``."""
         beside = np.array(self._image_shift(alpha)) - alpha.vector[:2]
         return self._instrument.with_anamorphosis(alpha).on_mirror(self._points + beside)
 

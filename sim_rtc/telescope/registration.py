@@ -30,11 +30,12 @@ _LARGEST_ROTATION_DEG = 0.3
 _LARGEST_MAGNIFICATION = 0.005
 
 _WALK_STEP_S = 20.0
-"""Between two knots of a random walk: about what exact optics take to compute, with a margin."""
+"""Time between two knots of a random walk: about the time that exact optics take to compute, with a
+margin."""
 
 _LONGEST_SEGMENT_S = 20.0
 _LAW_SEGMENT_S = 4.0
-"""Of a law of pointing: a slew takes seconds."""
+"""Duration of a segment of a pointing law: a slew takes seconds."""
 
 _SEGMENTS_PER_PERIOD = 12
 """Straight pieces of a sine: they leave it by 3 % of its amplitude at most."""
@@ -51,7 +52,7 @@ class Change:
     shift_y_subap: float = 0.0
     rotation_deg: float = 0.0
     magnification: float = 0.0
-    """Of the ratio: 0.002 makes the image 0.2 % of its nominal size larger."""
+    """Change of the ratio: 0.002 makes the image 0.2 % of its nominal size larger."""
 
     @classmethod
     def of(cls, boundary: Sequence[float], **more: float) -> Self:
@@ -77,7 +78,7 @@ class Jump(Change):
     """A sudden change of the registration."""
 
     time_s: float
-    """When, seconds of loop time."""
+    """Time of the jump, seconds of loop time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,9 +103,9 @@ class Flexure(Change):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Walk(Change):
-    """A random walk by these standard deviations after a minute; it grows with the root of time.
+    """A random walk with these standard deviations after a minute, growing with the root of time.
 
-    The same seed takes the same one, however it is asked for.
+    The same seed gives the same walk, independently of the times at which it is evaluated.
     """
 
     seed: int = 0
@@ -130,7 +131,7 @@ class Schedule:
     flexure: Flexure = Flexure()
     walk: Walk = Walk()
     jumps: tuple[Jump, ...] = ()
-    """In any order."""
+    """Jumps, in any order."""
 
     law: Callable[[float], Array] | None = None
     """Departure since time 0 by the law of pointing, at a time, numeric units; None: there is no
@@ -141,7 +142,7 @@ class Schedule:
 
     @property
     def drifts(self) -> bool:
-        """Whether the registration changes between the jumps."""
+        """Return True if the registration changes between the jumps."""
         departures = [self.drift.vector, self.flexure.vector, self.walk.vector]
         return self.law is not None or bool(np.any(departures))
 
@@ -227,7 +228,7 @@ class _Segment:
 
 
 class MovingOptics:
-    """The plant's optics at any time of a run, asked for in order."""
+    """The plant's optics at any time of a run; times must be requested in order."""
 
     def __init__(
         self,
@@ -248,10 +249,10 @@ class MovingOptics:
         self._seen_s = 0.0
 
     def move(self, vector: Array, takes_s: float) -> float:
-        """Move the mirror's image by ``(4,)``, numeric units; return when it stands still.
+        """Move the mirror's image by ``(4,)``, numeric units; return the time of arrival.
 
-        In seconds of loop time, so long after what was asked for last. If its optics are late, the
-        old ones stay until they are ready.
+        The time is seconds of loop time, counted from the last request. If the new optics are late,
+        the old ones stay in use until they are computed.
         """
         there_s = self._seen_s + takes_s
         self._demands.put((there_s, vector))

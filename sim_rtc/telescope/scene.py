@@ -44,7 +44,7 @@ class Spiders:
 
     n_arms: int
     width_m: float
-    """Of each shadow, in the pupil plane."""
+    """Width of each shadow in the pupil plane, metres."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,7 +73,7 @@ class Scene:
         return 2 if self.kind is SceneKind.DAYTIME else 1
 
     def light(self, pupil: PupilGrid, subaperture_m: float) -> PupilGrid:
-        """Return the pupil as it is lit: less light where an arm stands in the way."""
+        """Return the pupil with less light where an arm obstructs it."""
         if self.spiders is None:
             return pupil
         return replace(
@@ -83,10 +83,10 @@ class Scene:
 
 
 class PlayedTurbulence:
-    """Turns turbulence over the pupil into modal commands that play it on the mirror.
+    """Converts turbulence over the pupil into modal commands that play it on the mirror.
 
-    The sensor meets the mirror twice, so half of it is played: what the sensor sees has the seeing
-    that was asked for. The commands are those of an aligned mirror, as a file of them would be.
+    The light meets the mirror twice, so half of it is played: the sensor then sees the requested
+    seeing. The commands are those of an aligned mirror, as a file of them would be.
     """
 
     def __init__(self, modes: Array32, weights: Array, *, passes: int) -> None:
@@ -126,10 +126,10 @@ class Elevation:
 
     start_deg: float = 60.0
     rate_deg_per_minute: float = 0.0
-    """Of tracking; the sky turns by 0.25."""
+    """Rate of tracking, degrees per minute; the sky turns by 0.25."""
 
     slews: tuple[tuple[float, float], ...] = ()
-    """When each begins, seconds of loop time, and by how many degrees it goes up."""
+    """Start of each slew, seconds of loop time, and its change of elevation, degrees."""
 
     azimuth_deg: float = 180.0
     azimuth_rate_deg_per_minute: float = 0.0

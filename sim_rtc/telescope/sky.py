@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 _FRAMES_TOGETHER = 100
-"""Frames interpolated at a time: the fewer, the fewer steps they do not lie between."""
+"""Frames interpolated together. The fewer, the fewer steps are read for nothing."""
 
 
 class TurbulentFrames:
@@ -43,7 +43,7 @@ class TurbulentFrames:
 
 
 class Turbulence:
-    """All layers together, in the seeing of the moment; frames are asked for in order."""
+    """All layers together, scaled to the present seeing. Frames must be requested in order."""
 
     def __init__(self, layers: tuple[FrozenLayer, ...], seeing: SeeingSchedule) -> None:
         """Take layers whose strength is that of the seeing at time 0."""
@@ -68,7 +68,7 @@ class Sky:
     turbulence: Turbulence
     vibrations: Vibrations
     played: PlayedTurbulence | None = None
-    """By day: the turbulence is played on the mirror and nothing of it is in the air."""
+    """Turbulence played on the mirror by day, when there is none in the air; None at night."""
 
     def seen(self, time_s: Array) -> tuple[Array32, Array32 | None]:
         """Return the incoming OPD ``(n_frames, n_points)`` and the played commands, metres.
@@ -95,9 +95,9 @@ class _Between:
 
     @classmethod
     def of(cls, layer: FrozenLayer, time_s: Array, strength: Array) -> _Between:
-        """Return where these times lie, the layer having gone as far.
+        """Return the positions of these times in the layer.
 
-        ``strength`` ``(n_frames,)`` is what the phases are multiplied by.
+        ``strength`` ``(n_frames,)`` is the factor of the phases.
         """
         position = time_s * layer.steps_per_second + 1.0
         step = position.astype(np.intp)
@@ -159,7 +159,7 @@ class SeeingSchedule:
 
     @property
     def changes(self) -> bool:
-        """Whether the seeing is not the same all through the run."""
+        """Return True if the seeing changes during the run."""
         return any(arcsec != self.start_arcsec for _, arcsec in self.later)
 
     def arcsec(self, time_s: Array) -> Array:
@@ -209,7 +209,8 @@ class VibrationLine:
     """Wavefront on the sensor, metres RMS over pupil and time."""
 
     damping: float = 0.01
-    """Of the oscillator that noise shakes, over the critical one; 0: a pure sine."""
+    """Damping of the oscillator driven by noise, relative to the critical one; 0 for a pure sine.
+    """
 
 
 DAYTIME_LINES = (
@@ -217,11 +218,11 @@ DAYTIME_LINES = (
     VibrationLine(shape=Shape.TILT, frequency_hz=22.0, rms_m=40e-9),
     VibrationLine(shape=Shape.FOCUS, frequency_hz=47.0, rms_m=15e-9),
 )
-"""What shakes a telescope by day when nothing else is asked for: swinging arms, pumps, fans."""
+"""Default vibrations of a telescope by day: swinging arms, pumps, fans."""
 
 
 class Vibrations:
-    """Wavefronts of the lines at the frames of a run, asked for in order."""
+    """Wavefronts of the lines at the frames of a run. Frames must be requested in order."""
 
     def __init__(
         self,

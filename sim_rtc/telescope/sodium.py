@@ -1,8 +1,8 @@
-"""The star of a laser as each lenslet sees it: light of many heights, each on its own place.
+"""The laser guide star as each lenslet sees it: light from many heights, each at its own position.
 
 The service's model blurs spots by a Gaussian along a straight line. Here the layer is cut into
-sheets; each sends its light from its own height, so that what comes from below lies further out
-than what comes from above, and the pixels collect it sheet by sheet.
+sheets. Each sends light from its own height, so that light from below arrives further out than
+light from above, and the pixels collect it sheet by sheet.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from service.model.sensors.shack_hartmann.table import LaserStar
 Array = NDArray[Any]
 
 ANGLE_STEP = 0.5
-"""Between samples of the light of a point, λ/d: it has no finer structure."""
+"""Sampling of a point's light, λ/d; it has no finer structure."""
 
 _SHEETS = 9
 """The layer is cut into, over four times its standard deviation."""

@@ -1,8 +1,9 @@
 """Acknowledge, mute and remember alarms.
 
-As LSST's ts_watcher has it: an alarm is acknowledged, not dismissed; one that goes unseen stays
-as stale; the worst it has been is kept; an acknowledgement holds until the alarm is over, or worse
-than whoever gave it has seen. What an operator's order ends has been seen.
+The rules are those of LSST's ts_watcher. An alarm is acknowledged, not dismissed. One that ends
+without being acknowledged stays as stale. Its highest severity is kept. An acknowledgement holds
+until the alarm ends or becomes more severe than it was then. An alarm that an operator's order ends
+counts as acknowledged.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from service.tracking.state import Orders, TrackerState
 from service.tracking.step_context import StepContext
 
 RAISED_AGAIN_S = 60.0
-"""After a restart of the service, for an alarm that lasts to be raised again."""
+"""Time after a restart of the service for an active alarm to be raised again."""
 
 
 def update_records(context: StepContext, *, timely: bool, ordered: bool) -> None:
@@ -58,7 +59,7 @@ def record_of(state: TrackerState, alarm: Alarm) -> AlarmRecord:
 
 
 def stale_records(state: TrackerState) -> tuple[AlarmRecord, ...]:
-    """Return the alarms that have gone and nobody has seen."""
+    """Return the alarms that ended without being acknowledged."""
     return tuple(
         record for record in state.alarms.records if record.alarm_state is AlarmState.STALE
     )

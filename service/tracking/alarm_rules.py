@@ -1,10 +1,10 @@
 """Alarms that follow from the state: one table of rules.
 
-Where an alarm comes from stands in alarms.toml (``origin``). One that can be read from the state
-has its rule here; one that an event tells is raised where that event is taken in, and ends by its
-condition in ``LASTING`` where the state tells that its cause has gone. Operators' own rules forbid
-some acts while a condition on what the observatory reports, or on a field of the state, holds ("do
-not publish while the shutter is shut").
+The source of each alarm is in alarms.toml (``origin``). An alarm that can be derived from the state
+has its rule here. One that an event reports is raised where that event is processed, and ends by
+its condition in ``LASTING`` if the state shows that its cause is gone. Operators' own rules forbid
+actions while a condition on a reported value, or on a field of the state, holds ("do not publish
+while the shutter is closed").
 """
 
 from __future__ import annotations
@@ -187,11 +187,10 @@ RULES: Final[dict[str, Callable[[StepContext], str | None]]] = {
     # the last: windows may be refused for what another alarm says
     alarms.WINDOWS_REFUSED: window_processing.refused_text,
 }
-"""The text of each alarm by state, policy and time; None: there is nothing to see.
+"""Text of each alarm as a function of state, policy and time; None if the alarm is not active.
 
-A name that nothing else in the code speaks of stands here alone, without a constant in alarms.py.
-One that must not waver about a limit asks whether it lasts already: alarms are part of the state.
-"""
+An alarm name that no other code uses is written here only, without a constant in alarms.py. A rule
+with hysteresis asks whether its alarm is already active: alarms are part of the state."""
 
 
 def _no_rtc(context: StepContext) -> bool:
@@ -214,7 +213,7 @@ def _in_doubt(context: StepContext) -> bool:
 
 
 def _is_not_as_asked(context: StepContext) -> bool:
-    """Return whether the last dither is still the one that was not played as asked for."""
+    """Return True if the last dither is still the one that differed from its request."""
     return context.dither_policy.amiss_id is not None and not _is_given_up(context)
 
 
@@ -252,7 +251,8 @@ LASTING: Final[dict[str, Callable[[StepContext], bool]]] = {
     alarms.DISAGREES: _in_doubt,
     alarms.NOT_RESTORED: lambda context: context.registration is None,
 }
-"""Whether an alarm that an event has raised still lasts; all others are ended by an event, too."""
+"""Conditions under which an alarm raised by an event stays active; all others are ended by an
+event."""
 
 _COMPARE: Final[dict[str, Callable[[Any, Any], bool]]] = {
     "==": operator.eq,
@@ -277,7 +277,7 @@ FIELDS: Final[dict[str, Callable[[TrackerState], cmd.Value | None]]] = {
         None if state.alpha.pointing is None else state.alpha.pointing.azimuth_deg
     ),
 }
-"""What a condition may ask of the state; nothing where it is not known."""
+"""Fields of the state that a condition may use; None where the value is unknown."""
 
 
 def _rule_text(context: StepContext, rule: Rule) -> str | None:
@@ -327,7 +327,7 @@ def set_value(context: StepContext, command: cmd.SetValue) -> None:
 
 
 def _values_asked_for(context: StepContext) -> dict[str, tuple[str, str]]:
-    """Return the kind of each value that is asked for, and who asks, by its name."""
+    """Return the kind of each value that is used, and who uses it, by its name."""
     law = context.policy.law
     names = () if law is None else law.names - frozenset(ANGLES)
     of_law = dict.fromkeys(names, ("a number", "the law of pointing needs it"))

@@ -67,7 +67,7 @@ NOT_FOUND = "registration-not-found"
 
 
 RULE_PREFIX = "rule."
-"""Of the alarms of operators' own rules: no other alarm has a dot in its name."""
+"""Prefix of the alarms of operators' own rules: no other alarm has a dot in its name."""
 
 
 class Interlock(StrEnum):
@@ -83,7 +83,7 @@ class Interlock(StrEnum):
     """Rely on the loop: after some seconds the service acquires by itself."""
 
     SEND_NEW = auto()
-    """Send a matrix that was never in use, whoever approves of it; acquisitions need that."""
+    """Send a matrix that was never in use, whoever approves it; acquisitions need this."""
 
     SEND_KNOWN = auto()
     """Send one that has been in use before: a rollback."""
@@ -136,7 +136,7 @@ class Prerequisite:
     """What is missing, and what to do."""
 
     blocks: bool = False
-    """Whether the service can do nothing of its work meanwhile."""
+    """True if the service can do none of its work meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,7 +145,7 @@ class AlarmDefinition:
 
     severity: Severity
     means: str
-    """What is the matter."""
+    """Meaning of the alarm."""
 
     do: str
     """What an operator does about it."""
@@ -153,10 +153,10 @@ class AlarmDefinition:
     blocks: frozenset[Interlock] = frozenset()
 
     because: str = ""
-    """What was the matter while it lasted, for the reason of a refusal; empty: refuses nothing."""
+    """Cause in the past tense, for the reason of a refusal; empty if it refuses nothing."""
 
     responsible: Responsible | None = None
-    """Who can end it, where that is waited for though it may forbid nothing."""
+    """Who can end it, if the service waits for it although it may forbid nothing."""
 
     origin: str = "settings"
     """File of the service that finds it; ``settings``: a rule of the operators' own."""
@@ -172,14 +172,14 @@ class Alarm:
     """What was found, and what to do."""
 
     seen_ns_utc: int = 0
-    """When it was last found to be so."""
+    """Time of the last detection."""
 
     t_ns_utc: int = 0
-    """When it was raised, by the RTC's clock: telemetry from before does not tell that it is over.
-    0: not known."""
+    """Time at which it was raised, by the RTC's clock; earlier telemetry does not end it. 0 if
+    unknown."""
 
     own: AlarmDefinition | None = None
-    """Where it is otherwise than the table has it; None: as there."""
+    """Definition that replaces the one of the table; None to use the table's."""
 
     @property
     def definition(self) -> AlarmDefinition:
@@ -209,7 +209,7 @@ class OperatorNote:
     reason: str
     t_ns_utc: int
     until_ns_utc: int | None = None
-    """When it counts no more, of one that mutes; None: never."""
+    """End of a mute; None if it has none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,10 +222,10 @@ class AlarmRecord:
 
     since_ns_utc: int = 0
     text: str = ""
-    """As it was when it was raised; of a stale one, at its end."""
+    """Text when it was raised; for a stale alarm, at its end."""
 
     over_ns_utc: int | None = None
-    """When it went; None: it lasts, or was not raised."""
+    """Time of its end; None if it is active or was not raised."""
 
     acknowledged: OperatorNote | None = None
     muted: OperatorNote | None = None
@@ -246,7 +246,7 @@ def _read() -> dict[str, AlarmDefinition]:
 
 
 ALARMS: Final = _read()
-"""By name, as alarms.toml tells."""
+"""Definitions by name, from alarms.toml."""
 
 
 def blocking_alarm(alarms: Iterable[Alarm], interlock: Interlock) -> Alarm | None:

@@ -1,7 +1,7 @@
 """Start, follow and stop the dither.
 
-A dither that runs already, from before a restart of the service or in a replayed night, is as good
-as a new one, and the RTC plays no second one beside it.
+A dither that is already running, from before a restart of the service or in a replayed night, is
+used like a new one. The RTC plays only one at a time.
 """
 
 from __future__ import annotations
@@ -38,32 +38,33 @@ from service.tracking.step_context import StepContext
 from service.wire import DitherRequest, DitherStatus, DitherStop, Reply, Status
 
 MEASURED = 1.1
-"""What a second of frames may hold more than is allowed, before it is too strong."""
+"""Tolerated ratio of the amplitude measured in a second of frames to the permitted one."""
 
 CALM_S = 60.0
-"""After one that was too strong, or that nothing answered, before another is tried."""
+"""Pause after a dither that was too strong or had no response, before another is tried."""
 
 TELL_EVERY_S = 2.0
 
 SILENT_S = 1.0
-"""Of frames without the dither, before it is missed."""
+"""Duration of frames without the dither after which it is reported missing."""
 
 PATIENCE_S = 1.5
-"""Of frames without it, before another is asked for; doubled each time, for one that is late."""
+"""Duration of frames without the dither after which another is requested; doubled each time, for an
+RTC that begins late."""
 
 LONGEST_PATIENCE_S = 60.0
 
 SOON_OVER_S = 2.0
-"""A dither that ends by itself so soon is not worth a command."""
+"""A dither that ends by itself within this time is not stopped by a command."""
 
 STOPPED_WITHIN_S = 5.0
 """An RTC still playing a dither so long after it was asked to stop does not stop dithers."""
 
 MEMORY_S = 600.0
-"""Of the mean cost that is shown."""
+"""Averaging time of the cost that is displayed."""
 
 _ON_ITS_WAY_S = 2.0
-"""For a status made before the dither began, where it does not tell its own frame."""
+"""Time for a status made before the dither began to arrive, if it has no frame number."""
 
 
 def choose_dither(context: StepContext, rtc: Status) -> None:
@@ -139,7 +140,7 @@ def stop_by_operator(context: StepContext, _: cmd.StopDither) -> None:
 
 
 def stop_unfollowed(context: StepContext) -> None:
-    """Ask the RTC to end a dither that nobody wants, which is not followed."""
+    """Ask the RTC to end a dither that is not needed and not followed."""
     _set_policy(context, replace(context.dither_policy, stop_asked_ns_utc=context.now_ns))
     request_stop(context)
 
@@ -199,10 +200,10 @@ def follow_status(context: StepContext, rtc: Status) -> None:
 
 
 def on_silence(context: StepContext, event: ev.DitherSilent) -> None:
-    """Miss a dither that the frames do not show, whatever the status says; then ask anew.
+    """Report a dither that the frames do not contain; then request it again.
 
-    The frames have the last word. One the RTC only applies late comes in time for a longer
-    patience.
+    The frames decide, whatever the status says. An RTC that begins late is given a longer time
+    after each attempt.
     """
     dither = context.dither
     if dither is None or dither.id != event.id:
@@ -239,9 +240,9 @@ def learn_precision(context: StepContext, estimate: LockInEstimate | RandomEstim
 
 
 def why_too_strong(context: StepContext, event: ev.DitherMeasured) -> str | None:
-    """Name a dither that the frames show to be otherwise than asked; return why it must go.
+    """Report a dither that differs from the request; return the reason why it must be stopped.
 
-    What the commands hold is what the mirror does, whatever the RTC's status says.
+    The commands in the frames are what the mirror does, whatever the RTC's status says.
     """
     rtc, dither = context.rtc, context.dither
     if not event.text:
@@ -438,9 +439,9 @@ def _set_phase(context: StepContext, phase: DitherPhase, reason: str) -> None:
 
 
 def _take_over_played(context: StepContext, asked: Dither, shown: DitherStatus) -> None:
-    """Take the RTC's word on what it plays, where that is not what was asked for.
+    """Follow the dither that the RTC reports if it differs from the request.
 
-    It is true, and not for that tolerated: one too strong is stopped.
+    The report is used, but the dither is not tolerated for that: one that is too strong is stopped.
     """
     running = replace(asked, request=shown.request, start_seq=shown.start_seq)
     if running == asked:

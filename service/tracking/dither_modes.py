@@ -18,10 +18,10 @@ LINE_FRACTIONS = (0.211, 0.239, 0.283, 0.331)
 """Dither lines over the frame rate: wind biases those below 0.2; no sum of two meets a third."""
 
 LINE_RANGE = (0.2, 0.35)
-"""Of the frame rate, where lines may go to keep clear of vibrations."""
+"""Range of the lines as a fraction of the frame rate, for avoiding vibrations."""
 
 _OPTICAL_GAINS = (0.25, 0.5, 0.75, 1.0)
-"""How much of its gain a loop on sky may have: nobody knows which when a dither is planned."""
+"""Optical gains that a loop on sky may have; unknown when a dither is planned."""
 
 PROVING_RANGE = (0.15, 0.45)
 """The same of the many lines that show how modes answer: what wind does to a slow one is little of
@@ -59,11 +59,11 @@ def controlled(modes: tuple[int, ...], rtc: Status) -> tuple[int, ...]:
 
 
 def expected_amplification(rtc: Status, policy: Policy, chosen: tuple[int, ...] = ()) -> float:
-    """Return how much more than was asked for a dither puts on the mirror; 1: on free modes.
+    """Return the ratio of a dither's amplitude on the mirror to the request; 1 for free modes.
 
-    The loop sees a dither of its own modes and answers it: at 0.2 to 0.35 of the frame rate with
-    a delay of two frames it adds to it. Of all lines together, on whatever sky. Without ``chosen``
-    modes, which many lines show, it is of the four that follow α.
+    The loop responds to a dither of its own modes. At 0.2 to 0.35 of the frame rate with a delay of
+    two frames it amplifies the dither. The ratio is for all lines together, in any seeing. Without
+    ``chosen`` modes it is for the four that follow α.
     """
     dithered = chosen or _without_choice(rtc, policy) or ()
     modes = controlled(dithered, rtc)

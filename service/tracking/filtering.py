@@ -72,10 +72,12 @@ GAIN_RANGE = (0.1, 3.0)
 mirror is seen twice."""
 
 GAIN_GROUPS = 16
-"""A random dither on more modes than this is believed on the gains of neighbours together."""
+"""Largest number of modes of a random dither with individual gains; beyond it neighbours share one.
+"""
 
 MISFIT_WINDOWS = 10
-"""So many tell the model error together: the misfit of a faint star's window is mostly chance."""
+"""Number of windows that determine the model error together: the misfit of one window of a faint
+star is mostly noise."""
 
 
 def update_gains(
@@ -85,10 +87,10 @@ def update_gains(
     sigma: Array | None,
     t_ns: int,
 ) -> tuple[ModeGain, ...]:
-    """Return the gains after a window that held these modes, in the order of the modes.
+    """Return the gains after a window with these modes, in mode order.
 
-    ``gains`` and ``sigma`` ``(n_lines,)`` are modulus and 1 σ from the window's own data; None:
-    nothing but the scatter from window to window tells how precise they are.
+    ``gains`` and ``sigma`` ``(n_lines,)`` are modulus and 1 σ from the window's own data; None if
+    only the scatter from window to window determines their accuracy.
     """
     table = {gain.mode: gain for gain in before}
     own = np.zeros(len(gains)) if sigma is None else sigma
@@ -101,9 +103,9 @@ def update_gains(
 def _update_gain(
     gain: ModeGain | None, mode: int, measured: float, noise: float, t_ns: int
 ) -> ModeGain:
-    """Return one gain as a scalar random walk; its windows' scatter is learnt as it goes.
+    """Return one gain as a scalar random walk; the scatter of its windows is learnt.
 
-    A window's own σ knows the noise beside the lines, not that the gain itself swings.
+    A window's own σ describes the noise next to the lines, not the fluctuation of the gain itself.
     """
     if gain is None:
         scatter = max(noise, FIRST_SCATTER * measured)
@@ -136,7 +138,7 @@ class WindowEstimate(PointedEstimate):
     """Mean modulus of the gains of the dithered modes."""
 
     optical_gains: tuple[ModeGain, ...]
-    """Those of every mode known, this window's included."""
+    """Optical gains of all known modes, this window's included."""
 
     floor: Array
     """``(4,)`` 1 σ of the model error, numeric units: it does not average down."""
@@ -177,10 +179,10 @@ class FilterUpdate:
     """Normalised innovation squared (4 degrees of freedom)."""
 
     scatter: float = 1.0
-    """How much more windows scatter than they say, in variance, this one included."""
+    """Ratio of the scatter of windows to their prediction, in variance, this one included."""
 
     jumped: bool = False
-    """Whether it is of a new place, to which what was known before says nothing."""
+    """True if it is of a new registration, about which earlier estimates contain no information."""
 
 
 def predict(context: StepContext, registration: Registration, t_ns_utc: int) -> Joint:
@@ -223,7 +225,7 @@ def joint_of(registration: Registration) -> Joint:
 
 
 def alpha_of(joint: Joint, before: Misregistration) -> Misregistration:
-    """Return α as the filter has it; an anamorphosis that it does not follow is that of before."""
+    """Return α as filtered; an anamorphosis that the filter does not track is left as it was."""
     alpha = before.moved_to(joint.alpha)
     return alpha.stretched(joint.stretches) if joint.n_alpha > 4 else alpha
 
@@ -255,7 +257,7 @@ def add_history(context: StepContext, entry: HistoryEntry) -> None:
 
 
 def n_agreeing(context: StepContext, registration: Registration, prior: Joint) -> int:
-    """Return how many windows agree after this one: it stands alone where α had gone stale."""
+    """Return the number of agreeing windows after this one; 1 if α had become stale."""
     policy = context.policy
     sigma = np.sqrt(np.diag(prior.alpha_covariance) + registration.floor**2)
     limit = validity.beyond_model_error(policy.stale_sigma, registration.floor, policy)
@@ -307,10 +309,10 @@ def accept(
 
 
 def _still_doubted(state: TrackerState, update: FilterUpdate, when: TelemetrySpan) -> bool:
-    """Return whether α stays in doubt: the window is of before.
+    """Return True if α stays in doubt because the window began before the doubt.
 
-    One that confirms where the mirror has jumped to need not have begun since, for it tells no
-    other place than the window before it.
+    A window that confirms the registration after a jump need not have begun since: it agrees with
+    the window before it.
     """
     registration = state.alpha.registration
     if registration is None or not registration.doubt:
@@ -367,11 +369,12 @@ def model_error_of(
     policy: Policy,
     own: tuple[float, ...] | None = None,
 ) -> Array:
-    """Return the model error by all windows so far: what is set, and what they do not explain.
+    """Return the model error by all windows so far.
 
-    A window weaker than what is asked of α cannot tell: the chance in its misfit, times its own σ,
-    would be more than any model error. ``own`` ``(4,)`` is what the RTC's own matrix tells of it:
-    no window makes it smaller.
+    It is the larger of the setting and of what windows leave unexplained. A window with less
+    accuracy than is required of α cannot determine it: the noise in its misfit, times its own σ,
+    would exceed any model error. ``own`` ``(4,)`` is the model error from the RTC's own matrix, a
+    lower bound that no window reduces.
     """
     before = policy.floor if registration is None else registration.floor
     if own is not None:
@@ -394,7 +397,7 @@ def gains_of(estimate: DitheredEstimate) -> tuple[tuple[int, ...], Array, Any]:
 
 
 def strong_gains(estimate: DitheredEstimate) -> Array:
-    """Return moduli of the gains that α is told by."""
+    """Return the moduli of the gains that determine α."""
     modes, gains, _ = gains_of(estimate)
     return gains if len(modes) != len(estimate.strong) else gains[estimate.strong]
 

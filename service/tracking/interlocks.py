@@ -30,11 +30,11 @@ from service.tracking.update_policy import is_left_behind
 
 @dataclass(frozen=True, slots=True)
 class Permission:
-    """Whether an order may be given now."""
+    """Permission to give an order at present."""
 
     allowed: bool
     reason: str = ""
-    """What runs or is missing, and what to do first; empty: the order is allowed."""
+    """What is running or missing, and what to do first; empty if the order is permitted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +47,7 @@ class Moment:
     """The service's clock, nanoseconds."""
 
     running: tuple[RunningOperation, ...]
-    """What runs, what is exclusive first."""
+    """Running operations, the exclusive one first."""
 
 
 Order = type[Command] | Command
@@ -70,7 +70,7 @@ _ALWAYS = _SEEN | frozenset[type](
         cmd.StopDither,
     }
 )
-"""What ends something, and what disturbs nothing."""
+"""Orders that end something, or disturb nothing."""
 
 ALLOWS: Final[dict[OperationKind, frozenset[type]]] = {
     OperationKind.STOPPED: _ALWAYS,

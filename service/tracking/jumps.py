@@ -25,7 +25,8 @@ from service.tracking.registration import (
 from service.tracking.validity import CLOCK_SET_BACK_S, flexure
 
 STEADY_S = 60.0
-"""The drift of a minute is what the settings tell: over less it is that share of it."""
+"""Time scale of the drift: the settings give the drift of a minute; a shorter time has a
+proportional share."""
 
 VARYING = 0.3
 """Share of the model error that differs from window to window: bright stars scatter by 0.1 % of a
@@ -36,25 +37,25 @@ USUAL_MODEL_ERROR = 1.5
 have in common: beyond it windows of other modes differ by it. Benches find 2 to 12 times."""
 
 ROTATION_LIMIT = 15.1
-"""What the normalised square of one parameter exceeds once in 10 000, ``JUMP_THRESHOLD`` that of
-four. 0.1 deg are 4 to 6 σ of a window at magnitude 10 and do not stand out among four parameters; a
-tenth of a subaperture is 20 σ and needs no such help."""
+"""Value that the normalised square of one parameter exceeds once in 10 000, as ``JUMP_THRESHOLD``
+does for four parameters. A rotation of 0.1 deg is 4 to 6 σ of a window at magnitude 10 and is not
+significant among four parameters; a tenth of a subaperture is 20 σ and needs no separate test."""
 
 ROTATION_LIMIT_OF_TWO = 12.2
 """The same for two windows together, once in 2000: they must also agree."""
 
 PASSIVE_LIMIT = 26.9
-"""What a passive look's innovation exceeds once in 10 000: it is the larger of two, and the scatter
-that both are normalised by is itself learnt, from some forty looks (four times F of 4 and 156, at
-half of that)."""
+"""Value that the innovation of a passive estimate exceeds once in 10 000. It is the larger of two,
+and the scatter that normalises both is learnt from some forty estimates (four times F of 4 and 156,
+at half of that probability)."""
 
 SCATTERED = 1.5
-"""How much more windows scatter than they say, in variance, that is no chance: twenty windows that
-tell it scatter by 0.1 themselves, and one that was put aside adds a quarter."""
+"""Ratio of the scatter of windows to their prediction, in variance, that is significant: an
+estimate of it from twenty windows scatters by 0.1, and one rejected window adds a quarter."""
 
 ALIKE_S = 10.0
-"""For so long what turbulence does to windows may be alike: where a loop slips out of the pyramid's
-range they lie to one side of α for four to six seconds, then to the other."""
+"""Time for which the effect of turbulence on windows may be correlated: when a loop slips out of
+the pyramid's range, windows are on one side of α for four to six seconds, then on the other."""
 
 FARTHEST = 12.0
 """Times what two windows together hardly exceed by chance that is beyond all turbulence: it has led
@@ -92,16 +93,16 @@ class Innovation:
 
     @property
     def is_outlier(self) -> bool:
-        """Whether it is no chance."""
+        """Return True if the deviation is significant."""
         return self.excess > 1.0
 
 
 NEAR = Innovation(mahalanobis_squared=0.0, rotation=0.0)
-"""Where nothing can be told."""
+"""Result when there is nothing to compare with."""
 
 
 def innovation_of(difference: Array, covariance: Array) -> Innovation:
-    """Return how far ``(4,)`` lies from zero by its covariance ``(4, 4)``."""
+    """Return the distance of ``(4,)`` from zero, normalised by its covariance ``(4, 4)``."""
     weight = np.linalg.inv(covariance)
     score = weight @ difference
     return Innovation(
@@ -113,10 +114,11 @@ def innovation_of(difference: Array, covariance: Array) -> Innovation:
 def window_innovation(
     registration: Registration, window: PointedEstimate, policy: Policy
 ) -> Innovation:
-    """Return how far a window lies from α.
+    """Return the distance of a window from α.
 
-    It is seen from after the last window and from before it: a jump in the middle of a window
-    moves that one by half of it and the next by the other half, and neither half need be far out.
+    It is computed from the estimate after the last window and from the estimate before it. A jump
+    in the middle of a window moves that window by half of it and the next by the other half, and
+    neither half need be significant.
     """
     return _farthest(
         (as_previous(registration), registration.previous_estimate),
@@ -129,11 +131,12 @@ def window_innovation(
 def pair_innovation(
     registration: Registration, window: PointedEstimate, policy: Policy
 ) -> Innovation:
-    """Return how far a window and the one before it lie from what was known, both together.
+    """Return the distance of a window and the previous one from the earlier estimate, together.
 
-    Half the noise of one: a jump that no window alone can tell. The one before was held, or has
-    entered. They are seen from before both and from before the window before, in whose middle the
-    jump may have been; and they are no jump unless each lies nearer to the other than to α.
+    Two windows have half the noise of one, so that a jump too small for one window is detected. The
+    previous window was held or accepted. The estimates before both and before the window before are
+    used, because the jump may have occurred in the middle of that one. It is no jump unless each is
+    nearer to the other than to α.
     """
     first, before = previous_window(registration), registration.previous_estimate
     if first is None:
@@ -157,10 +160,11 @@ def pair_innovation(
 def _jump_inside_first(
     registration: Registration, first: TimedEstimate, window: PointedEstimate, policy: Policy
 ) -> Innovation:
-    """Return how far a window lies if the mirror jumped there inside the one before it.
+    """Return the distance of a window if the mirror jumped to it during the previous window.
 
-    That one lies between α and the new place: it is far out by itself, on the same way, and not
-    beyond. Only a jump beyond all turbulence is told like this.
+    That window is then between α and the new registration: significant by itself, in the same
+    direction, and not beyond. Only a jump larger than any effect of turbulence is detected in this
+    way.
     """
     if registration.suspected_jump is None:
         return NEAR
@@ -272,7 +276,7 @@ def _together(first: TimedEstimate, window: PointedEstimate) -> PointedEstimate:
 def _squared_distance(
     place: Misregistration, first: TimedEstimate, window: PointedEstimate, policy: Policy
 ) -> float:
-    """Return how far a window lies from a place by the noise of two: squared, 4 is expected."""
+    """Return the squared distance of a window by the noise of two windows; expected 4."""
     difference = window.alpha.vector - place.vector
     return float(difference @ np.linalg.solve(_noise_of_two(first, window, policy), difference))
 

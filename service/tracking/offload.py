@@ -1,9 +1,9 @@
-"""Ask a lens or stage to move the mirror's image back.
+"""Request that a lens or stage moves the mirror's image back.
 
-Some telescopes move a lens or a stage instead of the matrix, or beside it. A demand is a change of
-α. The reply tells that it was made, and when the image stands still: α is expected at the new
-place from then on, with the doubt of a device that does as it is told to some tenths, and windows
-must confirm it before anything else is asked for or made.
+Some telescopes move a lens or a stage instead of the matrix, or in addition. A demand is a change
+of α. The reply confirms it and states when the image is at rest. From then on α is expected at the
+new registration, with the uncertainty of a device that follows to some tenths, and windows must
+confirm it before anything else is requested or computed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from service.tracking.validity import MOVING, end_of, make_valid, void_until
 from service.wire import OffloadRequest, Reply, Status
 
 DISOBEDIENCE = 0.3
-"""1 σ of what a device does over what it was asked for, less 1."""
+"""1 σ of the relative error with which a device follows a demand."""
 
 CROSS_TALK = 0.05
 """1 σ of what a step of one axis does to another, in limits of a step."""
@@ -36,10 +36,10 @@ BEHIND = 1.5
 """Steps by which α may leave the registration that the matrix in use was made for."""
 
 LONGEST_S = 50.0
-"""Of a move by its reply; telemetry of a minute ago is another clock's."""
+"""Longest move that a reply may announce; telemetry of a minute ago may be of another clock."""
 
 STATUS_S = 1.0
-"""So old the last status may be, by whose clock the end of a move is told."""
+"""Largest age of the last status, whose clock gives the end of a move."""
 
 Array = NDArray[np.float64]
 
@@ -75,10 +75,10 @@ def request_offload(context: StepContext) -> None:
 def wanted_step(
     state: TrackerState, registration: Registration, start: Array, limits: Offloading
 ) -> Array:
-    """Return by how much α is to change ``(4,)``, numeric units; 0: by nothing.
+    """Return the change of α to request ``(4,)``, numeric units; 0 for none.
 
-    A step never takes α further from what the matrix in use was made for than the loop may stand:
-    the rest waits for the next matrix.
+    A step never takes α further from the registration of the matrix in use than the loop tolerates.
+    The rest is left to the next matrix.
     """
     alpha = registration.alpha.vector
     off = _apart(alpha, start)
@@ -170,7 +170,7 @@ def _may_move(
 
 
 def _rest_ns(last: Offload, policy: Policy) -> int:
-    """Return how long nothing is asked for after a demand; one without an answer is awaited."""
+    """Return the pause after a demand; a demand without a reply is awaited."""
     if last.state is OffloadState.MOVED:
         return round(policy.minimum_interval_s * SECOND_NS)
     return round(policy.refused_interval_s * SECOND_NS)

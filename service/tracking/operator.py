@@ -44,7 +44,7 @@ def set_mode(context: StepContext, command: cmd.SetMode) -> None:
 
 
 def approve(context: StepContext, command: cmd.Approve) -> None:
-    """Send a proposal, judged anew where need be."""
+    """Send a proposal, after a new verdict if necessary."""
     reconstructors.send_once_judged(context, command.id)
 
 
@@ -174,7 +174,7 @@ CLOSE_AGAIN_EVERY_S = 5.0
 """An RTC that still measures refuses; it is asked again."""
 
 CLOSE_AGAIN_FOR_S = 3600.0
-"""Then somebody wants the loop open."""
+"""Time for which the loop is closed again automatically; later, somebody wants it open."""
 
 
 def set_loop(context: StepContext, command: cmd.SetLoop) -> None:
@@ -274,16 +274,16 @@ def close_again(context: StepContext) -> None:
 def _gains_of(
     command: cmd.Gains, context: StepContext, rtc: Status, n_modes: int
 ) -> tuple[float, ...] | None:
-    """Return a gain for each mode of the basis as they are asked for; None: they stay."""
+    """Return a gain for each mode of the basis as requested; None if they are unchanged."""
     if command.effective_gain is not None:
         return _compensated(context, rtc, command.effective_gain, n_modes)
     return None if command.gains is None else _gains(rtc, command.gains, n_modes)
 
 
 def _gains(rtc: Status, groups: tuple[GainGroup, ...], n_modes: int) -> tuple[float, ...]:
-    """Return a gain for each mode of the basis: those in force, but for the groups.
+    """Return a gain for each mode of the basis: those in use, except for the groups.
 
-    The status of an open loop does not tell the gains it will close with.
+    The status of an open loop does not contain the gains with which it will close.
     """
     ranges = _ranges(groups, n_modes)
     named = sum(last - first + 1 for first, last in ranges)

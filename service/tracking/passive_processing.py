@@ -123,7 +123,7 @@ def _why_passive_unusable(state: TrackerState, event: ev.PassiveFitted) -> str |
 
 
 def _why_known_already(state: TrackerState, event: ev.PassiveFitted) -> str | None:
-    """Return which later telemetry tells more than an estimate that was long under way, or None."""
+    """Return the later telemetry that supersedes a delayed estimate, in words, or None."""
     registration = state.alpha.registration
     if registration is None or not registration.window_began_ns_utc:
         return None
@@ -213,10 +213,11 @@ def _ask_for_window(
     prior: Joint,
     far: float,
 ) -> None:
-    """Forget the bias and want a dithered window: the wind has changed or the mirror has moved.
+    """Reset the bias and request a dithered window: the wind has changed or the mirror has moved.
 
-    α stays valid, and nothing is made or sent until a window taken since has decided. It is an
-    alarm where none can, or none has when a second passive estimate disagrees.
+    α stays valid, but nothing is computed or sent until a window taken since has decided. An alarm
+    is raised if no window is possible, or if there was none when a second passive estimate
+    disagrees.
     """
     text = (
         "ordinary telemetry disagrees: the wind has changed or the mirror has moved, and a "

@@ -34,25 +34,25 @@ from service.tracking.validity import (
 Array = NDArray[np.float64]
 
 SPACING_NS = SECOND_NS // 2
-"""Between two places of the way that are kept: straight lines join them."""
+"""Spacing of the recorded points of the path; between them it is interpolated linearly."""
 
 WAY_KEPT = 240
 
 MAX_STEP = np.array([0.5, 0.5, np.deg2rad(3.0), 0.02])
-"""By which a law may move at once, and each second besides, numeric units: telescopes turn by a few
-degrees a second at most. Further is a leap of what is told."""
+"""Largest step of a law at once, and per second in addition, numeric units. Telescopes turn by a
+few degrees a second at most; a larger step is an error of the reported values."""
 
 FREE_STEP = np.array([0.03, 0.03, np.deg2rad(0.3), 0.002])
-"""By which a law of the pointing alone may move while the telescope stands, numeric units."""
+"""Largest step of a law of the pointing alone while the telescope is at rest, numeric units."""
 
 STEP_PER_DEG = np.array([0.2, 0.2, np.deg2rad(3.0), 0.004])
-"""By which it may move besides for each degree that the telescope turns: near the zenith a field
-turns faster than the azimuth, and a pupil that turns about a point ten subapertures away moves by
-0.17. A law that is not periodic moves by its whole turn at north, where the telescope has hardly
-turned."""
+"""Additional step per degree that the telescope turns, numeric units. Near the zenith a field turns
+faster than the azimuth, and a pupil that turns about a point ten subapertures away moves by 0.17. A
+law that is not periodic moves by its whole range at north, where the telescope has hardly turned.
+"""
 
 BELIEVED_S = 3.0
-"""A leap of the pointing that has stood for so long is believed."""
+"""A leap of the pointing that has lasted for this time is accepted."""
 
 LEAD_S = 6.0
 """A matrix is made for the law so far ahead: it is judged and sent in half of that."""
@@ -64,7 +64,7 @@ RATE_OVER_NS = 2 * SECOND_NS
 """Over so long the rate of the law is taken."""
 
 SMEARED = np.array([0.1, 0.1, np.deg2rad(0.3), 0.004])
-"""A window in which the law moved further tells no one place."""
+"""A window in which the law moved further belongs to no single registration."""
 
 
 def follow_law(context: StepContext) -> None:
@@ -150,7 +150,7 @@ def _rate(state: TrackerState) -> Array:
 
 
 def why_smeared(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> str | None:
-    """Return why a window tells no one place: the law moved within it; None: it does."""
+    """Return why a window belongs to no single registration (the law moved within it), or None."""
     first, last = law_at(state, began_ns_utc), law_at(state, ended_ns_utc)
     if first is None or last is None:
         return None
@@ -161,7 +161,7 @@ def why_smeared(state: TrackerState, began_ns_utc: int, ended_ns_utc: int) -> st
 
 
 def law_at(state: TrackerState, t_ns_utc: int) -> Misregistration | None:
-    """Return where the law had the mirror at a time of the RTC's clock; None: nobody knows."""
+    """Return the registration by the law at a time of the RTC's clock; None if unknown."""
     way = state.alpha.law.way
     later = next((k for k, (t_ns, _) in enumerate(way) if t_ns >= t_ns_utc), len(way))
     if not way:
@@ -193,7 +193,7 @@ def _of_now(
 
 
 def _nominal(context: StepContext, law: PointingLaw) -> Misregistration | str:
-    """Return where the law has the mirror now, or why nobody knows and what to do."""
+    """Return the present registration by the law, or why it is unknown and what to do."""
     reported = _reported(context)
     missing = sorted(law.names - reported.keys())
     if missing and context.alpha.pointing is None:
@@ -250,7 +250,7 @@ def _outruns_pointing(context: StepContext, law: PointingLaw, now: Misregistrati
 
 
 def _hold(context: StepContext, before: Misregistration, now: Misregistration) -> None:
-    """Let α stand where what is told leaps; one that lasts is believed, and α doubted."""
+    """Hold α where the reported values leap. A leap that lasts is accepted, and α is in doubt."""
     law, leap = context.alpha.law, context.alpha.law.leap
     if leap is None or _is_far(leap.to, now, (context.now_ns - leap.worked_out_ns_utc) / SECOND_NS):
         leap = LawLeap(to=now, since_ns_utc=context.now_ns, worked_out_ns_utc=context.now_ns)

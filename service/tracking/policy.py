@@ -25,21 +25,21 @@ class Rule:
 
     name: str
     about: str
-    """Name of a value that is told, or of a field of the state."""
+    """Name of a reported value, or of a field of the state."""
 
     how: str
     """``==``, ``!=``, ``<``, ``<=``, ``>`` or ``>=``."""
 
     than: bool | float | str
     blocks: frozenset[Interlock]
-    """What is forbidden while it holds."""
+    """Actions that are forbidden while the condition holds."""
 
     severity: Severity
     text: str
-    """What is the matter, and what to do."""
+    """Description of the condition, and what to do."""
 
     holds_unknown: bool
-    """Whether it holds while nobody tells the value."""
+    """True if the condition holds while the value is unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,24 +47,25 @@ class Offloading:
     """Limits of offloads; all arrays ``(4,)``, numeric units."""
 
     share: float
-    """Of the way back to the nominal registration that is asked for at once."""
+    """Fraction of the distance to the nominal registration that is requested at once."""
 
     near: NDArray[np.float64]
-    """Nearer than this nothing is asked for."""
+    """Distance below which nothing is requested."""
 
     max_step: NDArray[np.float64]
-    """Of one demand."""
+    """Largest change in one demand."""
 
     travel: NDArray[np.float64]
-    """Of all demands together, either way; 0: what cannot be moved."""
+    """Range of all demands together, in either direction; 0 for a parameter that cannot be moved.
+    """
 
     settle_s: float
-    """From the reply until the image stands still, where the reply does not say."""
+    """Time from the reply until the image is at rest, if the reply does not state it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorModePolicy:
-    """What the tracker must know of a mode of the sensor."""
+    """Properties of a sensor mode that the tracker needs."""
 
     subaperture_m: float
     """Width of a subaperture in the pupil plane: α's shifts are in it."""
@@ -91,25 +92,26 @@ class Policy:
     """``(4,)`` 1 σ of α to be kept by dithering, numeric units, model error not included."""
 
     dither_avoid_hz: tuple[float, ...]
-    """Vibrations the dither keeps clear of, besides those that are heard."""
+    """Vibrations that the dither avoids, in addition to those that are detected."""
 
     longest_pause_s: float
-    """Between two windows, for so long a jump may go unseen; 0: no pause at all."""
+    """Longest pause between two windows, during which a jump may stay undetected; 0 for none."""
 
     dither_modes: tuple[int, ...] | None
-    """None: the four that tell most among those the loop will not control."""
+    """Modes to dither; None for the four with most information among those the loop will not
+    control."""
 
     mode_information: NDArray[np.float64] | None = None
-    """``(n_modes, 4, 4)`` what each mode tells of α; None: the model is not known yet."""
+    """``(n_modes, 4, 4)`` information on α in each mode; None if the model is not computed yet."""
 
     start: Misregistration = field(default_factory=Misregistration)
-    """Where the fit of a window begins while α is not known: the mirror's nominal rotation."""
+    """Start of a window's fit while α is unknown: the mirror's nominal rotation."""
 
     dither_frequencies_hz: tuple[float, ...] | None
     """None: spread over 0.2-0.35 of the frame rate."""
 
     dither_duration_s: float = 120.0
-    """Of a request of an operator's who does not say."""
+    """Duration of a dither that an operator requests without stating one."""
 
     window_s: float
     """Shortest window of dithered telemetry."""
@@ -124,7 +126,7 @@ class Policy:
     """``(4,)`` 1 σ model error, numeric units."""
 
     bias_memory_s: float
-    """After so long what was learnt of the passive estimate's bias is worth 1/e."""
+    """Time after which the information learnt on the passive estimate's bias has decayed to 1/e."""
 
     flexure_per_degree: NDArray[np.float64]
     """``(4,)`` 1 σ of what a degree of elevation does to α, numeric units."""
@@ -140,7 +142,7 @@ class Policy:
     the model error adds."""
 
     acquires: bool
-    """Whether the service finds α from nothing by itself, in mode auto."""
+    """True if the service acquires an unknown α on its own initiative, in mode auto."""
 
     acquisition_amplitude_m: float
     """RMS of each mode dithered while the loop is open for it, metres OPD."""
@@ -164,8 +166,8 @@ class Policy:
     """Operators' own."""
 
     opens_lost_loop: bool | None
-    """Whether a loop that is lost with a matrix just applied is asked to open where going back does
-    not help; None: where the mode was auto when it was applied."""
+    """True if a loop that is lost with a new matrix is opened when a rollback does not help; None
+    to do so if the mode was auto when the matrix was applied."""
 
     offloading: Offloading | None
     """None: α is corrected by the matrix alone."""
@@ -174,7 +176,7 @@ class Policy:
     """Modes that the sensor may change to, by their ``config_id``; empty: it has one alone."""
 
     law: PointingLaw | None = None
-    """Where the mirror lies at any pointing; None: at the same place."""
+    """Registration as a function of the pointing; None if it is constant."""
 
     refused_interval_s: float = 30.0
     """The same after one was refused, rejected or not acknowledged."""

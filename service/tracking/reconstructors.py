@@ -25,7 +25,7 @@ from service.wire import Acknowledgement, AckState, Status
 RECONSTRUCTORS_KEPT = 200
 
 RETURNS_KEPT = 100
-"""Newest of those that have been in use before: what an operator may want to go back to."""
+"""Number of previously used reconstructors that are kept for a rollback, the newest."""
 
 UNSENT_KEPT = 50
 """Newest of those that were never sent: enough to see what is being refused, and why."""
@@ -112,7 +112,7 @@ def forget_session(context: StepContext) -> None:
 
 
 def discard_proposals(context: StepContext, why: str) -> None:
-    """Discard what waits for an operator: it is worth nothing any more."""
+    """Discard proposals that wait for an operator because they are out of date."""
     for record in context.matrices.reconstructors:
         if record.state is MatrixState.PROPOSED:
             change_state(context, record.id, MatrixState.DISCARDED, why)
@@ -149,8 +149,8 @@ def request_verdict(context: StepContext, matrix_id: str) -> None:
 def on_matrix(context: StepContext, made: ev.MatrixMade) -> None:
     """Keep a new reconstructor; send it if it passed the gate and needs no approval.
 
-    What an operator wants is sent whatever else is known; what nobody asked for only to a closed
-    loop that behaves, and if α may be believed.
+    One that an operator ordered is sent in any case; others are sent only to a closed loop without
+    alarms, and if α is valid.
     """
     record, wanted = made.record, made.wanted
     overtaken = not wanted and _jumped_since(context.state, record)
@@ -213,7 +213,7 @@ def send_once_judged(context: StepContext, matrix_id: str, *, wanted: bool = Tru
 
 
 def on_proposal_judged(context: StepContext, event: ev.ProposalJudged) -> None:
-    """Send a reconstructor that has passed the gate anew; what has changed meanwhile ends it."""
+    """Send a reconstructor that has passed the gate again, unless something changed."""
     record, rtc = context.state.reconstructor(event.id), context.rtc
     if record is None or record.state is not MatrixState.PROPOSED:
         return
@@ -336,10 +336,10 @@ def _acknowledged(
 
 
 def on_fetched(context: StepContext, fetched: ev.MatrixFetched) -> None:
-    """Keep the matrix the RTC uses, which the service did not make, or find its own again.
+    """Keep the matrix that the RTC uses and the service did not make, or recognise one of its own.
 
-    Ids are not enough: an RTC that starts anew may list its slopes otherwise, and hold the matrix
-    of an id that is known as it needs it then.
+    Ids are not sufficient: a restarted RTC may order its slopes differently, and use a different
+    matrix under a known id.
     """
     note_not_fetched(context, "")
     record = fetched.record
@@ -416,7 +416,7 @@ def _sendable(
 def _distrust(
     context: StepContext, record: ReconstructorRecord, state: MatrixState, sha256: str | None
 ) -> None:
-    """Believe that the RTC holds other numbers under an id than are known: nothing goes out."""
+    """Conclude that the RTC's matrix differs from the one known by its id: nothing is sent."""
     before = "sent were" if record.parent is not None else "it was, when it was read before,"
     text = (
         f"the RTC has {state} other numbers as {record.id}: sha256 {sha256}, {before} "
@@ -444,7 +444,7 @@ def _trust(context: StepContext, matrix_id: str) -> None:
 
 
 def _jumped_since(state: TrackerState, record: ReconstructorRecord) -> bool:
-    """Return whether a jump has been named since it was asked for, beyond the gate's verdict."""
+    """Return True if a jump was found since its request: the verdict is out of date."""
     registration, began_ns = state.alpha.registration, state.matrices.making_since_ns_utc
     if registration is None or registration.jumped_ns_utc is None or began_ns is None:
         return False
@@ -478,10 +478,10 @@ def _is_old(state: TrackerState, record: ReconstructorRecord, event: Acknowledge
 
 
 def prune(shelf: list[ReconstructorRecord], in_use: str | None) -> tuple[ReconstructorRecord, ...]:
-    """Return as many as are kept, oldest first.
+    """Return the records that are kept, oldest first.
 
-    First to go is what was never sent, however new what is worth going back to: a flood of
-    proposals that nobody wants must not wash away the way back.
+    Matrices that were never sent are dropped first, however new they are: many unused proposals
+    must not displace the matrices for a rollback.
     """
     excess = len(shelf) - RECONSTRUCTORS_KEPT
     if excess <= 0:

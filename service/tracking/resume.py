@@ -112,10 +112,10 @@ def obey_orders(context: StepContext, orders: Orders) -> None:
 
 
 def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRecord, ...]:
-    """Return what a restarted service takes over from its archive.
+    """Return the records that a restarted service takes over from its archive.
 
-    What was under way has failed; a proposal's verdict is of another day. What the RTC brought can
-    be gone back to, and is read back anew, for nobody can say it is the same as last time.
+    Operations that were under way have failed, and the verdict of a proposal is out of date. A
+    matrix that the RTC brought can be restored, and is read again, because it may have changed.
     """
     taken_over = [
         replace(record, state=_RESTARTED[record.state], reason="the service restarted")
@@ -127,7 +127,7 @@ def restored(records: tuple[ReconstructorRecord, ...]) -> tuple[ReconstructorRec
 
 
 def saved_of(state: TrackerState, now_ns: int) -> Saved | None:
-    """Return what is worth keeping of a state; None: nothing is known yet, nor ordered."""
+    """Return the part of a state that is saved; None if nothing is known yet, nor ordered."""
     registration, acquisition, orders = (
         state.alpha.registration,
         acquisition_to_save(state),
@@ -167,11 +167,11 @@ def with_orders(left: Saved, state: TrackerState) -> Saved | None:
 
 
 def resumed(state: TrackerState, saved: Saved, policy: Policy, now_ns: int) -> TrackerState:
-    """Return the state with α taken over, σ grown by the time away, and no window to confirm it.
+    """Return the state with α restored, σ increased by the time away, and no confirming window.
 
-    It is a start for the fit and something to judge the matrix in use with; until windows of this
-    run agree with it nothing is made from it. An acquisition that was under way comes with it, and
-    what an operator has ordered stands, whatever becomes of α.
+    α is the start of fits and the reference for the verdict on the matrix in use; nothing is made
+    from it until windows of this run agree. An acquisition that was under way is restored with it,
+    and operators' orders hold, whatever becomes of α.
     """
     context = StepContext(state, policy, now_ns)
     if saved.orders is not None and saved.system == state.system:

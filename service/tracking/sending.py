@@ -13,16 +13,16 @@ _OF_A_SWAP = (
     *(alarms.DIVERGING, alarms.EDGE_SLIP, alarms.OFF_LOOP, alarms.WRONG_LOOP, alarms.WRONG_UNIT),
     *(alarms.WRONG_MATRIX, alarms.WRONG_ANSWER),
 )
-"""What telemetry complains of when another matrix than the right one multiplies its slopes."""
+"""Alarms that telemetry raises when a wrong matrix multiplies its slopes."""
 
 
 def why_unsendable(
     state: TrackerState, record: ReconstructorRecord, swapped_ns_utc: int | None = None
 ) -> str | None:
-    """Return why a reconstructor may not be published now, whoever asks, or None.
+    """Return why a reconstructor may not be published now, by anybody, or None.
 
-    ``swapped_ns_utc``: it was in use until then. What telemetry has complained of since is what the
-    swap has done, and no reason against going back.
+    ``swapped_ns_utc`` is the time until which it was in use. Alarms since then are consequences of
+    the swap and no reason against a rollback.
     """
     if state.loop.rtc is None:
         return NO_RTC

@@ -44,7 +44,7 @@ LOG_LENGTH = 500
 FAILURES_KEPT = 20
 
 BURST_NS = 60 * SECOND_NS
-"""A line that comes again within this is counted, not told."""
+"""A line that repeats within this time is counted, not logged."""
 
 REPEATING = frozenset(
     {
@@ -83,7 +83,7 @@ class StepContext:
 
     def __init__(self, state: TrackerState, policy: Policy, now_ns: int, cause: str = "") -> None:
         self.before = state
-        """As nobody had seen the event yet."""
+        """State before the event."""
 
         self.state = state
         self.policy = policy
@@ -172,7 +172,7 @@ class StepContext:
 
     @property
     def dither(self) -> Dither | None:
-        """The dither that was asked for or runs; None: none."""
+        """Return the dither that is requested or running, or None."""
         return self.state.dithers.dither
 
     @property
@@ -182,12 +182,12 @@ class StepContext:
 
     @property
     def nominal(self) -> Misregistration:
-        """Where the mirror should be: by the law of pointing, or as the instrument file has it."""
+        """Return the registration by the pointing law, or that of the instrument file."""
         return self.state.alpha.law.nominal or self.policy.start
 
     @property
     def start_of_fits(self) -> Misregistration:
-        """Where fits begin while α is unknown."""
+        """Return the starting point of fits while α is unknown."""
         return (
             self.state.alpha.law.nominal or self.state.alpha.own_matrix_alpha or self.policy.start
         )
@@ -208,9 +208,9 @@ class StepContext:
 
     @contextmanager
     def because_of(self, cause: str) -> Iterator[None]:
-        """Let what is done within go back to what a record was asked for by; empty: to the event.
+        """Attribute everything within the block to a cause; if empty, to that of the event.
 
-        An acknowledgement, a status or a tick does not know what it is about.
+        An acknowledgement, a status or a tick does not contain its cause.
         """
         own, self.cause = self.cause, cause or self.cause
         yield
@@ -327,7 +327,7 @@ def _ranges(text: str) -> tuple[tuple[str, str], ...]:
 def _widened(
     before: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]
 ) -> tuple[tuple[str, str], ...]:
-    """Return the ranges of both; of a line of another make the first ones stand."""
+    """Return the ranges of both lines; for a line of another form the first ranges are kept."""
     if len(before) != len(new):
         return before
     pairs = zip(before, new, strict=True)
@@ -355,9 +355,9 @@ def _burst_text(entry: LogEntry) -> str:
 
 
 def log_bursts(context: StepContext) -> None:
-    """Add a line for each burst that is over: when it was, how often, and from what to what.
+    """Log each burst that has ended: time, count, and range of its numbers.
 
-    It has the time of the burst's end, and not of when it is told.
+    The line has the time of the burst's end, not that of logging.
     """
     for entry in context.state.log:
         if entry.times > 1 and context.now_ns - entry.t_ns_utc >= BURST_NS:

@@ -1,4 +1,4 @@
-"""Ask for what the service wants next: a verdict, a new matrix, a dither."""
+"""Decide what the service requests next: a verdict, a new matrix, a dither."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from service.tracking.update_policy import (
 from service.wire import Status
 
 ASK_FIRST_S = 3.0
-"""For the RTC's matrix to come before it is asked for again."""
+"""Time for the RTC's matrix to arrive before it is requested again."""
 
 ASK_AGAIN_S = 10.0
-"""Between two questions for a matrix that was not to be had, or has no name."""
+"""Interval between two requests for a matrix that was not available or has no name."""
 
 JUDGE_INTERVAL_S = 60.0
-"""Between two looks at the margin of the matrix in use while the last one holds: it takes 2 s of a
-core with 500 modes, and only its star and its optical gains may be others."""
+"""Interval between two verdicts on the matrix in use while the last one holds. A verdict takes 2 s
+of a core with 500 modes, and only the star and the optical gains may have changed."""
 
 JUDGE_REFUSED_S = 15.0
 """The same where the margin is short, or no answer came: a smaller σ may let it pass."""
@@ -240,10 +240,10 @@ def _explain_unproven(context: StepContext, rtc: Status, n_safe: int) -> str:
 
 
 def _is_busy(context: StepContext) -> bool:
-    """Return whether a reconstructor is on its way, or one awaits an operator.
+    """Return True if a reconstructor is on its way, or one awaits an operator.
 
-    In auto nobody is going to decide on a proposal left from another mode or an absent RTC, but
-    where there would be no way back.
+    In auto nobody decides on a proposal left from another mode or an absent RTC, unless there is no
+    matrix to return to.
     """
     state = context.state
     awaited = state.operator.mode is not Mode.AUTO or why_no_return(state) is not None

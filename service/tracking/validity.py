@@ -1,9 +1,10 @@
-"""How old and how valid α is, and which telemetry is void, for what, and why.
+"""Age and validity of α, and the intervals of telemetry that are void.
 
-A window is fitted seconds after it was taken, by a busy worker later still, when what spoilt it is
-over. So what spoils telemetry leaves an interval behind, by the RTC's clock: what began before its
-end is void for its purpose, whenever it is worked out. When the trouble itself began is known later
-than it was, and only to a detector's patience: an interval has no begin.
+A window is fitted seconds after it was taken, later if the worker is busy, when the cause that
+spoilt it may be over. Whatever spoils telemetry therefore leaves an interval, by the RTC's clock:
+telemetry that began before its end is void for the interval's purpose, whenever it is processed. An
+interval has no beginning, because the beginning of a disturbance is known only as accurately as its
+detector is fast.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from service.wire import Pointing
 
 _POINTINGS_KEPT = 120
 _TURNED_DEG = 0.05
-"""By how much the telescope turns before another line of its way is kept."""
+"""Rotation of the telescope after which another point of its path is recorded."""
 
 AGEING_SHARE = 0.5
 """Share of the stale limit from which on α is ageing."""
@@ -73,7 +74,7 @@ Array = NDArray[np.float64]
 
 
 def note_pointing(context: StepContext, pointing: Pointing | None) -> None:
-    """Note where the telescope looks, and remember its way; None: nobody tells."""
+    """Record the pointing of the telescope and its path; None if it is not reported."""
     if pointing is None:
         return
     way, t_ns = context.alpha.pointings, 0 if context.rtc is None else context.rtc.t_ns
@@ -175,7 +176,7 @@ def in_subapertures(registration: Registration, scale: Array, config_id: str) ->
 
 
 def require_new_windows(context: StepContext) -> None:
-    """Have windows confirm what is known anew."""
+    """Require new windows to confirm the estimate."""
     if context.registration is not None:
         store_registration(context, replace(context.registration, n_windows=0))
 
@@ -186,7 +187,7 @@ def restore_registration(context: StepContext, registration: Registration) -> No
 
 
 def age_registration(context: StepContext) -> None:
-    """Let σ grow to the present, and say what α is then worth."""
+    """Increase σ to the present time and update the validity of α."""
     registration = context.registration
     if registration is not None:
         registration = _without_old_suspicion(registration, context.now_ns)
@@ -204,7 +205,7 @@ def age_registration(context: StepContext) -> None:
 
 
 def request_window(context: StepContext, reason: str) -> None:
-    """Want a dithered window; a wish that stands keeps its beginning."""
+    """Request a dithered window; a request that is pending keeps its start."""
     if context.alpha.dither_due_since_ns_utc is None:
         due = replace(
             context.state,
@@ -283,10 +284,10 @@ def _why_invalid(state: TrackerState, registration: Registration, policy: Policy
 
 
 def beyond_model_error(limit: Array, floor: Array, policy: Policy) -> Array:
-    """Return a limit on σ ``(4,)``, larger by the model error that windows have found.
+    """Return a limit on σ ``(4,)``, increased by the model error that windows have found.
 
-    No further window reduces that error. Whether a loop is safe with it is for the stability gate,
-    which looks at all of α ± 3σ.
+    No further window reduces that error. Whether a loop is safe with it is decided by the stability
+    gate, which examines α ± 3σ.
     """
     found = np.maximum(floor**2 - policy.floor**2, 0.0)
     return np.asarray(np.sqrt(limit**2 + found))
@@ -308,7 +309,7 @@ def _without_old_suspicion(registration: Registration, now_ns: int) -> Registrat
 
 
 def stale_text(context: StepContext) -> str | None:
-    """Return why α is worth too little for a closed loop, in the words of its validity, or None."""
+    """Return why α is not accurate enough for a closed loop, as its validity states it, or None."""
     registration, rtc = context.registration, context.rtc
     if registration is None or rtc is None or not rtc.in_loop or registration.n_windows == 0:
         return None
@@ -356,12 +357,12 @@ class TelemetrySpan:
 
 
 def telemetry_span(began_ns_utc: int, ended_ns_utc: int) -> TelemetrySpan:
-    """Return the stretch that ended then; 0: nobody says when it began, it is taken for short."""
+    """Return the interval that ended then; a start of 0 means unknown and short."""
     return TelemetrySpan(began_ns_utc=began_ns_utc or ended_ns_utc, ended_ns_utc=ended_ns_utc)
 
 
 def precedes(state: TrackerState, span: TelemetrySpan, since_ns_utc: int) -> bool:
-    """Return whether telemetry began before a time, and so cannot tell of what is since then."""
+    """Return True if telemetry began before a time, so that it contains earlier states."""
     rtc = state.loop.rtc
     if rtc is not None and since_ns_utc - rtc.t_ns > CLOCK_SET_BACK_S * SECOND_NS:
         return False

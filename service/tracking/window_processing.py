@@ -1,9 +1,10 @@
-"""Take a window or a passive estimate into the registration, or refuse it.
+"""Accept a window or a passive estimate into the registration, or reject it.
 
-One window far out may be a jump or a mistake. It is held, nothing is made from α meanwhile, and
-the next window decides: one that agrees with it makes it a jump, one that agrees with all before
-makes it an outlier. A jump that one window alone cannot tell from noise is told by two together.
-Where windows scatter by more than they say, they must agree for longer than turbulence is alike.
+One window far from α may be a jump or an error. It is held, nothing is computed from α meanwhile,
+and the next window decides: if it agrees with the held one, it is a jump; if it agrees with all
+earlier ones, the held one is an outlier. A jump that one window cannot distinguish from noise is
+detected by two together. If windows scatter by more than they predict, they must agree for longer
+than turbulence is correlated.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ IN_A_ROW = 3
 
 
 NONE_FOR_S = 60.0
-"""Of a running dither without a window that could be used. A simulated RTC may be ten times slower
-than its timestamps: a window then takes 20 s."""
+"""Duration of a dither without an accepted window. A simulated RTC may be ten times slower than its
+timestamps; a window then takes 20 s."""
 
 
 AS_EXPECTED = (RefusalKind.CUT_SHORT, RefusalKind.VOID)
@@ -176,9 +177,9 @@ def _suspect_jump(
     far: Innovation,
     first: TimedEstimate | None = None,
 ) -> None:
-    """Put a window that is far out aside, and doubt α until another one has come.
+    """Hold a window that is far from α, and mark α as in doubt until another one has arrived.
 
-    ``first``: the one before, which tells the same place; together they are so ``far``.
+    ``first`` is the previous window if it agrees; ``far`` is the distance of both together.
     """
     innovation = far.mahalanobis_squared
     text = (
@@ -257,7 +258,7 @@ def _distance_text(window: TimedEstimate, registration: Registration) -> str:
 
 
 def reset_run(context: StepContext) -> None:
-    """Begin to count anew where no window is expected any more."""
+    """Restart the count of consecutive windows when none is expected any more."""
     if context.windows.run < 0 and _is_excused(context):
         context.windows = replace(context.windows, run=0)
 

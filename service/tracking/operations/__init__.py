@@ -1,7 +1,7 @@
-"""Operations that have the loop or the mirror to themselves, one module each.
+"""Operations with exclusive use of the loop or mirror, one module each.
 
-Acquisition, the RTC's measurement, a noisy measurement, probation: each is a record of the state
-and the functions that take it further with an event. What is heard is taken in by the table of
-``service.tracker`` first, so that an operation decides on the state after it. Which orders go
-beside one is in ``tracking.interlocks``.
+Acquisition, the RTC's measurement, a noisy measurement, probation. Each is a record of the state
+and the functions that advance it by an event. The table of ``service.tracker`` processes an event
+first, so that an operation sees the state after it. Orders that are permitted during an operation
+are in ``tracking.interlocks``.
 """

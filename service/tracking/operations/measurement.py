@@ -31,15 +31,16 @@ N_TONES = 40
 """Modes of a sine measurement that names none."""
 
 TONE_BAND = (0.05, 0.45)
-"""Of the frame rate: above the loop's bandwidth and below half the rate."""
+"""Range of the tones as a fraction of the frame rate: above the loop's bandwidth and below half the
+rate."""
 
 TONES_LAST_S = 10.0
 
 OVERDUE_S = 15.0
-"""For the matrix to come once the loop is closed again."""
+"""Time for the matrix to arrive after the loop is closed again."""
 
 LONGEST_S = 3600.0
-"""Of any measurement."""
+"""Longest measurement."""
 
 MEASURING = "an interaction matrix is being measured: these frames are no ordinary telemetry"
 
@@ -164,7 +165,7 @@ def _update(context: StepContext, record: MeasurementRecord) -> None:
 
 
 def fail_measurement(context: StepContext, record: MeasurementRecord | None, text: str) -> None:
-    """Note why there is no matrix, unless nobody waits for it any more."""
+    """Record why there is no matrix, unless the measurement was already ended."""
     before = None if record is None else context.state.measurement(record.id)
     if record is not None and (before is None or before.state is not MeasureState.GIVEN_UP):
         store_measurement(context, replace(record, state=MeasureState.FAILED, reason=text))

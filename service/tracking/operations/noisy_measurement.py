@@ -21,13 +21,13 @@ from service.tracking.step_context import StepContext, present
 from service.wire import DitherRequest, Reply, Status
 
 DURATION_S = 30.0
-"""Where none is asked for: an element is worth its noise by then, on a bright star."""
+"""Default duration: on a bright star an element is then as large as its noise."""
 
 FREE_WITHIN_S = 15.0
-"""For the service's own dither to be gone from the RTC's status."""
+"""Time for the service's own dither to vanish from the RTC's status."""
 
 MADE_WITHIN_S = 120.0
-"""For the fit and the archive."""
+"""Time for the fit and the archive."""
 
 
 def measure_noisy(context: StepContext, command: cmd.MeasureNoisy) -> None:

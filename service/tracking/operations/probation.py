@@ -1,7 +1,7 @@
-"""Probation: go back from a matrix that makes the loop worse.
+"""Probation: return from a matrix that makes the loop worse.
 
-The one before held the loop until a moment ago, whoever made it: it is sent again whatever the gate
-or telemetry have said since. If the loop is lost all the same it is asked to open.
+The previous matrix held the loop until a moment ago, whoever made it. It is sent again whatever the
+gate or the telemetry have reported since. If the loop is lost nevertheless, it is opened.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from service.tracking.state import Mode, TrackerState
 from service.tracking.step_context import StepContext
 
 LATE_S = 1.0
-"""For telemetry to come with the verdict: nothing else waits longer."""
+"""Time for the telemetry with the verdict to arrive; everything else waits no longer."""
 
 REPUBLISHED_WITHIN_S = 10.0
-"""For the matrix before to be ready to be sent again."""
+"""Time for the previous matrix to be ready for sending."""
 
 LAW_WITHIN_S = 5.0
-"""After a swap commands that do not obey the loop are the swap's doing: it takes up to 2 s of
-telemetry to show that they do not."""
+"""Commands that contradict the loop law within this time are a consequence of the swap; it takes up
+to 2 s of telemetry to detect it."""
 
 CALM_WITHIN_S = 1.0
-"""For a loop that diverges to be calm again with the matrix before: the watch on it remembers half
-a second."""
+"""Time for a diverging loop to become calm with the previous matrix; its detector remembers half a
+second."""
 
 OPEN_AGAIN_S = 2.0
-"""Between two requests to open the loop."""
+"""Interval between two requests to open the loop."""
 
 _TELLING = (WRONG_LOOP, OFF_LOOP, DIVERGING)
 """Alarms that say by themselves that the RTC plays another matrix, or one that does not hold."""

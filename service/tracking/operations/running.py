@@ -42,7 +42,7 @@ class RunningOperation:
 
     kind: OperationKind
     text: str
-    """What runs, and what ends it."""
+    """What is running, and what ends it."""
 
 
 def running_operations(state: TrackerState, now_ns: int) -> tuple[RunningOperation, ...]:
@@ -111,7 +111,7 @@ def _of_matrices(state: TrackerState) -> Iterator[RunningOperation]:
 
 
 class ServiceState(StrEnum):
-    """Whether the service does its work; the first that holds, from below."""
+    """State of the service; the first that applies, from the bottom."""
 
     OPERATIONAL = "Operational"
     """It works for an RTC whose loop is closed, or has the mirror."""
@@ -123,7 +123,7 @@ class ServiceState(StrEnum):
     """A serious alarm lasts."""
 
     NOT_READY = "NotReady"
-    """It starts, stands by, or waits for what everything needs."""
+    """It is starting, standing by, or waiting for something that everything needs."""
 
     ERROR = "Error"
     """A critical alarm lasts."""
@@ -155,7 +155,7 @@ OPERATION_OF: dict[OperationKind, CurrentOperation] = {
     OperationKind.RAMPING: CurrentOperation.MEASURING,
     OperationKind.STOPPED: CurrentOperation.HOLD,
 }
-"""What it does while one of these runs; the others change nothing of it."""
+"""Current operation while one of these runs; others do not change it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +165,7 @@ class Operating:
     service_state: ServiceState
     current_operation: CurrentOperation
     because: str
-    """In a sentence."""
+    """Reason in one sentence."""
 
     @property
     def words(self) -> str:

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import httpx
 
-from pyrcal_studies.demo.arguments import FORWARDED, REPEATED
-from pyrcal_studies.demo.children import children, interrupted_by_any_end
-from pyrcal_studies.demo.report import table
-from pyrcal_studies.demo.truth import TruthFile
-from pyrcal_studies.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, TelemetryObserver
+from pyrcal.demo.arguments import FORWARDED, REPEATED
+from pyrcal.demo.children import children, interrupted_by_any_end
+from pyrcal.demo.report import table
+from pyrcal.demo.truth import TruthFile
+from pyrcal.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, TelemetryObserver
 from service.config.instrument_schema import (
     AboutTable,
     InstrumentFile,
@@ -127,7 +127,7 @@ def run_demo(options: argparse.Namespace) -> int:
         report = watch.closing_report()
     _say(table(report))
     if options.plot is not None:
-        from pyrcal_studies.demo.figure import draw
+        from pyrcal.demo.figure import draw
 
         draw(report, truth, options.plot)
     if options.json is not None:

@@ -9,19 +9,19 @@ from typing import Any
 
 import httpx
 
-from pyrcal_studies.demo.children import Child
-from pyrcal_studies.demo.report import (
+from pyrcal.demo.children import Child
+from pyrcal.demo.report import (
     MODEL,
     REAL_TIME,
     TOLERANCE_ACROSS_SUBAP,
-    WORKER_BEHIND,
     Circumstances,
     Report,
     make_report,
     waits,
 )
-from pyrcal_studies.demo.truth import Line, TruthFile
+from pyrcal.demo.truth import Line, TruthFile
 from service.model.misregistration import PARAMETERS
+from service.tracking.alarms import WORKER_BEHIND
 
 POLL_S = 0.5
 LINE_S = 2.0

@@ -14,7 +14,6 @@ COPY pyrcal pyrcal
 COPY check_rtc check_rtc
 COPY sim_rtc sim_rtc
 COPY cacao_bridge cacao_bridge
-COPY pyrcal_studies pyrcal_studies
 RUN /opt/build/bin/pip wheel --no-deps --no-build-isolation --wheel-dir /opt/wheels .
 
 FROM ${BASE}

@@ -19,7 +19,7 @@ from typing import Any
 
 import httpx
 
-from pyrcal_studies.demo.children import Child, children, interrupted_by_any_end
+from pyrcal.demo.children import Child, children, interrupted_by_any_end
 
 START_TIMEOUT_S = 240.0
 """For the optics of a first start, and a first matrix, on a machine that has other work."""

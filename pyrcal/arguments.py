@@ -17,11 +17,10 @@ from service.cli import program
 from service.cli.program import OneLineParser
 
 OTHER_PROGRAMS = {
-    "demo": ("pyrcal_studies.demo", "service and simulated telescope, end to end"),
+    "demo": ("pyrcal.demo", "service and simulated telescope, end to end"),
     "sim": ("sim_rtc", "the simulated RTC"),
     "check-rtc": ("check_rtc", "check whether an RTC keeps the contract"),
     "cacao": ("cacao_bridge", "the bridge to a loop of cacao's"),
-    "campaign": ("pyrcal_studies.campaign", "play many simulated nights"),
 }
 """Module and purpose of what is run in this program's place, with options of its own."""
 

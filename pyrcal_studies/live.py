@@ -15,9 +15,9 @@ from typing import Any
 
 import httpx
 
+from pyrcal.demo.truth import TruthFile
 from pyrcal_studies.cable import Cable
 from pyrcal_studies.campaign.small import SETTINGS, SMALL
-from pyrcal_studies.demo.truth import TruthFile
 from pyrcal_studies.machine import Machine
 
 WITHIN_S = 60.0

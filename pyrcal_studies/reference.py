@@ -145,7 +145,7 @@ def commands() -> str:
     """Return docs/reference/cli.md: every command with its options."""
     intro = (
         "`make` puts `pyrcal` into `.venv/bin`. `--help` of each command says the same; "
-        "those of `pyrcal sim`, `demo` and `campaign` are manuals of their own. Options that "
+        "those of `pyrcal sim` and `demo` are manuals of their own. Options that "
         "several commands share are explained once, first."
     )
     parsers = dict(_parsers(command_line())) | {"pyrcal check-rtc": check_parser()}

@@ -40,7 +40,7 @@ def main() -> int:
         port, zenoh_port = free_port(), free_port()
         words = ["--port", str(port), "--zenoh-port", str(zenoh_port), "--dir", f"{folder}/demo"]
         at_s = sys.argv[1] if len(sys.argv) > 1 else "90"
-        command = [sys.executable, "-m", "pyrcal_studies.demo", "--jump", f"{at_s}:{JUMP}", *words]
+        command = [sys.executable, "-m", "pyrcal.demo", "--jump", f"{at_s}:{JUMP}", *words]
         demo = subprocess.Popen(command)
         try:
             walk(f"http://127.0.0.1:{port}")

@@ -31,10 +31,10 @@ _SOURCES = {
 
 _ENDINGS = {"hdf5": "h5", "raw": "f4"}
 
-_PAGE = 1000
+_PAGE_ENTRIES = 1000
 
-SENT_WITHIN_S = 60.0
-"""A service reads a matrix from its disk before the first byte of it comes."""
+MATRIX_TIMEOUT_S = 60.0
+"""Timeout of a matrix, seconds: the service reads it from its disk before it sends a byte."""
 
 
 def run_command(service: Service, _request: Request, options: argparse.Namespace) -> int:
@@ -92,7 +92,7 @@ def _write(file: BinaryIO, content: bytes, target: Path) -> None:
 def _sent(service: Service, path: str, form: str, query: dict[str, str]) -> Iterator[bytes]:
     """Yield the bytes that the service sends."""
     asked = f"{path}?{urlencode({'format': form, **query})}"
-    with service.answered("GET", asked, within_s=None, silent_s=SENT_WITHIN_S) as response:
+    with service.answered("GET", asked, within_s=None, silent_s=MATRIX_TIMEOUT_S) as response:
         yield from chunks(response)
 
 
@@ -100,7 +100,7 @@ def _history(service: Service, path: str, form: str, query: dict[str, str]) -> I
     """Yield the history of alpha, page by page, as lines or as a table with a head."""
     after, head = 0, True
     while True:
-        document = service.get(path, **query, after=after, limit=_PAGE).document
+        document = service.get(path, **query, after=after, limit=_PAGE_ENTRIES).document
         with understood(service):
             entries = [dict(entry) for entry in document["entries"]]
             lines = _written(entries, form, head=head)

@@ -17,11 +17,11 @@ from pyrcal.options import named
 from pyrcal.terminal import login, print_document, print_lines
 from service.errors import ConfigurationError, say, shown
 
-LOOK_S = 0.5
-"""Between two looks at work under way."""
+POLL_S = 0.5
+"""Time between two requests for the state of work under way, seconds."""
 
-SENT_WITHIN_S = 30.0
-"""A matrix that is not applied by then is left to the service."""
+MAX_SWAP_WAIT_S = 30.0
+"""Longest time to wait for a matrix to be applied, seconds; it is then left to the service."""
 
 _ON_ITS_WAY = {"proposed", "published", "staged"}
 _UNDER_WAY = _ON_ITS_WAY | {"waiting", "asked", "running", "finishing"}
@@ -173,7 +173,7 @@ def _follow(service: Service, request: Request, options: argparse.Namespace) -> 
                 if step.text != shown_text and not console.is_terminal:
                     say(step.text)
                 shown_text = step.text
-                time.sleep(LOOK_S)
+                time.sleep(POLL_S)
     except KeyboardInterrupt:
         say("the work goes on; pyrcal watch shows it")
         raise
@@ -192,7 +192,7 @@ def _step(document: Document, lasted_s: float) -> Step:
         return Step(text, work["under_way"], work["stage"] == "tracking")
     state = document["state"]
     why = f": {document['reason']}" if document["reason"] else ""
-    too_long = state in _ON_ITS_WAY and lasted_s > SENT_WITHIN_S
+    too_long = state in _ON_ITS_WAY and lasted_s > MAX_SWAP_WAIT_S
     text = f"{document['id']} is {state}{why}"
     return Step(
         f"{text}, still; pyrcal watch shows the rest" if too_long else text,

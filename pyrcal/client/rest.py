@@ -21,12 +21,14 @@ from service.errors import CommandError, ConfigurationError, LinkError
 Document = dict[str, Any]
 """A JSON object that REST answers."""
 
-ANSWER_WITHIN_S = 5.0
-OBEYED_WITHIN_S = 30.0
-"""An order waits for the RTC."""
+REQUEST_TIMEOUT_S = 5.0
+"""Timeout of a request that only reads, seconds."""
 
-LARGEST = 100_000_000
-"""Bytes of a document; the longest history has a third of that."""
+ORDER_TIMEOUT_S = 30.0
+"""Timeout of an order, seconds: it waits for the RTC."""
+
+MAX_ANSWER_BYTES = 100_000_000
+"""Largest document that is read; the longest history has a third of that."""
 
 _SAYS_PYRCAL = "urn:pyrcal:problem:"
 
@@ -93,7 +95,7 @@ class Service:
         """
         given = {name: value for name, value in query.items() if value is not None}
         path = f"{path}?{urlencode(given)}" if given else path
-        with self.answered("GET", path, within_s=ANSWER_WITHIN_S) as response:
+        with self.answered("GET", path, within_s=REQUEST_TIMEOUT_S) as response:
             return self._read(response)
 
     def order(self, method: str, path: str, body: Document, headers: Mapping[str, str]) -> Fetched:
@@ -111,7 +113,7 @@ class Service:
         raw, again = json.dumps(body).encode(), "Idempotency-Key" in headers
         while True:
             try:
-                with self.answered(method, path, raw, sent, within_s=OBEYED_WITHIN_S) as response:
+                with self.answered(method, path, raw, sent, within_s=ORDER_TIMEOUT_S) as response:
                     return self._read(response)
             except _LostError as error:
                 if not again:
@@ -150,7 +152,7 @@ class Service:
         UnreachableError
             If nothing answers in time, or something else.
         """
-        limit_s = within_s or silent_s or ANSWER_WITHIN_S
+        limit_s = within_s or silent_s or REQUEST_TIMEOUT_S
         kind = http.client.HTTPSConnection if self._secure else http.client.HTTPConnection
         connection = kind(self._host, self._port, timeout=limit_s)
         late = threading.Event()
@@ -187,11 +189,11 @@ class Service:
 
     def _read(self, response: http.client.HTTPResponse) -> Fetched:
         """Return the JSON object in an answer."""
-        raw = response.read(LARGEST + 1)
+        raw = response.read(MAX_ANSWER_BYTES + 1)
         if response.length:
             raise http.client.IncompleteRead(raw, response.length)
         try:
-            document = json.loads(raw) if len(raw) <= LARGEST else None
+            document = json.loads(raw) if len(raw) <= MAX_ANSWER_BYTES else None
         except (ValueError, RecursionError):
             document = None
         if not isinstance(document, dict):

@@ -23,16 +23,17 @@ from service.errors import say, shown
 if TYPE_CHECKING:
     from rich.console import Group
 
-SILENT_S = 15.0
-"""The stream shows a sign of life every 10 s; without one for so long it is cut."""
+MAX_SILENCE_S = 15.0
+"""Silence after which the stream counts as cut, seconds. The service sends a sign of life every
+10 s."""
 
-AGAIN_S = 1.0
-"""Between two attempts to connect."""
+RECONNECT_S = 1.0
+"""Time between two attempts to connect, seconds."""
 
 DRAWN_S = 0.25
 _LOG_LENGTH = 200
-_LONGEST = 10_000_000
-"""Bytes of a line: a state has a thousandth of that."""
+_MAX_LINE_BYTES = 10_000_000
+"""Longest line of the stream; a state has a thousandth of that."""
 
 Event = tuple[str, Document]
 """Its name and its data."""
@@ -85,7 +86,7 @@ def events(service: Service, path: str, latest: Latest) -> Iterator[Event]:
     while True:
         headers = {"Last-Event-ID": latest.last} if latest.last else {}
         try:
-            with service.answered("GET", path, headers=headers, silent_s=SILENT_S) as response:
+            with service.answered("GET", path, headers=headers, silent_s=MAX_SILENCE_S) as response:
                 for name, data in _read(service, response, latest):
                     ever = True
                     if name == "reset":
@@ -103,7 +104,7 @@ def events(service: Service, path: str, latest: Latest) -> Iterator[Event]:
                 raise
             latest.lost = str(error)
         yield "lost", {"text": latest.lost}
-        time.sleep(AGAIN_S)
+        time.sleep(RECONNECT_S)
 
 
 def _read(service: Service, response: HTTPResponse, latest: Latest) -> Iterator[Event]:
@@ -117,7 +118,7 @@ def _read(service: Service, response: HTTPResponse, latest: Latest) -> Iterator[
     if not response.headers.get("Content-Type", "").startswith("text/event-stream"):
         raise service.stranger("no stream of events")
     fields: dict[str, str] = {}
-    while raw := response.readline(_LONGEST):
+    while raw := response.readline(_MAX_LINE_BYTES):
         name, _, value = raw.decode(errors="replace").rstrip("\r\n").partition(":")
         if name or value:
             fields[name] = value.removeprefix(" ")

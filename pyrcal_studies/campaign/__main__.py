@@ -1,8 +1,8 @@
 """Campaigns: seeds x magnitudes x winds x truths, in parallel and resumable.
 
-Run: ``pyrcal campaign --magnitudes 7,10,12.5 --seeds 0:10 --output var/campaign.jsonl``; rows that
-are there already are not run again. ``--table FILE.md`` writes the table, ``--plot FILE.png``
-draws errors against stated σ.
+Run: ``python -m pyrcal_studies.campaign --magnitudes 7,10,12.5 --seeds 0:10 --output
+var/campaign.jsonl``; rows that are there already are not run again. ``--table FILE.md`` writes the
+table, ``--plot FILE.png`` draws errors against stated σ.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ def main() -> int:
         environment["PYRCAL_COMPUTE__WORKING_POINT_MODES"] = str(given.working_point_modes)
     floor = floor_of(load_settings(None, environment), load_instrument(given.instrument))
     text = table(file.rows, floor, pooled=given.winds_in_turn is not None)
-    tell(text, given.table, "pyrcal campaign")
+    tell(text, given.table, "python -m pyrcal_studies.campaign")
     if given.plot is not None:
         plot(given.plot, file.rows, floor)
     return 0
 
 
 def campaign_parser() -> argparse.ArgumentParser:
-    """Return the parser of ``pyrcal campaign``."""
+    """Return the parser of ``python -m pyrcal_studies.campaign``."""
     parser = argparse.ArgumentParser(
-        prog="pyrcal campaign",
+        prog="python -m pyrcal_studies.campaign",
         description="Runs many simulated nights and compares what was estimated with the truth.",
     )
     parser.add_argument("--output", type=Path, default=Path("campaign.jsonl"), help="rows, resumed")
@@ -129,4 +129,4 @@ def _modes(text: str) -> tuple[int, ...]:
 
 
 if __name__ == "__main__":
-    sys.exit(status_of(main, "pyrcal campaign"))
+    sys.exit(status_of(main, "python -m pyrcal_studies.campaign"))

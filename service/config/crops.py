@@ -14,11 +14,11 @@ from service.files.container import MAX_BYTES
 from service.model.instrument import LocalFunctions
 from service.model.surface import NOTHING
 
-_MANY = 1000
-"""Functions from which on it pays to know that each covers little: 663 took twice as long so,"""
+_MIN_CROPPED_FUNCTIONS = 1000
+"""Influence functions from which on cropping them saves time: with 663 it took twice as long."""
 
-_LITTLE = 0.1
-"""of what all cover, in the mean."""
+_MAX_MEAN_COVERAGE = 0.1
+"""Mean share of the pupil that a function may cover for cropping to save time."""
 
 _CUT = 0.01
 """Share of the height that a function may have at the rim of its crop."""
@@ -39,7 +39,7 @@ def local_functions(
     ConfigurationError
         As :func:`modes_of_crops`, but for the size.
     """
-    if len(heights) < _MANY:
+    if len(heights) < _MIN_CROPPED_FUNCTIONS:
         return None
     if known is None:
         shape = _table_of(file, heights)
@@ -56,7 +56,7 @@ def local_functions(
         found.append(part[row, column])
         places.append((row + rows.start) * known.shape[1] + column + columns.start)
     ends = np.concatenate([[0], np.cumsum([len(one) for one in places])]).astype(np.intp)
-    if ends[-1] > _LITTLE * len(heights) * known.sum():
+    if ends[-1] > _MAX_MEAN_COVERAGE * len(heights) * known.sum():
         return None
     local = LocalFunctions(
         heights=np.concatenate(found),

@@ -14,8 +14,9 @@ from service.errors import ModelError
 from service.model.kinds import Read
 from service.model.pointing_law import ANGLES, PointingLaw, Term
 
-_NEAR = 0.75
-"""Likeness from which on a name is a misspelt angle, and no value of the observatory's."""
+_MISSPELT_SIMILARITY = 0.75
+"""Similarity above which a name is taken for a misspelt angle, and not for a value of the
+observatory."""
 
 _FORM = '{ of = "elevation", at = [20, 80], values = [0.1, -0.1] }'
 
@@ -62,7 +63,7 @@ def _checked(value: object) -> Term:
         case _:
             raise ModelError(f"found {value!r}, expected a number, an expression or {_FORM}")
     for name in sorted(term.names - set(ANGLES)):
-        close = difflib.get_close_matches(name, ANGLES, n=1, cutoff=_NEAR)
+        close = difflib.get_close_matches(name, ANGLES, n=1, cutoff=_MISSPELT_SIMILARITY)
         if close:
             raise ModelError(f"found {name}, did you mean {close[0]}?")
     return term

@@ -9,8 +9,8 @@ from service.config.sources import refuse
 from service.errors import ConfigurationError
 from service.model.instrument import PupilMap
 
-_LIT = 0.5
-"""Points of which more is lit than this are where the pupil is."""
+_LIT_FRACTION = 0.5
+"""Illumination of a point, of the largest, above which it belongs to the pupil."""
 
 _WIDTHS = (0.8, 1.1)
 """Width of a map's light over ``diameter_m``: a segmented pupil's corners stand out."""
@@ -54,7 +54,7 @@ def _checked(file: Section[AboutTable], subaperture_m: float) -> PupilMap:
         refuse(where, f"shape {lit.shape}", "(ny, nx), a map of the pupil")
     if not np.isfinite(lit).all() or lit.min() < 0.0 or lit.max() > 1.0:
         refuse(where, "values that are not 0 to 1", "the share of each point that is lit")
-    rows, columns = (np.flatnonzero((lit > _LIT).any(axis=axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero((lit > _LIT_FRACTION).any(axis=axis)) for axis in (1, 0))
     if not rows.size:
         refuse(where, "no lit point", f"a pupil of {diameter_m:g} m")
     pitch_m = file.said.pupil_pitch_m or diameter_m / max(lit.shape)

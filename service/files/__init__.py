@@ -39,8 +39,8 @@ _OTHERS = {
 }
 """First bytes of what else comes, what it is, and what to do with it."""
 
-_SHOWN = 16
-"""Bytes of a file that tell what it is: a message repeats them."""
+_SHOWN_BYTES = 16
+"""First bytes of an unknown file that the refusal repeats."""
 
 
 class FileKind(StrEnum):
@@ -63,7 +63,7 @@ def kind_of(path: Path) -> FileKind:
     """
     try:
         with path.open("rb") as file:
-            begins, offset = file.read(_SHOWN), 512
+            begins, offset = file.read(_SHOWN_BYTES), 512
             there = begins[:8]
             while there and there != _HDF5_BEGINS:
                 file.seek(offset)

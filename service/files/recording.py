@@ -49,8 +49,8 @@ FLUSH_S: Final = 0.5
 BACKLOG_BYTES: Final = 64_000_000
 """What may wait for the disk; beyond it messages are dropped and counted."""
 
-PART_BYTES: Final = 16_000_000
-"""Of what was there before that is written at once."""
+PAST_PART_BYTES: Final = 16_000_000
+"""Bytes of earlier telemetry that are written to the disk at once."""
 
 _ROW: Final = np.dtype(
     [
@@ -265,7 +265,7 @@ class RecordingWriter:
         for message in self._past:
             part.append(message)
             size += message.n_bytes
-            if size >= PART_BYTES:
+            if size >= PAST_PART_BYTES:
                 break
         return part
 

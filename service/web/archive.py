@@ -104,8 +104,8 @@ async def unpin(client: ClientDep, product_id: ProductId, instruction: Said) -> 
 # --- the audit trail: who ordered what, when, why and from where, and what it was answered
 
 
-PAGE = 1000
-"""Entries that are read from the disk at once for an export."""
+EXPORT_PAGE_ENTRIES = 1000
+"""Entries that an export reads from the disk at once."""
 
 
 class AuditFormat(StrEnum):
@@ -187,7 +187,7 @@ async def audit(service: ServiceDep, parameters: Annotated[AuditParameters, Quer
 
 def _all(archive: Archive, part: Range) -> Iterator[dict[str, Any]]:
     """Yield all entries of a part as they leave; each page waits for the disk."""
-    page = replace(part, limit=PAGE)
+    page = replace(part, limit=EXPORT_PAGE_ENTRIES)
     while entries := archive.audit_trail(page):
         yield from map(to_json, entries)
         page = replace(page, after=entries[-1].id)
@@ -208,7 +208,7 @@ def _csv_lines(entries: Iterator[dict[str, Any]]) -> Iterator[str]:
         yield buffer.getvalue()
         buffer.seek(0)
         buffer.truncate()
-        rows = list(islice(entries, PAGE))
+        rows = list(islice(entries, EXPORT_PAGE_ENTRIES))
         if not rows:
             return
         table.writerows({name: _inert(cell) for name, cell in row.items()} for row in rows)

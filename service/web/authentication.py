@@ -25,7 +25,7 @@ from typing_extensions import override
 from service.archive import Actor, AuditEntry, Channel
 from service.errors import ConfigurationError, UnknownIdError
 from service.web.bodies import bounded
-from service.web.connections import RETRY_S, Middleware, to_its_end
+from service.web.connections import UNAVAILABLE_RETRY_S, Middleware, to_its_end
 from service.web.keys import Key, KeyFile, KeyScope, is_loopback
 from service.web.problems import INVALID, UNKNOWN, problem
 from service.web.views import answer, define_view, held, shows
@@ -33,14 +33,15 @@ from service.web.views import answer, define_view, held, shows
 COOKIE = "pyrcal_key"
 """Under which a browser keeps the key."""
 
-MOST_TOLD, TOLD_WITHIN_S = 20, 60.0
-"""Refusals that are told one by one within so many seconds; the others are only counted."""
+MAX_AUDITED_REFUSALS, AUDIT_PERIOD_S = 20, 60.0
+"""Refusals that are written to the audit trail within so many seconds, which only grows; the
+others are counted."""
 
 MAX_HEADERS = 100
-"""Of a request; browsers send about twenty, proxies a few more."""
+"""Headers of a request; browsers send about twenty, proxies a few more."""
 
-_LAST = {"Connection": "close"}
-"""What follows on such a connection is not to be trusted."""
+_CLOSE_CONNECTION = {"Connection": "close"}
+"""Header after which the connection is closed: what follows on it cannot be trusted."""
 
 _READS = {"GET", "HEAD", "OPTIONS"}
 _OWN_SITES = {"same-origin", "none"}
@@ -142,14 +143,14 @@ class Refusals:
 
     def __init__(self, audit: Callable[[AuditEntry], object]) -> None:
         self._audit = audit
-        self._since_s = -TOLD_WITHIN_S
+        self._since_s = -AUDIT_PERIOD_S
         self._left = self._untold = 0
 
     def tell(self, request: Request, refusal: Refusal) -> None:
         """Take down a refusal, unless as many were within the last minute."""
         now_s = time.monotonic()
-        if now_s - self._since_s >= TOLD_WITHIN_S:
-            self._since_s, self._left = now_s, MOST_TOLD
+        if now_s - self._since_s >= AUDIT_PERIOD_S:
+            self._since_s, self._left = now_s, MAX_AUDITED_REFUSALS
         if self._left == 0:
             self._untold += 1
             return
@@ -283,7 +284,7 @@ class Authentication(Middleware):
                 self._trouble = str(error)
                 structlog.get_logger().error("api.keys", text=self._trouble)
             detail = "the file of the API keys cannot be read; the service's log says more"
-            later = {"Retry-After": str(RETRY_S)}
+            later = {"Retry-After": str(UNAVAILABLE_RETRY_S)}
             return None, Refusal(HTTPStatus.SERVICE_UNAVAILABLE, "keys", detail, later)
         if key is None:
             return None, _without_key(needed, shown=secret is not None)
@@ -345,11 +346,11 @@ def _misshapen(request: Request) -> Refusal | None:
     if n_headers > MAX_HEADERS:
         detail = f"found {n_headers} headers, expected at most {MAX_HEADERS}"
         status = HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE
-        return Refusal(status, "headers", detail, _LAST)
+        return Refusal(status, "headers", detail, _CLOSE_CONNECTION)
     if {"content-length", "transfer-encoding"}.issubset(request.headers):
         # a proxy that goes by the one and a server that goes by the other see other requests
         detail = "found Content-Length and Transfer-Encoding, expected one of them"
-        return Refusal(HTTPStatus.BAD_REQUEST, "two-lengths", detail, _LAST)
+        return Refusal(HTTPStatus.BAD_REQUEST, "two-lengths", detail, _CLOSE_CONNECTION)
     return None
 
 

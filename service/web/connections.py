@@ -33,8 +33,8 @@ MAX_CONNECTIONS = 500
 system allows 1024 open files by default. Where clients are not trusted, a reverse proxy limits
 each of them (docs/operate/deploying.md)."""
 
-RETRY_S = 5
-"""``Retry-After`` of an answer 503, seconds."""
+UNAVAILABLE_RETRY_S = 5
+"""``Retry-After`` when the service ends or cannot read its keys, seconds."""
 
 
 class Middleware:
@@ -73,7 +73,7 @@ async def to_its_end(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -
         if not begun:
             detail = "the service ends: ask the next one again"
             status = HTTPStatus.SERVICE_UNAVAILABLE
-            headers = {"Retry-After": str(RETRY_S)}
+            headers = {"Retry-After": str(UNAVAILABLE_RETRY_S)}
             await problem(Request(scope), status, "ending", detail, headers)(scope, receive, send)
 
 
@@ -126,12 +126,14 @@ class Server(uvicorn.Server):
 ONCE = "idempotency-key"
 """Header of whoever may send a request again."""
 
-LONGEST_KEY = 200
-MAX_KEPT = 1000
-"""Answers that are remembered; the oldest go first."""
+MAX_KEY_LENGTH = 200
+"""Longest idempotency key, characters."""
 
-LARGEST_KEPT = 100_000
-"""Bytes: an order's answer is a few hundred."""
+MAX_KEPT_ANSWERS = 1000
+"""Answers that are remembered; the oldest are dropped first."""
+
+MAX_KEPT_BYTES = 100_000
+"""Largest answer that is remembered; the answer to an order has some hundred bytes."""
 
 _NOT_DONE = {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.INSUFFICIENT_STORAGE}
 """Answers that say that nothing was done: the next time may do it."""
@@ -174,8 +176,8 @@ class Idempotency(Middleware):
         if (request.method, request.url.path) == STREAMED:
             # it goes to the disk as it comes: nobody has its bytes to compare
             return await self._refuse(request, send, "found a key, expected none with an upload")
-        if not (0 < len(key) <= LONGEST_KEY and key.isprintable()):
-            found = f"found {len(key)} characters, expected 1 to {LONGEST_KEY} printable ones"
+        if not (0 < len(key) <= MAX_KEY_LENGTH and key.isprintable()):
+            found = f"found {len(key)} characters, expected 1 to {MAX_KEY_LENGTH} printable ones"
             return await self._refuse(request, send, found)
         name = (request.user and request.user.name, key)
         body = await request.body()
@@ -212,7 +214,7 @@ class Idempotency(Middleware):
             if not given.answer and self._given.get(name) is given:
                 del self._given[name]
             given.done.set()
-            while len(self._given) > MAX_KEPT:
+            while len(self._given) > MAX_KEPT_ANSWERS:
                 self._given.popitem(last=False)
 
     async def _refuse(self, request: Request, send: Send, found: str) -> None:
@@ -226,7 +228,7 @@ def _lasts(messages: list[Message]) -> bool:
     if not messages or messages[-1].get("more_body", False):
         return False
     size = sum(len(message.get("body", b"")) for message in messages)
-    return messages[0]["status"] not in _NOT_DONE and size <= LARGEST_KEPT
+    return messages[0]["status"] not in _NOT_DONE and size <= MAX_KEPT_BYTES
 
 
 # --- which request has led to what: an id in its answer and in every line of the log

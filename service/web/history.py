@@ -33,12 +33,12 @@ def _said_as_a_clock_does(value: object) -> object:
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_LAST = _EPOCH + timedelta(microseconds=FOREVER_NS // 1000)
+_LATEST = _EPOCH + timedelta(microseconds=FOREVER_NS // 1000)
 
 
 def _in_nanoseconds(time: datetime) -> datetime:
-    if not _EPOCH <= time <= _LAST:
-        expected = f"{_EPOCH:%Y-%m-%dT%H:%M:%SZ} to {_LAST:%Y-%m-%dT%H:%M:%SZ}, in nanoseconds"
+    if not _EPOCH <= time <= _LATEST:
+        expected = f"{_EPOCH:%Y-%m-%dT%H:%M:%SZ} to {_LATEST:%Y-%m-%dT%H:%M:%SZ}, in nanoseconds"
         raise ValueError(f"found {time.isoformat()}, expected a time from {expected}")
     return time
 

@@ -73,11 +73,11 @@ OtherId = Annotated[str, Depends(_other)]
 """Of another one in the same path."""
 
 
-_SLOPES_AT_ONCE = 1024
-"""Of a product in float64."""
+_SLOPES_PER_PRODUCT = 1024
+"""Slopes that are multiplied at once, in float64."""
 
-PART_BYTES = 4_000_000
-"""Of a large telescope's matrix, 250 MB, that leaves without being copied whole."""
+RESPONSE_PART_BYTES = 4_000_000
+"""Bytes sent at once, so that the 250 MB of a large telescope's matrix are never copied whole."""
 
 
 # --- the formats in which its numbers leave
@@ -154,8 +154,8 @@ def _parts(head: bytes, numbers: Numbers) -> Iterator[bytes]:
     """Yield a file's head, and its numbers as they lie in memory."""
     yield head
     lying = numbers.reshape(-1).view(np.uint8)
-    for first in range(0, len(lying), PART_BYTES):
-        yield lying[first : first + PART_BYTES].tobytes()
+    for first in range(0, len(lying), RESPONSE_PART_BYTES):
+        yield lying[first : first + RESPONSE_PART_BYTES].tobytes()
 
 
 def _npy_head(numbers: Numbers) -> bytes:
@@ -356,8 +356,8 @@ def _singular_values(
 def _products(matrix: Numbers) -> NDArray[np.float64]:
     """Return the matrix times its transpose, some slopes at once: in float64 it is large."""
     found = np.zeros((len(matrix), len(matrix)))
-    for first in range(0, matrix.shape[1], _SLOPES_AT_ONCE):
-        some = matrix[:, first : first + _SLOPES_AT_ONCE].astype(np.float64)
+    for first in range(0, matrix.shape[1], _SLOPES_PER_PRODUCT):
+        some = matrix[:, first : first + _SLOPES_PER_PRODUCT].astype(np.float64)
         found += some @ some.T
     return found
 

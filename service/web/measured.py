@@ -25,7 +25,7 @@ from service.tracking.operation_records import MeasurementRecord, NoisyFinding
 from service.tracking.state import TrackerState
 from service.web import views
 from service.web.matrices import (
-    PART_BYTES,
+    RESPONSE_PART_BYTES,
     MatrixFormat,
     MatrixParameters,
     describes_numbers,
@@ -163,8 +163,8 @@ FitsDep = Annotated[FitQueue, held("fits")]
 
 FitId = Annotated[str, Path(alias="id", description="Id of a fit")]
 
-_TEXT = 200
-"""Longest name of an array or a file."""
+_MAX_NAME = 200
+"""Longest name of an array or a file, characters."""
 
 
 def _understood(parse: Callable[[str], object]) -> AfterValidator:
@@ -187,7 +187,7 @@ def _packaged(name: str) -> None:
 class FitParameters(Parameters):
     """Parameters of a fit, in the words of ``pyrcal fit``."""
 
-    dataset: str | None = Field(default=None, min_length=1, max_length=_TEXT)
+    dataset: str | None = Field(default=None, min_length=1, max_length=_MAX_NAME)
     """Name of the matrix in its file; default interaction_matrix."""
 
     method: Method = Method.JOINT
@@ -196,7 +196,7 @@ class FitParameters(Parameters):
     modes: Annotated[str, Field(max_length=10_000), _understood(files.parse_modes)] | None = None
     """Basis indices, like 0:400 or 3,5,9; default all."""
 
-    start: Annotated[str, Field(max_length=_TEXT), _understood(files.parse_alpha)] | None = None
+    start: Annotated[str, Field(max_length=_MAX_NAME), _understood(files.parse_alpha)] | None = None
     """X,Y,ROT,MAG: subapertures, degrees, ratio."""
 
     gain_map: bool = False
@@ -210,13 +210,13 @@ class FitParameters(Parameters):
     ) = None
     """A packaged instrument; default: the service's own, or the one in the upload."""
 
-    reference: str | None = Field(default=None, min_length=1, max_length=_TEXT)
+    reference: str | None = Field(default=None, min_length=1, max_length=_MAX_NAME)
     """Name of the measured file in an uploaded zip."""
 
-    name: str = Field(default="", max_length=_TEXT)
+    name: str = Field(default="", max_length=_MAX_NAME)
     """What to call it in the list of fits, such as the file's name."""
 
-    measurement: str | None = Field(default=None, min_length=1, max_length=_TEXT)
+    measurement: str | None = Field(default=None, min_length=1, max_length=_MAX_NAME)
     """Id of a matrix the RTC has measured for this service; there is no body then."""
 
     def asked(self) -> dict[str, Any]:
@@ -345,7 +345,7 @@ async def give_up_fit(desk: FitsDep, fit_id: FitId) -> Response:
 
 async def _kept(path: pathlib.Path) -> AsyncIterator[bytes]:
     with path.open("rb") as file:
-        while part := await run_in_threadpool(file.read, PART_BYTES):
+        while part := await run_in_threadpool(file.read, RESPONSE_PART_BYTES):
             yield part
 
 

@@ -292,14 +292,14 @@ def _maps(block: FrameBlock, instrument: Instrument) -> SlopeMaps:
 # --- server-sent events, rendered once for all listeners
 
 
-LOOK_S = 0.5
-"""Between two looks at what is new, seconds: all listeners wake together and share one."""
+STREAM_PERIOD_S = 0.5
+"""Period at which the stream looks for changes, seconds. All listeners share one snapshot."""
 
-HEARTBEAT_S = 10.0
-"""Longest silence, seconds: then comes a comment, and the state as it is."""
+MAX_STREAM_SILENCE_S = 10.0
+"""Longest silence of the stream, seconds; then a comment and the state are sent."""
 
 MAX_LISTENERS = 60
-"""Fewer than there may be connections: others want to ask something, too."""
+"""Listeners to the stream. Fewer than connections, so that other requests find a place."""
 
 RETRY_MS = 1000
 """When a listener that was cut off should come back, milliseconds."""
@@ -346,7 +346,7 @@ class Stream:
             now, news = self._look(), b""
             if version != self._version:
                 version, news = self._version, self._state
-            elif now - quiet_since >= HEARTBEAT_S / LOOK_S:
+            elif now - quiet_since >= MAX_STREAM_SILENCE_S / STREAM_PERIOD_S:
                 news = b": nothing new\n\n" + self._state
             if self._ids is not ids:
                 ids = self._ids
@@ -359,7 +359,7 @@ class Stream:
 
     def _look(self) -> int:
         """Render what is known, unless it was in this moment; return the number of the moment."""
-        now = int(asyncio.get_running_loop().time() / LOOK_S)
+        now = int(asyncio.get_running_loop().time() / STREAM_PERIOD_S)
         if now != self._looked:
             self._looked = now
             snapshot = self._service.snapshot()
@@ -376,8 +376,9 @@ class Stream:
     async def _next_look(self) -> None:
         """Wait for the next moment, or the end."""
         time_s = asyncio.get_running_loop().time()
+        rest_s = STREAM_PERIOD_S - time_s % STREAM_PERIOD_S
         with suppress(TimeoutError):
-            async with asyncio.timeout(LOOK_S * (1.0 - time_s / LOOK_S % 1.0) + 1e-3):
+            async with asyncio.timeout(rest_s + 1e-3):
                 await self._over.wait()
 
     def _since(self, heard: str) -> bytes:

@@ -32,8 +32,8 @@ _OF_ERROR: dict[type[errors.PyrcalError], tuple[HTTPStatus, str]] = {
     errors.PyrcalError: (HTTPStatus.INTERNAL_SERVER_ERROR, "internal"),
 }
 
-RETRY_S = 30
-"""When to come again where too much is under way, seconds: a fit takes that long."""
+BUSY_RETRY_S = 30
+"""``Retry-After`` when too much is under way, seconds: a fit takes that long."""
 
 
 class Problem(BaseModel):
@@ -126,7 +126,7 @@ def install(app: FastAPI) -> None:
 def known_problem(request: Request, error: errors.PyrcalError) -> JSONResponse:
     """Return the problem that an error of this service is."""
     status, kind = next(_OF_ERROR[cls] for cls in type(error).__mro__ if cls in _OF_ERROR)
-    later = {"Retry-After": str(RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
+    later = {"Retry-After": str(BUSY_RETRY_S)} if status is HTTPStatus.SERVICE_UNAVAILABLE else None
     return problem(request, status, kind, str(error), later)
 
 

@@ -86,8 +86,8 @@ async def events(service: ServiceDep, parameters: Annotated[LimitParameters, Que
 # --- whether all is well
 
 
-FRESH_S = 3.0
-"""Telemetry whose last frame is older has stopped, seconds."""
+MAX_FRAME_AGE_S = 3.0
+"""Age of the last frame beyond which telemetry counts as stopped, seconds."""
 
 
 class HealthView(BaseModel):
@@ -146,8 +146,10 @@ def find_problems(snapshot: Snapshot) -> dict[str, str]:
     stopped = []
     if age_s is None:
         stopped = ["no frame has come from an RTC yet"]
-    elif age_s > FRESH_S:
-        stopped = [f"the last frame came {age_s:.0f} s ago, expected one within {FRESH_S:g} s"]
+    elif age_s > MAX_FRAME_AGE_S:
+        stopped = [
+            f"the last frame came {age_s:.0f} s ago, expected one within {MAX_FRAME_AGE_S:g} s"
+        ]
     unusable = [wait.text for wait in hindering if wait.responsible is not Responsible.WORKER]
     lost = [wait.text for wait in hindering if wait.responsible is Responsible.WORKER]
     return {

@@ -6,7 +6,7 @@ import sys
 import h5py
 import pytest
 
-from pyrcal_studies.demo.truth import TruthFile
+from pyrcal.demo.truth import TruthFile
 from service.config import load_instrument
 from service.model.slopes import rtc_mask, to_rtc
 from sim_rtc.assembly import build_telescope

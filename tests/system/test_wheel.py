@@ -66,6 +66,13 @@ def test_a_wheel_has_what_the_program_reads_besides_its_code(wheel):
     assert {str(path.relative_to(ROOT)) for path in expected if path.is_file()} <= names
 
 
+def test_a_wheel_has_the_demo_and_no_studies(wheel):
+    folders = {name.partition("/")[0] for name in wheel.namelist()}
+    assert {"service", "pyrcal", "sim_rtc", "check_rtc", "cacao_bridge"} <= folders
+    assert "pyrcal_studies" not in folders
+    assert "pyrcal/demo/__main__.py" in wheel.namelist()
+
+
 def test_the_default_installation_reads_fits(wheel):
     (about,) = [name for name in wheel.namelist() if name.endswith("/METADATA")]
     needed = wheel.read(about).decode().splitlines()

@@ -120,7 +120,7 @@ async def test_a_part_that_there_cannot_be_is_refused(client, query, words):
 
 
 async def test_an_export_has_all_of_it_whatever_a_page_holds(client, monkeypatch):
-    monkeypatch.setattr(kept, "PAGE", 5)
+    monkeypatch.setattr(kept, "EXPORT_PAGE_ENTRIES", 5)
     lines = await client.get("/v1/audit?format=jsonl")
     assert lines.headers["content-type"].startswith("application/jsonl")
     assert 'filename="audit.jsonl"' in lines.headers["content-disposition"]

@@ -52,14 +52,14 @@ async def test_singular_values_are_those_of_the_matrix_it_inverts(client, servic
 
 async def test_products_are_summed_over_slopes_some_at_a_time(monkeypatch):
     matrix = np.random.default_rng(5).normal(size=(7, 23)).astype(np.float32)
-    monkeypatch.setattr(matrices, "_SLOPES_AT_ONCE", 5)
+    monkeypatch.setattr(matrices, "_SLOPES_PER_PRODUCT", 5)
     expected = matrix.astype(float) @ matrix.astype(float).T
     np.testing.assert_allclose(matrices._products(matrix), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("form", ["raw", "npy"])
 async def test_a_large_matrix_leaves_in_parts_and_is_whole(client, service, monkeypatch, form):
-    monkeypatch.setattr(matrices, "PART_BYTES", 100)
+    monkeypatch.setattr(matrices, "RESPONSE_PART_BYTES", 100)
     answer = await client.get(f"/v1/reconstructors/cm-1/matrix?format={form}")
     matrix, file = service.matrix("cm-1"), io.BytesIO()
     np.save(file, matrix)

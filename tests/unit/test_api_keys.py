@@ -140,7 +140,7 @@ async def test_without_key_with_a_wrong_one_or_from_a_foreign_page_0_succeed_and
         for scope in KeyScope
         if security and not scope.covers(KeyScope(security[0]["bearer"][0]))
     ]
-    monkeypatch.setattr(authentication, "MOST_TOLD", len(asked))
+    monkeypatch.setattr(authentication, "MAX_AUDITED_REFUSALS", len(asked))
     for method, path, headers, status, kind in asked:
         response = await client.request(method, as_asked(path), headers=headers)
         assert_problem(response, status, kind)
@@ -368,7 +368,7 @@ async def test_to_revoke_the_last_key_opens_no_door(client, service, keys, secre
 
 
 async def test_a_stream_ends_when_its_key_is_revoked(service, keys, secrets, monkeypatch):
-    monkeypatch.setattr(page, "HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(page, "MAX_STREAM_SILENCE_S", 0.5)
     async with serving(service, keys) as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         head = (
@@ -383,7 +383,7 @@ async def test_a_stream_ends_when_its_key_is_revoked(service, keys, secrets, mon
 
 
 async def test_a_stream_that_needed_no_key_ends_when_there_is_one(service, keys, monkeypatch):
-    monkeypatch.setattr(page, "HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(page, "MAX_STREAM_SILENCE_S", 0.5)
     async with serving(service, keys) as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\n\r\n")

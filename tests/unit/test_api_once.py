@@ -125,7 +125,7 @@ async def test_an_upload_takes_no_key(client):
 async def test_what_is_remembered_is_bounded_and_the_oldest_goes_first(
     client, service, monkeypatch
 ):
-    monkeypatch.setattr(connections, "MAX_KEPT", 3)
+    monkeypatch.setattr(connections, "MAX_KEPT_ANSWERS", 3)
     for k in range(4):
         await keyed(client, f"k-{k}")
     assert (await keyed(client, "k-3")).json()["text"] == "order 4"

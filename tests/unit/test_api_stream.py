@@ -23,8 +23,8 @@ pytestmark = pytest.mark.timeout(60)
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(page, "LOOK_S", 0.05)
-    monkeypatch.setattr(page, "HEARTBEAT_S", 0.5)
+    monkeypatch.setattr(page, "STREAM_PERIOD_S", 0.05)
+    monkeypatch.setattr(page, "MAX_STREAM_SILENCE_S", 0.5)
 
 
 @pytest.fixture
@@ -189,7 +189,7 @@ async def test_all_who_listen_share_one_look(service):
         looks, loop = 0, asyncio.get_running_loop()
         began = loop.time()
         await asyncio.sleep(1.0)
-        assert 0 < looks <= (loop.time() - began) / page.LOOK_S + 2
+        assert 0 < looks <= (loop.time() - began) / page.STREAM_PERIOD_S + 2
 
 
 async def test_a_stream_ends_at_once_with_the_service(service):

@@ -181,7 +181,7 @@ def test_the_simulator_is_reached_through_the_same_program():
     assert found.stderr.startswith("sim_rtc: ")
 
 
-@pytest.mark.parametrize("words", [["campaign", "--plant", "linear"], ["demo", "--seconds", "9"]])
+@pytest.mark.parametrize("words", [["sim", "--plant", "linear"], ["demo", "--seconds", "9"]])
 def test_each_has_a_module_of_its_own(monkeypatch, words):
     asked = []
     monkeypatch.setattr(os, "execv", lambda *given: asked.extend(given))

@@ -78,7 +78,7 @@ def loaded(tmp_path_factory):
         path = folder / "bench.toml"
         path.write_text(f"{TABLE}modes_pitch_m = {STEP_M}\n{mirror}")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(crops, "_MANY", 0 if local else np.inf)
+            patch.setattr(crops, "_MIN_CROPPED_FUNCTIONS", 0 if local else np.inf)
             return load_instrument(path)
 
     return load

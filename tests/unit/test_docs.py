@@ -18,9 +18,8 @@ from cacao_bridge.__main__ import arguments_parser
 from cacao_bridge.settings import load as load_bridge
 from check_rtc.__main__ import check_parser
 from pyrcal.arguments import command_line, with_negative_numbers
+from pyrcal.demo.arguments import demo_parser
 from pyrcal.offline.system_file import load_system
-from pyrcal_studies.campaign.__main__ import campaign_parser
-from pyrcal_studies.demo.arguments import demo_parser
 from service.api import create_app
 from service.config import load_instrument, load_settings
 from service.tracking.alarms import ALARMS
@@ -92,8 +91,6 @@ def check_pyrcal(words):
                 check_parser().parse_args(rest)
             case "cacao":
                 arguments_parser().parse_args(rest)
-            case "campaign":
-                campaign_parser().parse_args(rest)
             case "sim":
                 parse_options([word.replace("bench.toml", "flao-lbt") for word in rest])
             case _:

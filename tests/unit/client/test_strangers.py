@@ -76,7 +76,7 @@ STRANGE = {
 
 @pytest.mark.parametrize("name", STRANGE)
 def test_whatever_answers_it_ends_soon_with_one_line_and_status_3(capsys, monkeypatch, name):
-    monkeypatch.setattr(rest, "ANSWER_WITHIN_S", 0.3)
+    monkeypatch.setattr(rest, "REQUEST_TIMEOUT_S", 0.3)
     with saying(STRANGE[name]) as (url, _):
         assert main(["status", "--url", url]) == 3
     told = capsys.readouterr()
@@ -159,7 +159,7 @@ def line(text, t_utc="1970-01-01T00:00:09.5Z"):
 
 @pytest.fixture
 def latest(monkeypatch):
-    monkeypatch.setattr(watch, "AGAIN_S", 0.01)
+    monkeypatch.setattr(watch, "RECONNECT_S", 0.01)
     return watch.Latest()
 
 
@@ -182,7 +182,7 @@ def test_who_was_cut_off_comes_back_where_it_was(latest):
 
 
 def test_a_stream_that_falls_silent_is_lost(latest, monkeypatch):
-    monkeypatch.setattr(watch, "SILENT_S", 1.0)
+    monkeypatch.setattr(watch, "MAX_SILENCE_S", 1.0)
 
     def falls_silent(connection):
         connection.sendall(stream(event("state", told())))

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from pyrcal_studies.demo.__main__ import main
-from pyrcal_studies.demo.arguments import demo_parser
-from pyrcal_studies.demo.run import _beginning, _commands, _emptied, _promise, _say, _too_large
+from pyrcal.demo.__main__ import main
+from pyrcal.demo.arguments import demo_parser
+from pyrcal.demo.run import _beginning, _commands, _emptied, _promise, _say, _too_large
 from service.errors import ConfigurationError
 from sim_rtc.options import parse_options
 
@@ -152,7 +152,7 @@ def test_the_demo_refuses_an_argument_in_one_line_before_it_starts_anything(
 ):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pyrcal_studies.demo.run.children", None)  # whoever starts something fails
+    monkeypatch.setattr("pyrcal.demo.run.children", None)  # whoever starts something fails
     words = ["--dir", str(tmp_path / "demo"), option, value]
     try:
         status = main(words)

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from pyrcal.arguments import with_negative_numbers
-from pyrcal_studies.demo.arguments import demo_parser
+from pyrcal.demo.arguments import demo_parser
 from service.cli.program import imported_and_run
 
 
@@ -16,7 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = demo_parser().parse_args(with_negative_numbers(words))
 
     def load() -> Callable[[], int]:
-        from pyrcal_studies.demo.run import run_demo
+        from pyrcal.demo.run import run_demo
 
         return lambda: run_demo(options)
 

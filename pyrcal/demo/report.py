@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from pyrcal_studies.demo.truth import TruthFile
+from pyrcal.demo.truth import TruthFile
 from service.model.misregistration import PARAMETERS
+from service.tracking.alarms import WORKER_BEHIND
 
 TOLERANCE = {
     "shift_x_subap": 0.02,
@@ -26,9 +27,6 @@ MAX_ERROR_IN_SIGMA = 4.0
 
 LONG_S = 5.0
 """What has been missing for so long is missing."""
-
-WORKER_BEHIND = "worker-behind"
-"""The alarm that says so: the estimate may come late, and the demo waits for it."""
 
 MODEL = "model"
 """Name of what the service waits for until its model is prepared."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-from pyrcal_studies.demo.report import Report, strehl_ratio
-from pyrcal_studies.demo.truth import TruthFile
+from pyrcal.demo.report import Report, strehl_ratio
+from pyrcal.demo.truth import TruthFile
 
 BEFORE, BETWEEN, AFTER = "#c0392b", "#7f8c8d", "#1f6fb2"
 """Colours of the RTC's own matrix, of the service's first, and of that with more modes."""

@@ -9,28 +9,34 @@ from typing import Any
 
 import httpx
 
-from pyrcal_studies.demo.children import Child
-from pyrcal_studies.demo.report import (
+from pyrcal.demo.children import Child
+from pyrcal.demo.report import (
     MODEL,
     REAL_TIME,
     TOLERANCE_ACROSS_SUBAP,
-    WORKER_BEHIND,
     Circumstances,
     Report,
     make_report,
     waits,
 )
-from pyrcal_studies.demo.truth import Line, TruthFile
+from pyrcal.demo.truth import Line, TruthFile
 from service.model.misregistration import PARAMETERS
+from service.tracking.alarms import WORKER_BEHIND
 
 POLL_S = 0.5
-LINE_S = 2.0
+"""Time between two requests to the service, seconds."""
+
+PRINT_PERIOD_S = 2.0
+"""Time between two printed lines, seconds."""
+
 HEADING_EVERY = 20
+"""Printed lines between two headings."""
 
-FRESH_S = 1.5
-"""An answer older than this is not shown as if it were one of now."""
+MAX_ANSWER_AGE_S = 1.5
+"""Age beyond which an answer is not printed as current, seconds."""
 
-ANSWER_WITHIN_S = 1.0
+REQUEST_TIMEOUT_S = 1.0
+"""Timeout of a request, seconds."""
 
 PREPARE_WITHIN_S = 180.0
 """Until service and simulator are ready; a slow machine without a cache needs a third of it."""
@@ -57,8 +63,8 @@ LARGE_STRETCH = 60.0
 SLOW_STRETCH = 2.0
 """... and so many times the telemetry: where the simulator is slow, the service is."""
 
-_LINE_S = 0.5
-"""Loop time between two lines of the truth: one more than the wall clock allows may be there."""
+_TRUTH_PERIOD_S = 0.5
+"""Loop time between two lines of the truth file, seconds. It may be one line ahead of the clock."""
 
 View = dict[str, Any]
 
@@ -81,7 +87,7 @@ class Stopwatch:
         """
         step_s = (telemetry_ns - self._telemetry_ns) / 1e9
         if step_s != 0.0:
-            self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _LINE_S)
+            self.telemetry_s += min(max(step_s, 0.0), now_s - self._grown_s + _TRUTH_PERIOD_S)
             self._grown_s = now_s
         self._alive_s = max(self._grown_s, frames_grown_s or 0.0)
         if now_s - self._alive_s > SILENCE_S:
@@ -177,7 +183,7 @@ class TelemetryObserver:
             self._look()
             if time.monotonic() >= next_line_s:
                 self._say_lines(n_lines)
-                n_lines, next_line_s = n_lines + 1, time.monotonic() + LINE_S
+                n_lines, next_line_s = n_lines + 1, time.monotonic() + PRINT_PERIOD_S
             time.sleep(POLL_S)
 
     def report(self, refusal: str | None = None) -> Report:
@@ -228,7 +234,7 @@ class TelemetryObserver:
                 return True
             if waited_s >= next_line_s:
                 self._say(f"{waited_s:7.1f}  preparing: {awaited(self._state)}")
-                next_line_s = waited_s + LINE_S
+                next_line_s = waited_s + PRINT_PERIOD_S
             time.sleep(POLL_S)
         return False
 
@@ -300,7 +306,7 @@ class TelemetryObserver:
             self._say_once(slower)
         seconds = 0.0 if clock is None else clock.wall_s
         silent_s = time.monotonic() - self._answered_s
-        if silent_s > FRESH_S:
+        if silent_s > MAX_ANSWER_AGE_S:
             self._say(f"{seconds:7.1f}  no answer from the service for {silent_s:.0f} s")
         else:
             self._say(live_line(seconds, self._state, self._truth.last))

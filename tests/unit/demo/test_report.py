@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import pytest
 
-from pyrcal_studies.demo.report import Circumstances, Report, Stage, make_report, table
-from pyrcal_studies.demo.truth import TruthFile
+from pyrcal.demo.report import Circumstances, Report, Stage, make_report, table
+from pyrcal.demo.truth import TruthFile
 
 TRUE = {"shift_x_subap": 0.1, "shift_y_subap": 0.0, "rotation_deg": 0.2, "magnification": 1.003}
 SIGMA = {
@@ -118,7 +118,7 @@ def test_a_night_that_won_less_than_was_promised_fails(truth):
 
 def test_the_picture_shows_both_stages(truth, tmp_path):
     pytest.importorskip("matplotlib")
-    from pyrcal_studies.demo.figure import draw
+    from pyrcal.demo.figure import draw
 
     for line in truth.lines:
         line["n_controlled"] = 500 if line["cm_id"] == "cm-500" else 400

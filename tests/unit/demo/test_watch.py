@@ -5,9 +5,9 @@ import time
 import httpx
 import pytest
 
-from pyrcal_studies.demo.children import Child
-from pyrcal_studies.demo.truth import TruthFile
-from pyrcal_studies.demo.watch import (
+from pyrcal.demo.children import Child
+from pyrcal.demo.truth import TruthFile
+from pyrcal.demo.watch import (
     HEADING,
     HOLD_S,
     STRETCH,
@@ -19,7 +19,7 @@ from pyrcal_studies.demo.watch import (
     rate_line,
     slow_line,
 )
-from tests.unit.studies.demo.test_report import TRUE, service_state, shelf, waiting
+from tests.unit.demo.test_report import TRUE, service_state, shelf, waiting
 
 SECOND_NS = 1_000_000_000
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import httpx
 
-from pyrcal_studies.demo.arguments import FORWARDED, REPEATED
-from pyrcal_studies.demo.children import children, interrupted_by_any_end
-from pyrcal_studies.demo.report import table
-from pyrcal_studies.demo.truth import TruthFile
-from pyrcal_studies.demo.watch import ANSWER_WITHIN_S, USUAL_RATE_HZ, Promise, TelemetryObserver
+from pyrcal.demo.arguments import FORWARDED, REPEATED
+from pyrcal.demo.children import children, interrupted_by_any_end
+from pyrcal.demo.report import table
+from pyrcal.demo.truth import TruthFile
+from pyrcal.demo.watch import REQUEST_TIMEOUT_S, USUAL_RATE_HZ, Promise, TelemetryObserver
 from service.config.instrument_schema import (
     AboutTable,
     InstrumentFile,
@@ -36,8 +36,8 @@ LIVE_INSTRUMENT = "instrument.toml"
 USUAL_MAGNITUDE, USUAL_DIAMETER_M = 8.0, 8.22
 """Star of the simulator, and telescope that it is meant for."""
 
-OWN = "flao-lbt"
-"""The instrument of the demo unless another is asked for."""
+DEFAULT_INSTRUMENT = "flao-lbt"
+"""Instrument of the demo unless another one is given."""
 
 WANTED_RATIO, OTHER_RATIO = 1.5, 1.25
 """Of the wavefront error before and after, where the night begins far away: of FLAO, and of any
@@ -58,23 +58,23 @@ MEASURED_RATIO = 1 / 1.1
 """Of a measured plant, which begins with the reconstructor of the measurement itself: the service's
 may leave a tenth more."""
 
-PLACE = """\
+PLACE_TEXT = """\
 The mirror lies 0.4 subapertures and 0.65 deg from where the RTC's matrix has it."""
-FAR = f"""\
-{PLACE} With that matrix a
+FAR_TEXT = f"""\
+{PLACE_TEXT} With that matrix a
 loop of 400 modes diverges, so the RTC begins with 120. WFE is what the simulator knows to be left.
 """
-OTHER_FAR = f"""\
-{PLACE} The RTC begins
+OTHER_FAR_TEXT = f"""\
+{PLACE_TEXT} The RTC begins
 with 120 modes, or with seven tenths of them all where that is fewer. WFE is what the simulator
 knows to be left.
 """
-SMALL_FAR = f"""\
-{PLACE} The RTC begins
+SMALL_FAR_TEXT = f"""\
+{PLACE_TEXT} The RTC begins
 with a third of its modes, on a star that gives this small telescope the light of an 8 m telescope
 at magnitude 8. WFE is what the simulator knows to be left.
 """
-LARGE = """\
+TOO_LARGE_TEXT = """\
 This telescope is too large for real time: {gflop_s:.0f} GFLOP/s at {rate_hz:g} Hz. Its loop runs as
 fast as this machine goes: at the highest rate that it holds or, where a dither needs more, in slow
 motion. Until all is ready takes minutes: modes (kept on disk afterwards), D and its derivatives,
@@ -106,7 +106,7 @@ def run_demo(options: argparse.Namespace) -> int:
     _say(f"REST       {url}/v1/state   logs and truth: {options.dir}\n")
     large = _too_large(options)
     if large is not None:
-        _say(LARGE.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
+        _say(TOO_LARGE_TEXT.format(gflop_s=large.gflop_s, rate_hz=large.rate_hz))
     if _is_far(options):
         _say(_beginning(options))
     commands = {
@@ -114,7 +114,7 @@ def run_demo(options: argparse.Namespace) -> int:
         "simulator": ["-m", "sim_rtc", *sim_words],
     }
     with (
-        httpx.Client(base_url=url, timeout=ANSWER_WITHIN_S) as client,
+        httpx.Client(base_url=url, timeout=REQUEST_TIMEOUT_S) as client,
         interrupted_by_any_end(),
         children(options.dir, commands) as started,
     ):
@@ -127,7 +127,7 @@ def run_demo(options: argparse.Namespace) -> int:
         report = watch.closing_report()
     _say(table(report))
     if options.plot is not None:
-        from pyrcal_studies.demo.figure import draw
+        from pyrcal.demo.figure import draw
 
         draw(report, truth, options.plot)
     if options.json is not None:
@@ -148,9 +148,9 @@ def _is_far(options: argparse.Namespace) -> bool:
 
 def _beginning(options: argparse.Namespace) -> str:
     """Return what a night that begins far away begins with; 400 modes are FLAO's."""
-    if options.instrument == OWN:
-        return FAR
-    return OTHER_FAR if _small_m(options) is None else SMALL_FAR
+    if options.instrument == DEFAULT_INSTRUMENT:
+        return FAR_TEXT
+    return OTHER_FAR_TEXT if _small_m(options) is None else SMALL_FAR_TEXT
 
 
 def _small_m(options: argparse.Namespace) -> float | None:
@@ -224,7 +224,7 @@ def _promise(options: argparse.Namespace) -> Promise:
         wanted_ratio=_wanted_ratio(options),
         across_subap=_across_subap(read_instrument_file(options.instrument)),
         measured_plant=_is_measured(options),
-        held_rate=options.instrument != OWN,
+        held_rate=options.instrument != DEFAULT_INSTRUMENT,
         large=large is not None,
         asked_rate_hz=USUAL_RATE_HZ if large is None else large.rate_hz,
     )
@@ -235,7 +235,7 @@ def _wanted_ratio(options: argparse.Namespace) -> float:
         return MEASURED_RATIO
     if not _is_far(options) or _too_large(options) is not None:
         return 1.0
-    if options.instrument == OWN:
+    if options.instrument == DEFAULT_INSTRUMENT:
         return WANTED_RATIO
     few = _n_modes(options) <= FEW_MODES or _small_m(options) is not None
     return FEW_RATIO if few else OTHER_RATIO
@@ -302,7 +302,7 @@ def _commands(options: argparse.Namespace) -> tuple[list[str], list[str]]:
     simulator = ["--connect", endpoint, "--seed", str(options.seed)]
     simulator += ["--instrument", options.instrument]
     simulator += ["--truth", str(options.dir / "truth.jsonl"), "--quiet"]
-    if options.instrument != OWN:
+    if options.instrument != DEFAULT_INSTRUMENT:
         simulator.append("--held-rate")
     large = _too_large(options)
     if large is not None:

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pyrcal_studies.demo.children import GRACE_S, children, interrupted_by_any_end
+from pyrcal.demo.children import GRACE_S, children, interrupted_by_any_end
 from tests.system.night import session_members, wait_for
 from tests.system.pace import in_time
 

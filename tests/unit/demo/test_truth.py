@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from pyrcal_studies.demo.truth import TruthFile
+from pyrcal.demo.truth import TruthFile
 
 
 def line(second, error_nm, cm_id="a", kind="truth"):

@@ -413,9 +413,7 @@ class Observatory:
         matrix, record = self._actions.matrix(in_use), self.state.reconstructor(in_use)
         self._engine.learn(in_use, matrix)
         if record is not None:
-            read = read_own_matrix(
-                record, matrix, self.state, self._workers, self._actions.matrix
-            )
+            read = read_own_matrix(record, matrix, self.state, self._workers, self._actions.matrix)
             for event in asyncio.run(read):
                 self._in(self.latencies.listen_s, partial(self._post, event))
 

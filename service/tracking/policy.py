@@ -142,6 +142,9 @@ class Policy:
     """``(4,)`` 1 σ of a window or of α that is too large to be useful, numeric units, beyond what
     the model error adds."""
 
+    tolerance: NDArray[np.float64]
+    """``(4,)`` how much more misregistration this loop tolerates than that of FLAO, 1 or more."""
+
     acquires: bool
     """Whether the service finds α from nothing by itself, in mode auto."""
 

@@ -94,7 +94,7 @@ class Plan:
     instrument: str = INSTRUMENT
     seed: int = 1
     n_first: int = N_FIRST
-    seconds: float = 45.0
+    seconds: float = 36.0
     slope_noise: float = SLOPE_NOISE
     settings: tuple[tuple[str, float | str | bool], ...] = ()
 
@@ -111,9 +111,13 @@ class ModalDome(Dome):
         seed: int = 1,
         slope_noise: float = SLOPE_NOISE,
         n_first: int = N_FIRST,
-        wind: bool = True,
+        own: Array | None = None,
     ) -> None:
-        """Take the plant's matrix ``(n_slopes, n_modes)`` and its registration, for the record."""
+        """Take the plant's matrix ``(n_slopes, n_modes)`` and its registration, for the record.
+
+        ``own`` ``(n_first, n_slopes)`` is the reconstructor that the RTC begins with; None: the
+        pseudo-inverse of the first columns of the plant's matrix.
+        """
         n_modes = response.shape[1]
         self.instrument, self.rate_hz = instrument, FRAME_RATE_HZ
         self.jump_times_s, self.frame, self.moments, self.orders = (), 0, [], []
@@ -135,7 +139,9 @@ class ModalDome(Dome):
             basis_id=instrument.basis_id or "plant-1",
             config_id=instrument.config_id or "plant-1",
         )
-        own = np.linalg.pinv(response[:, :n_first]).astype(np.float32)
+        if own is None:
+            own = np.linalg.pinv(response[:, :n_first])
+        own = own.astype(np.float32)
         self.computer = RealTimeComputer(
             self._blocks(),
             identity=identity,
@@ -201,7 +207,7 @@ class ModalDome(Dome):
 
 
 @lru_cache(maxsize=2)
-def _models(file: str) -> tuple[Instrument, RtcInteractionModel, InteractionModel]:
+def models_of(file: str) -> tuple[Instrument, RtcInteractionModel, InteractionModel]:
     """Return the instrument, its model, and the model of a mirror with another coupling."""
     instrument = load_instrument(file)
     basis = analytic_basis(instrument)
@@ -220,7 +226,7 @@ def _models(file: str) -> tuple[Instrument, RtcInteractionModel, InteractionMode
 
 def wrong_response(plan: Plan) -> Array:
     """Return a plant ``(n_slopes, n_modes)`` that the model explains but for ``plan.error``."""
-    _, model, other = _models(plan.instrument)
+    _, model, other = models_of(plan.instrument)
     rng = np.random.default_rng([plan.seed, 36])
     alpha = true_alpha(plan)
     drawn = model.interaction_matrix(alpha).astype(float)
@@ -268,7 +274,7 @@ def response_of(plan: Plan) -> Array:
 
 def fitted_alpha(plan: Plan, response: Array) -> Misregistration:
     """Return the registration that best explains all columns of the plant's matrix."""
-    _, model, _ = _models(plan.instrument)
+    _, model, _ = models_of(plan.instrument)
     start = true_alpha(plan) if not plan.matrix else model.instrument.start
     found = recognise_modes(
         np.linalg.pinv(response, rcond=1e-6).astype(np.float32), model.linearise, start
@@ -286,7 +292,7 @@ def best_nm(plan: Plan, n_modes: int) -> float:
 @lru_cache(maxsize=16)
 def _best_nm(plan: Plan, n_modes: int) -> float:
     """Return the same; whatever the service does on this plant, it is computed once."""
-    instrument, *_ = _models(plan.instrument)
+    instrument, *_ = models_of(plan.instrument)
     dome = ModalDome(
         instrument,
         response_of(plan),
@@ -308,7 +314,7 @@ def late_nm(moments: Sequence[Moment]) -> float:
 
 def stable_modes(plan: Plan, response: Array, alpha: Misregistration) -> int:
     """Return how many modes the model's reconstructor at ``alpha`` holds on the plant."""
-    _, model, _ = _models(plan.instrument)
+    _, model, _ = models_of(plan.instrument)
     matrix, most = model.interaction_matrix(alpha), 0
     for n in range(1, response.shape[1] + 1):
         inverse = np.linalg.pinv(matrix[:, :n], rcond=0.01)
@@ -321,8 +327,9 @@ def stable_modes(plan: Plan, response: Array, alpha: Misregistration) -> int:
 class Night(Observatory):
     """The service at such a plant; keeps what alarms have said and when."""
 
-    def __init__(self, plan: Plan, response: Array) -> None:
-        instrument, *_ = _models(plan.instrument)
+    def __init__(self, plan: Plan, response: Array, own: Array | None = None) -> None:
+        """Take the plant's matrix and, if it is another than that of the plan, the RTC's own."""
+        instrument, *_ = models_of(plan.instrument)
         settings = load_settings(None, {}, dict(plan.settings))
         self.said: dict[tuple[str, str], float] = {}
         dome = ModalDome(
@@ -332,6 +339,7 @@ class Night(Observatory):
             seed=plan.seed,
             slope_noise=plan.slope_noise,
             n_first=plan.n_first,
+            own=own,
         )
         super().__init__(
             (),
@@ -376,18 +384,19 @@ def play(plan: Plan) -> Row:
 def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> Row:
     """Return what came of a run."""
     registration, last = night.state.alpha.registration, night.dome.moments[-1]
-    row: Row = {"fit": fit.to_boundary(), "truth": true_alpha(plan).to_boundary()}
+    row: Row = {"fit": fit.to_boundary()}
     if registration is not None:
         off = registration.alpha.vector - fit.vector
-        error = registration.alpha.vector - true_alpha(plan).vector
         row |= {
             "alpha": registration.alpha.to_boundary(),
             "off_sigma": (off / registration.sigma).tolist(),
-            "error_sigma": (error / registration.sigma).tolist(),
             "sigma": (registration.sigma * BOUNDARY_SCALE).tolist(),
             "off": (off * BOUNDARY_SCALE).tolist(),
             "validity": str(registration.validity.level),
         }
+        if not plan.matrix:  # nobody knows the true registration of a measured one
+            error = registration.alpha.vector - true_alpha(plan).vector
+            row |= {"error_sigma": (error / registration.sigma).tolist()}
     proposed = [r for r in night.state.matrices.reconstructors if r.parent is not None]
     first_ns = min((r.created_ns_utc for r in proposed), default=None)
     return row | {
@@ -456,20 +465,27 @@ def summary(rows: Iterable[Row]) -> str:
         groups.setdefault((kind, row["mode"]), []).append(row)
     for (kind, mode), group in groups.items():
         off = np.array([row["off_sigma"] for row in group if "off_sigma" in row])
-        error = np.array([row["error_sigma"] for row in group if "off_sigma" in row])
+        error = np.array([row["error_sigma"] for row in group if "error_sigma" in row])
         first = [row["first_s"] for row in group if row["first_s"] is not None]
         ratio = [row["late_nm"] / row["best_nm"] for row in group]
         n_all = sum(row["n_modes"] == row["n_stable"] for row in group)
         text += line(
             *(kind, mode, len(group)),
-            *(f"{np.sqrt(np.mean(off**2)):.2f}", f"{np.abs(off).max():.1f}"),
-            *(f"{np.sqrt(np.mean(error**2)):.2f}", f"{np.abs(error).max():.1f}"),
+            *_rms_and_largest(off),
+            *_rms_and_largest(error),
             *(f"{np.median(first):.0f}", f"{max(first):.0f}"),
             f"{n_all} of {len(group)}",
             *(f"{np.median(ratio):.3f}", f"{max(ratio):.3f}"),
             sum(bool(row["said"]) for row in group),
         )
     return text
+
+
+def _rms_and_largest(errors: Array) -> tuple[str, str]:
+    """Return both of errors in σ, in words; of none a dash."""
+    if not errors.size:
+        return "-", "-"
+    return f"{np.sqrt(np.mean(errors**2)):.2f}", f"{np.abs(errors).max():.1f}"
 
 
 def main() -> int:
@@ -479,7 +495,7 @@ def main() -> int:
     parser.add_argument("--modes", nargs="+", default=["auto"], help="auto, propose")
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--first", type=int, default=1, help="first draw")
-    parser.add_argument("--seconds", type=float, default=45.0, help="of each run")
+    parser.add_argument("--seconds", type=float, default=36.0, help="of each run")
     parser.add_argument("--matrix", default="", help="a measured matrix instead, npz with D")
     parser.add_argument("--instrument", default=INSTRUMENT, help="its instrument file")
     parser.add_argument(

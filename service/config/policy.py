@@ -112,6 +112,7 @@ def policy_of(settings: Settings, instrument: Instrument | None = None) -> Polic
         slew_limit_deg=tracking.slew_limit_deg,
         stale_sigma=_stale_sigma(settings, instrument),
         useless_sigma=USELESS / BOUNDARY_SCALE * tolerance_scale(settings, instrument),
+        tolerance=tolerance_scale(settings, instrument),
         acquires=settings.acquisition.auto,
         acquisition_amplitude_m=settings.acquisition.amplitude_m,
         n_modes_target=control.n_modes_target,

@@ -68,7 +68,8 @@ SITTING_LADDER = (1, 2, 3, 5, 8, 12)
 """Windows in one sitting."""
 
 USABLE = np.array([0.03, 0.03, np.deg2rad(0.04), 0.003])
-"""1 σ of one window above which its fit may be biased by noise, numeric units."""
+"""1 σ of one window above which its fit may be biased by noise by more than a loop of FLAO
+notices, numeric units."""
 
 CHANGE = 1.25
 """The amplitude stays while the best one is within this factor of it."""
@@ -305,9 +306,9 @@ def _requirement(
     lengths = window_lengths_s(policy)
     if rtc.magnitude is not None and rtc.magnitude >= FAINT_MAGNITUDE:
         lengths = tuple(s for s in lengths if s >= FAINT_WINDOW_S) or lengths[-1:]
-    return replace(
-        requirement, window_s=dither.choose_window_s(kappa, requirement, USABLE, lengths)
-    )
+    usable = USABLE * policy.tolerance
+    window_s = dither.choose_window_s(kappa, requirement, usable, lengths)
+    return replace(requirement, window_s=window_s)
 
 
 def _lasting_s(phase: DitherPhase) -> float:

@@ -141,6 +141,9 @@ class Policy:
     """``(4,)`` 1 σ of a window or of α that is too large to be useful, numeric units, beyond what
     the model error adds."""
 
+    tolerance: NDArray[np.float64]
+    """``(4,)`` how much more misregistration this loop tolerates than that of FLAO, 1 or more."""
+
     acquires: bool
     """True if the service acquires an unknown α on its own initiative, in mode auto."""
 

@@ -107,6 +107,8 @@ def test_a_coarse_basis_tolerates_more():
     wider = np.sqrt(500 / 40)
     scale = np.array([wider * 11 / 30, wider * 11 / 30, wider, wider])
     np.testing.assert_allclose(coarse.useless_sigma, scale * usual.useless_sigma)
+    np.testing.assert_allclose(coarse.tolerance, scale)
+    np.testing.assert_array_equal(usual.tolerance, 1.0)
     np.testing.assert_allclose(coarse.update_threshold, scale * usual.update_threshold)
     given = load_settings(None, {"PYRCAL_CONTROL__UPDATE_SHIFT_SUBAP": "0.01"})
     threshold = policy_of(given, load_instrument("tests/data/bench.toml")).update_threshold

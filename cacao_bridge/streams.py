@@ -218,6 +218,8 @@ class Stream:
         self._index = memoryview(self._map)[296:300].cast("I")
         self._writing = memoryview(self._map)[288:289]
         self._offset: int | None = None
+        self._shift: int | None = 0 if self._is_cube else None
+        """Slot of the newest frame less the one that the writer's index names; None: not known."""
         self._adrift_s = math.inf
         """Since when ring and counter have not been seen together."""
         self._writers: list[tuple[int, float]] = []
@@ -387,6 +389,8 @@ class Stream:
         first time when it is the same several times. None: not now; a busy machine may put a
         writer aside in the midst of a frame.
         """
+        if self._shift is None and (shift := self._find_shift()) is not None:
+            self._shift, self._offset = shift, None  # learned before from frames all alike
         turn, now_s = settled(self._seen_turn, self._offset), time.monotonic()
         if turn is not None and self._offset in {None, turn}:
             self._offset, self._adrift_s = turn, math.inf
@@ -402,7 +406,28 @@ class Stream:
         counter = self.counter
         if not idle or self._writing[0] or (place, counter) != (self._place, self.counter):
             return None
-        return (place - counter) % len(self._slots)
+        return (place + (self._shift or 0) - counter) % len(self._slots)
+
+    def _find_shift(self) -> int | None:
+        """Return how far the newest frame's slot is from the one that the writer's index names.
+
+        The library's index names the newest slot; other writers leave it at the next one to be
+        written, the oldest. The data of the stream itself tells. None: not now, as frames are
+        written too fast, or not yet, as several slots hold the same numbers.
+        """
+        for _ in range(_TRIES):
+            counter, place = self.counter, self._place
+            alike = np.flatnonzero(self._same_as_newest())
+            if self._writing[0] or (counter, place) != (self.counter, self._place):
+                continue
+            return int((alike[0] - place) % len(self._slots)) if len(alike) == 1 else None
+        return None
+
+    def _same_as_newest(self) -> NDArray[np.bool_]:
+        """Return for each slot of the ring whether it holds the frame of the stream, bit by bit."""
+        newest = self._data[0].view(f"u{self._data.itemsize}")
+        found: NDArray[np.bool_] = (self._slots.view(newest.dtype) == newest).all(axis=1)
+        return found
 
     @property
     def _place(self) -> int:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.figures import PAPER_MODES, check_plots
 from service.errors import MatrixError
+from service.files.whole import open_hdf5
 from service.model.instrument import Instrument
 from service.model.pupil import rtc_valid_subapertures, valid_subapertures
 from service.model.slopes import as_maps, to_conventions
@@ -69,7 +69,7 @@ class Pair:
             If the file is not one, or of another instrument.
         """
         try:
-            with h5py.File(path, "r", locking=False) as file:
+            with open_hdf5(path) as file:
                 names = ("interaction_matrix", "synthetic", "element_noise", "optical_gain", "snr")
                 values = {name: np.asarray(file[name][()], float) for name in names}
                 facts = dict(file.attrs)

@@ -25,7 +25,7 @@ from service.estimation.frames import FrameBlock
 from service.files.last_telemetry import LastTelemetry
 from service.files.recording import Message, RecordedKind, RecordingWriter
 from service.link import session as link
-from service.link.guard import LinkGuard
+from service.link.guard import LinkGuard, count_waiting
 from service.link.intake import Intake
 from service.link.leader_election import Standby
 from service.link.matrices import LinkEvent, MeasuredIntake, Offer, Outbox
@@ -171,6 +171,7 @@ class Bridge:
             self._intake.statistics(),
             refusals=self.guard.refusals(),
             ending_certificates=self.guard.ending(),
+            waiting_connections=count_waiting(self._endpoint.listen),
         )
 
     def keep(self, recorder: RecordingWriter | None, before_s: float = 0.0) -> float:

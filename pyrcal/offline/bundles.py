@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from service.files.bundle import RECONSTRUCTOR, Bundle, read_bundle, write_bundl
 from service.files.container import NUMPY_DAMAGE
 from service.files.disk_cache import cached_basis
 from service.files.documents import json_text
+from service.files.whole import open_hdf5
 from service.model.instrument import Instrument, instrument_sha256
 from service.model.interaction import RtcInteractionModel
 from service.model.modes import ModalBasis
@@ -66,7 +66,7 @@ def _whole(
     options: argparse.Namespace, instrument: Instrument, path: Path, record: ReconstructorRecord
 ) -> Bundle:
     """Return an archived product, what is asked for beside it, and the basis it is of."""
-    with h5py.File(path, "r", locking=False) as file:
+    with open_hdf5(path) as file:
         names = {RECONSTRUCTOR: RECONSTRUCTOR, **_BESIDE}
         arrays = {name: np.asarray(file[at][()]) for name, at in names.items() if at in file}
         provenance = {
@@ -98,7 +98,7 @@ def _whole(
 def _record_in(path: Path) -> ReconstructorRecord:
     """Return the record in an archived product, its matrix held against it."""
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        with open_hdf5(path) as file:
             record = from_json(file.attrs["record"], ReconstructorRecord)
             told, found = file.attrs["sha256"], checksum(np.asarray(file[RECONSTRUCTOR][()]))
     except NOT_UNDERSTOOD as error:

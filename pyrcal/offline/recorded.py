@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from service.errors import MatrixError
 from service.files.bounds import check_number
 from service.files.container import DATASET, Container, StoredArray, opened
+from service.files.whole import open_hdf5
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ def check_sealed(path: Path) -> None:
     if not h5py.is_hdf5(path):
         return
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        with open_hdf5(path) as file:
             seen = {h5py.h5o.get_info(file.id).addr}
             groups, n_links = [file["/"]], 0
             while groups:

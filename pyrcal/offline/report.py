@@ -24,6 +24,7 @@ from service.control.reconstructor import Inversion, Recipe
 from service.errors import MatrixError
 from service.files.container import put_array, put_covariance
 from service.files.documents import json_text
+from service.files.whole import open_hdf5
 from service.model.kinds import Method, SlopeOrder
 from service.model.misregistration import (
     BOUNDARY_SCALE,
@@ -390,7 +391,7 @@ def read_fit(path: str | Path) -> KnownFit:
     path = Path(path)
     try:
         if h5py.is_hdf5(path):
-            with h5py.File(path, "r", locking=False) as file:
+            with open_hdf5(path) as file:
                 return _of_product(file, path)
         return _of_document(json.loads(path.read_text(encoding="utf-8")), path)
     except (OSError, KeyError, TypeError, ValueError) as error:

@@ -38,6 +38,7 @@ from pyrcal.offline.importers.saved import read_npz
 from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of
 from service.files.recording import Message, RecordedKind
+from service.files.whole import open_hdf5
 from service.model.instrument import Instrument
 from service.tracking.policy import SECOND_NS
 from service.wire import (
@@ -99,7 +100,7 @@ def opened_arrays(path: Path) -> Iterator[Arrays]:
                 found: dict[str, Any] = dict(read_npz(path, max_bytes=None))
                 facts: Mapping[str, Any] = {}
             elif kind_of(path) is FileKind.HDF5:
-                file = stack.enter_context(h5py.File(path, "r", locking=False))
+                file = stack.enter_context(open_hdf5(path))
                 found = {k: v for k, v in file.items() if isinstance(v, h5py.Dataset)}
                 facts = file.attrs
             else:

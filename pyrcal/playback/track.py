@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import h5py
 import structlog
 from threadpoolctl import threadpool_limits
 
@@ -27,7 +26,7 @@ from service.config.settings import Settings
 from service.errors import ConfigurationError, say
 from service.files.documents import json_text
 from service.files.recording import FORMAT, Message, Recording
-from service.files.whole import write_whole
+from service.files.whole import open_hdf5, write_whole
 from service.model.instrument import Instrument
 
 FOUND, NOTHING_FOUND = 0, 1
@@ -92,7 +91,7 @@ def track(
 
 def _is_recording(path: Path) -> bool:
     try:
-        with h5py.File(path, "r", locking=False, swmr=True) as file:
+        with open_hdf5(path, swmr=True) as file:
             return bool(file.attrs.get("format") == FORMAT)
     except (OSError, RuntimeError):  # read as arrays it is refused with the reason
         return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from service.archive.products import (
 from service.archive.serialisation import TrackingFile
 from service.archive.store import FOLDER_MODE, Store
 from service.errors import ArchiveError, StorageError, UnknownIdError
+from service.files.durable import lock_file
 from service.tracking.operation_records import MeasurementRecord
 from service.tracking.products import ReconstructorRecord
 from service.tracking.registration import HistoryEntry
@@ -235,8 +235,11 @@ class Archive:
 def _locked(path: Path) -> IO[str]:
     file = path.open("a")
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+        lock_file(file, path.parent)
+    except BlockingIOError:
         file.close()
         raise ArchiveError(f"{path.parent}: in use by another service") from None
+    except (OSError, StorageError):
+        file.close()
+        raise
     return file

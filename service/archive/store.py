@@ -16,7 +16,7 @@ from service import __version__
 from service.archive.index import Index, Product, begun_ns_utc
 from service.archive.serialisation import NOT_UNDERSTOOD, from_json, to_json
 from service.errors import ArchiveError, StorageError, UnknownIdError
-from service.files.whole import write_whole
+from service.files.whole import open_hdf5, write_whole
 from service.wire import checksum, validate_id
 
 Provenance = str | int | float | bool | NDArray[Any]
@@ -297,7 +297,7 @@ class Store(Folder, Generic[Record]):
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[h5py.File]:
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        with open_hdf5(path) as file:
             yield file
     except FileNotFoundError as error:
         raise ArchiveError(f"{path}: missing, although it was stored") from error

@@ -6,7 +6,6 @@ Quick to import. What the program calls modes and scopes stands here as text; a 
 from __future__ import annotations
 
 import argparse
-import fcntl
 import json
 import logging
 import os
@@ -26,7 +25,8 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from typing_extensions import override
 
-from service.errors import ConfigurationError, PyrcalError, say
+from service.errors import ConfigurationError, PyrcalError, StorageError, say
+from service.files.durable import lock_file
 
 INTERRUPTED = 130
 
@@ -227,11 +227,11 @@ def announced(data_dir: Path, url: str) -> Iterator[None]:
         return
     with note:
         try:
-            fcntl.flock(note, fcntl.LOCK_EX)
+            lock_file(note, path, wait=True)
             json.dump({"data_dir": str(data_dir.absolute()), "url": url}, note)
             note.flush()
             Path(note.name).rename(path)  # whoever finds it finds it locked
-        except OSError as error:
+        except (OSError, StorageError) as error:
             structlog.get_logger().info("service.not-announced", text=str(error))
         try:
             yield
@@ -245,9 +245,9 @@ def running_services() -> tuple[RunningService, ...]:
     if not _is_own(folder):
         return ()
     for path in sorted(folder.glob("*.json")):
-        with suppress(OSError, ValueError, KeyError), path.open() as note:
+        with suppress(OSError, StorageError, ValueError, KeyError), path.open() as note:
             try:
-                fcntl.flock(note, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                lock_file(note, path, shared=True)
             except BlockingIOError:
                 told = json.load(note)
                 found.append(RunningService(Path(told["data_dir"]), told["url"]))

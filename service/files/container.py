@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from service.errors import MatrixError
 from service.files import FileKind, kind_of
 from service.files.bounds import attributes, datasets
+from service.files.whole import open_hdf5
 from service.model.misregistration import COVARIANCE_SCALE, PARAMETERS
 
 MAX_BYTES = 4 << 30
@@ -147,7 +148,7 @@ def opened(path: Path) -> Iterator[Container]:
 @contextmanager
 def _hdf5(path: Path) -> Iterator[Container]:
     try:
-        file = h5py.File(path, "r", locking=False)
+        file = open_hdf5(path)
     except OSError as error:
         raise MatrixError(f"{path}: damaged HDF5 file: {error}") from error
     arrays: dict[str, StoredArray] = {}

@@ -30,11 +30,11 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
-import h5py
 import numpy as np
 import structlog
 
 from service.errors import ConfigurationError
+from service.files.whole import open_hdf5
 
 _log = structlog.get_logger()
 
@@ -104,7 +104,7 @@ class Recording:
             If it cannot be read or is no recording of a version this code knows.
         """
         try:
-            self._file = h5py.File(self._path, "r", swmr=True)
+            self._file = open_hdf5(self._path, swmr=True)
         except OSError as error:
             raise ConfigurationError(f"{self._path}: cannot be read: {error}") from error
         found = (self._file.attrs.get("format"), int(self._file.attrs.get("version", 0)))
@@ -183,9 +183,10 @@ class RecordingWriter:
             If it exists already, or cannot be created.
         """
         try:
-            self._file = h5py.File(self._path, "x", libver="latest")
+            self._file = open_hdf5(self._path, "x", libver="latest")
         except OSError as error:
-            reason = "it exists already" if self._path.exists() else str(error)
+            exists = isinstance(error, FileExistsError)
+            reason = "it exists already" if exists else str(error)
             raise ConfigurationError(f"{self._path}: cannot be created: {reason}") from error
         self._file.attrs.update(
             format=FORMAT, version=VERSION, system=self._system, created_ns=time.time_ns()

@@ -1,14 +1,34 @@
-"""HDF5 files that are complete or absent."""
+"""HDF5 files: opened on every file system, and written so that they are complete or absent."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 
 from service.errors import StorageError
 from service.files.durable import flush
+
+
+def open_hdf5(path: str | Path, mode: str = "r", **options: Any) -> h5py.File:  # noqa: ANN401 - h5py
+    """Open an HDF5 file without locking it, as file systems without locks allow, NFS among them.
+
+    No lock is needed: a file that pyrcal writes is created by one program alone, and is complete
+    before it gets its name, or written so that it may be read meanwhile. All open it like this,
+    for HDF5 refuses a file that one process opens with and without locks. ``options`` are those of
+    ``h5py.File``.
+
+    Raises
+    ------
+    FileExistsError
+        If the mode is ``x`` and there is such a file.
+    OSError
+        If the file cannot be opened.
+    """
+    return h5py.File(path, mode, locking=False, **options)
 
 
 def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
@@ -21,9 +41,9 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
     StorageError
         If the disk refuses.
     """
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        with h5py.File(part, "w") as file:
+        with open_hdf5(part, "w") as file:
             fill(file)
         part.chmod(0o444)
         flush(part)

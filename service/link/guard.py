@@ -4,14 +4,18 @@ zenoh reports each connection that is made, with the name of its certificate; a 
 is counted as refused. What zenoh itself refuses (a TLS handshake, a message that the role does not
 allow) it reports nowhere but in its trace log, a line for each message that it lets through or not:
 that log is not read here. A router of one's own can write it (docs/operate/link.md).
+Connections that were closed before a handshake are counted in the kernel's table of sockets: zenoh
+deals with about ten of them a second, one after the other, and lets nobody else in meanwhile.
 """
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import structlog
@@ -31,6 +35,16 @@ REMEMBERED: Final = 64
 """Most refusals that are told apart; the others are counted together."""
 
 OTHERS: Final = ("others", "several things", "")
+
+HANDSHAKE_FAILURES_HZ: Final = 10.0
+"""Failed TLS handshakes that zenoh deals with in a second: after each it waits for 0.1 s."""
+
+MIN_WAITING: Final = 20
+"""Closed connections from which on an alarm is raised: the next program waits for 2 s."""
+
+_SOCKET_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+_CLOSE_WAIT: Final = "08"
+"""State in the kernel's table of a connection that only the other side has closed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,6 +150,39 @@ class LinkGuard:
         self._refused = {
             key: entry for key, entry in self._refused.items() if now_s - entry[1] < RECENT_S
         }
+
+
+def count_waiting(listen: Sequence[str], tables: Sequence[Path] = _SOCKET_TABLES) -> dict[int, int]:
+    """Return by TLS port how many connections were closed and are not dealt with yet.
+
+    Only ports that have such connections are listed; none is where the kernel has no such table.
+    """
+    addresses = (re.split("[?#]", one)[0] for one in listen if one.startswith("tls/"))
+    ports = {int(one.rpartition(":")[2]) for one in addresses if one[-1:].isdecimal()}
+    found: dict[int, int] = {}
+    for table in tables if ports else ():
+        try:
+            lines = table.read_text(encoding="ascii").splitlines()[1:]
+        except OSError:
+            continue
+        for line in lines:
+            _, local, _, state, *_ = line.split()
+            port = int(local.rpartition(":")[2], 16)
+            if state == _CLOSE_WAIT and port in ports:
+                found[port] = found.get(port, 0) + 1
+    return found
+
+
+def flooded_in_words(waiting: Mapping[int, int]) -> str:
+    """Return which port keeps programs out, and for how long; empty: none does."""
+    return "; ".join(
+        f"{n} connections to port {port} were closed before a handshake. A program that connects "
+        f"there, an RTC that restarts among them, is let in after about "
+        f"{n / HANDSHAKE_FAILURES_HZ:.0f} s, or when they end. Let the firewall admit few new "
+        "connections of each address, or give the RTC a port of its own"
+        for port, n in sorted(waiting.items())
+        if n >= MIN_WAITING
+    )
 
 
 def refused_in_words(refusals: Sequence[Refusal]) -> str:

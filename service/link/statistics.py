@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 RECENT_S: Final = 2.0
@@ -173,6 +173,9 @@ class LinkStatistics:
 
     dispositions: tuple[Disposition, ...] = ()
     """Outcomes of frames and messages by kind, the most frequent first."""
+
+    waiting_connections: Mapping[int, int] = field(default_factory=dict)
+    """Connections closed before a TLS handshake that zenoh has not dealt with yet, by port."""
 
     status_age_s: float | None = None
     """Seconds since the last status of this session was taken in; None: none has been."""

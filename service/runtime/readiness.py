@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from service.link.guard import ending_in_words, refused_in_words
+from service.link.guard import ending_in_words, flooded_in_words, refused_in_words
 from service.link.intake import COALESCED
 from service.link.statistics import MALFORMED, RECENT_S, USED, Disposition, LinkStatistics
 from service.model.misregistration import at_boundary
@@ -65,6 +65,7 @@ COMPLAINTS: Final = (
     alarms.CLOCK_LEAPT,
     alarms.FRAMES_LOST,
     alarms.FRAMES_UNUSED,
+    alarms.LINK_FLOODED,
     alarms.LINK_REFUSED,
     alarms.MESSAGES_REFUSED,
     alarms.NO_FRAMES,
@@ -84,6 +85,7 @@ def complaints(link: LinkStatistics) -> dict[str, str]:
         alarms.FRAMES_UNUSED: _unused(link),
         alarms.MESSAGES_REFUSED: _refused(link),
         alarms.STATUS_FLOOD: _flood(link),
+        alarms.LINK_FLOODED: flooded_in_words(link.waiting_connections),
         alarms.LINK_REFUSED: refused_in_words(link.refusals),
         alarms.CERTIFICATE_ENDING: ending_in_words(link.ending_certificates),
     }

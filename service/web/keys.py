@@ -6,7 +6,6 @@ from, so that a slow hash would protect nothing and cost the service its time wi
 
 from __future__ import annotations
 
-import fcntl
 import hmac
 import os
 import re
@@ -24,7 +23,7 @@ from typing import Annotated
 import msgspec
 
 from service.errors import ConfigurationError, UnknownIdError
-from service.files.durable import replace_file
+from service.files.durable import lock_file, replace_file
 
 PREFIX = "pyrcal_"
 """Of every key: whoever finds one lying about can tell what it is."""
@@ -174,7 +173,7 @@ class KeyFile:
         except OSError as error:
             raise ConfigurationError(f"{self.path.parent}: cannot be used: {error}") from error
         try:
-            fcntl.flock(folder, fcntl.LOCK_EX)
+            lock_file(folder, self.path.parent, wait=True)
             yield
         finally:
             os.close(folder)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from service.config.sources import read_dataset
 from service.errors import ConfigurationError
+from service.files.whole import open_hdf5
 from service.model.instrument import Instrument
 
 Array = NDArray[np.float64]
@@ -168,7 +169,7 @@ def _pitch_m(reference: str) -> float:
     name, _, dataset = reference.rpartition(":/")
     found = None
     if h5py.is_hdf5(name):
-        with h5py.File(name, "r") as opened:
+        with open_hdf5(name) as opened:
             found = opened[dataset].attrs.get("pitch_m")
     try:
         pitch_m = float(np.asarray(found).item())

@@ -6,6 +6,7 @@ the attacker has: nothing, a certificate of his own making, or the viewer's.
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -18,9 +19,10 @@ import zenoh
 
 from service.config.link_tables import AccessTable, TlsTable, UsersTable, ZenohTable, link_security
 from service.errors import LinkError
-from service.link.guard import OPEN, LinkSecurity
+from service.link.guard import MIN_WAITING, OPEN, LinkSecurity
 from service.rtc_bridge import Bridge, Endpoint
 from service.runtime.readiness import complaints
+from service.tracking.alarms import LINK_FLOODED
 from service.wire import LoopRequest, Role
 from service.wire.signing import Signatures
 from tests.system.cable import free_port
@@ -320,6 +322,29 @@ def test_a_stranger_cannot_connect(secured, folder, who):
     with pytest.raises(zenoh.ZError):
         attacker(endpoint, **how).close()
     assert secured.drives()
+
+
+def test_a_flood_of_one_port_is_named_and_an_rtc_is_let_in_at_another(folder):
+    """Sixty connections closed before a handshake keep the first port busy for six seconds."""
+    flooded, free = free_port(), free_port()
+    both = (f"tls/127.0.0.1:{flooded}", f"tls/127.0.0.1:{free}")
+    zenoh_table = tables(folder, flooded).model_copy(update={"listen": both})
+    endpoint = Endpoint(
+        system="bench",
+        listen=both,
+        security=link_security(zenoh_table, "bench"),
+        command_attempts=1,
+    )
+    with Bridge(endpoint) as bridge:
+        for _ in range(60):
+            socket.create_connection(("127.0.0.1", flooded)).close()
+        assert complaints(bridge.statistics()).keys() == {LINK_FLOODED}
+        with FakeRtc(both[1], **certificate(folder / "ours", "rtc")):
+            deadline = Deadline(3.0)
+            while not bridge.statistics().rtc_alive:
+                assert not deadline.passed, "the RTC was not let in"
+                time.sleep(0.01)
+        assert bridge.statistics().waiting_connections[flooded] >= MIN_WAITING
 
 
 def test_an_rtc_is_let_by_nobody_who_only_says_that_he_is_the_service(folder):

@@ -62,6 +62,23 @@ def test_a_name_without_a_role_that_comes_again_and_again_is_one_refusal():
     assert found.where.endswith("tls/10.0.0.9")
 
 
+def test_connections_that_were_closed_before_a_handshake_are_counted_by_port(tmp_path):
+    """The kernel's table: local address and state are the second and fourth column."""
+    table = tmp_path / "tcp"
+    rows = [("1D17", "0A"), *[("1D17", "08")] * 30, ("1D17", "01"), ("1D18", "08"), ("1F90", "08")]
+    lines = [
+        f"  {k}: 0100007F:{port} 0900007F:C350 {s} 0:0 00:0" for k, (port, s) in enumerate(rows)
+    ]
+    table.write_text("\n".join(["  sl  local_address rem_address st", *lines]))
+    listen = ("tls/0.0.0.0:7447", "tls/[::]:7448#iface=eth0", "tcp/127.0.0.1:8080")
+    waiting = guard.count_waiting(listen, (table, tmp_path / "absent"))
+    assert waiting == {7447: 30, 7448: 1}
+    assert guard.flooded_in_words({7448: guard.MIN_WAITING - 1}) == ""
+    assert "port 7447" in guard.flooded_in_words(waiting)
+    assert "3 s" in guard.flooded_in_words(waiting)
+    assert "7448" not in guard.flooded_in_words(waiting)
+
+
 @pytest.mark.parametrize("name", ["link-refused", "certificate-ending"])
 def test_each_has_its_alarm(name):
     from service.tracking.alarms import ALARMS

@@ -158,6 +158,9 @@ class Milk:
         array = np.frombuffer(self.map, self.kind, int(np.prod(shape)), self.at[name])
         return array.reshape(shape)
 
+    names_next = False
+    """Whether the index names the next slot to be written, the oldest, as some writers have it."""
+
     def put(self, values, *triggers):
         """Write a frame, made from the newest of these streams: nearest first."""
         md = self.md
@@ -172,12 +175,12 @@ class Milk:
         for trace, trigger in zip(self.trace, triggers, strict=False):
             trace.trigger_inode, trace.cnt0 = trigger.md.inode, trigger.md.cnt0
         if self.ring is not None:
-            place = md.CBindex + 1
+            place = md.CBindex if self.names_next else md.CBindex + 1
             wrapped = place >= md.CBsize
             place = 0 if wrapped else place
             self.ring[place] = self.data[0]
             md.CBcycle += wrapped
-            md.CBindex = place
+            md.CBindex = (place + self.names_next) % md.CBsize
         now = time.time_ns()
         md.writetime.tv_sec, md.writetime.tv_nsec = divmod(now, 10**9)
         md.cnt0 += 1

@@ -207,6 +207,25 @@ def test_a_ring_that_drifts_from_its_counter_is_refused(path):
         stream.after(0)
 
 
+@pytest.mark.parametrize("rest", [0, 3])
+def test_a_writer_whose_index_names_the_oldest_slot_is_read_right(path, rest):
+    """Frames that are all alike tell nothing: the index is believed until they differ."""
+    milk = Milk(path, (6,), n_ring=8)
+    milk.names_next = True
+    stream, counter = Stream(path), None
+    for _ in range(rest):
+        milk.put(np.zeros(6))
+        frames = stream.after(counter)
+        counter = frames.first
+        assert not frames.values.any()
+    for k in range(rest + 1, 30):
+        milk.put(frame(k))
+        frames = stream.after(counter)
+        assert (frames.first, frames.n_lost) == (k, 0)
+        np.testing.assert_array_equal(frames.values, [frame(k)])
+        counter = k
+
+
 @pytest.mark.parametrize("tells", [True, False])
 def test_a_writer_put_aside_in_the_midst_of_a_frame_costs_nothing(path, tells):
     """It may be so for longer than anybody looks; not every writer says that it is at it."""

@@ -379,9 +379,19 @@ def main():
     parser.add_argument("--inputs", type=int, default=1_050_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--corpus", type=Path, help="folder for what is found")
+    parser.add_argument(
+        "--commands", metavar="READER", nargs="?", const="", help="commands on files"
+    )
     parser.add_argument("--guided", help="kind, with atheris; what else is given is libFuzzer's")
     options, more = parser.parse_known_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    if options.commands is not None:
+        from tests.malformed_commands import every_reader
+
+        n_findings = every_reader(
+            min(options.inputs, 100_000), options.seed, options.corpus, options.commands
+        )
+        return min(n_findings, 1)
     if options.guided:
         guided(next(kind for kind in KINDS if kind.name == options.guided), more)
     rng, rows = random.Random(options.seed), []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
+from pyrcal.offline.advice import Advice, Grounds, explained, recommendation, with_displaced
 from pyrcal.offline.alternatives import alternatives, off_centre
 from pyrcal.offline.columns import displaced_columns, noise_columns, strange_columns
 from pyrcal.offline.control_check import GAIN, check_control
@@ -62,6 +62,7 @@ from service.estimation.orientation import (
     overruled,
 )
 from service.estimation.reference import Reference, Target, is_by_actuator, target_of
+from service.model.aperture import check_mask
 from service.model.instrument import Instrument
 from service.model.kinds import Method, Normalisation
 from service.model.misregistration import Misregistration
@@ -168,7 +169,7 @@ def _fitted(
         tell("modes")
         basis = modal_basis(instrument)
     usable = checked(
-        _selected(reference, options.modes),
+        _with_shape(_selected(reference, options.modes), instrument),
         n_slopes=instrument.slopes.kind.n_planes * int(rtc_valid_subapertures(instrument).sum()),
         n_modes=basis.n_modes,
         wavelength_m=instrument.wfs.wavelength_m,
@@ -176,6 +177,7 @@ def _fitted(
     )
     used = basis.subset(usable.columns)
     tell("orientation")
+    own_mask = instrument.wfs.valid_subapertures is not None
     instrument = _masked(instrument)
     reported = replace(
         instrument.slopes, orientation=options.orientation or instrument.slopes.orientation
@@ -209,7 +211,22 @@ def _fitted(
             replace(instrument, slopes=reported), usable, used, mapper=mapper
         )
         fit = with_displaced(fit, tuple(columns))
-    return fit
+    return _with_mask(fit, instrument) if own_mask else fit
+
+
+def _with_mask(fit: Fit, instrument: Instrument) -> Fit:
+    """Return a fit with what is wrong between mask and pupil, which a refusal may be due to."""
+    x, y = fit.alpha.vector[:2].tolist()
+    difference = check_mask(instrument, (x, y))
+    if difference is None:
+        return fit
+    remarks = fit.remarks
+    if difference not in instrument.remarks:
+        remarks = (*remarks, difference)
+    advised = fit.recommendation
+    if not fit.accepted:
+        advised = f"{Advice.DO_NOT_USE}: {difference}"
+    return replace(fit, remarks=remarks, recommendation=advised)
 
 
 def _without_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
@@ -260,6 +277,26 @@ def _selected(reference: Reference, modes: NDArray[np.intp] | None) -> Reference
         matrix=reference.matrix[:, columns],
         modes=reference.columns[columns],
         noise=None if reference.noise is None else reference.noise[columns],
+    )
+
+
+def _with_shape(reference: Reference, instrument: Instrument) -> Reference:
+    """Return only the columns of modes that have a shape in the instrument file."""
+    flat = np.isin(reference.columns, instrument.mirror.flat_modes)
+    if not flat.any() or flat.all() or reference.matrix.shape[1:] != flat.shape:
+        return reference
+    named = ", ".join(str(mode) for mode in reference.columns[flat][:_NAMED])
+    more = f" and {int(flat.sum()) - _NAMED} more" if flat.sum() > _NAMED else ""
+    noise = reference.noise
+    return replace(
+        reference,
+        matrix=reference.matrix[:, ~flat],
+        modes=reference.columns[~flat],
+        noise=noise[~flat] if noise is not None and noise.shape == flat.shape else noise,
+        left_out=(
+            *reference.left_out,
+            f"without a usable shape in the instrument file: modes {named}{more}",
+        ),
     )
 
 

@@ -201,8 +201,9 @@ def _noise(stored: StoredArray | None, n_modes: int) -> Array | None:
     if stored is None or values is None:
         return None
     if values.shape != (n_modes,) or not np.all(values > 0.0):
+        least = f", least value {np.min(values):g}" if values.size else ""
         raise MatrixError(
-            f"{stored.where}: found shape {values.shape}, least value {np.min(values):g}; "
+            f"{stored.where}: found shape {values.shape}{least}; "
             f"expected the positive 1 sigma of an element for each of {n_modes} columns"
         )
     return values
@@ -212,8 +213,9 @@ def _double_pass(container: Container) -> bool | None:
     given = container.facts.get("double_pass", container.facts.get("dblpass"))
     if given is None:
         return None
-    if isinstance(given, bool | np.bool_) or given in {0, 1}:
-        return bool(given)
+    flag = np.asarray(given)
+    if flag.ndim == 0 and (flag.dtype.kind == "b" or (flag.dtype.kind in "iuf" and flag in (0, 1))):
+        return bool(flag)
     raise MatrixError(f"{container.path}: double_pass: found {given!r}, expected true or false")
 
 

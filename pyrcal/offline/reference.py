@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from service.errors import MatrixError
 from service.estimation.reference import Reference
+from service.model.defects import COPY, find_defects
 from service.model.misregistration import unit_like
 from service.model.slopes import likely_kind
 
@@ -25,6 +27,9 @@ otherwise the columns are at fault."""
 PLAUSIBLE = 1e-4
 """RMS slope per metre of OPD times the wavelength is some units; outside this share of 1 to its
 reciprocal the unit is another one: nanometres and micrometres are 1e-9 and 1e-6."""
+
+FEWEST_TO_COMPARE = 9
+"""Columns from which equal rows are copies: of a few low orders many rows are equal."""
 
 _UNIT_DECADES = 1.5
 """Powers of ten around a unit that are still recognised as it."""
@@ -60,7 +65,7 @@ def checked(
     _check_shape(reference, n_slopes, n_modes)
     reference, silenced = _without_dead_rows(reference)
     kept, left_out = _usable(reference)
-    left_out = (*silenced, *left_out)
+    left_out = (*reference.left_out, *silenced, *left_out)
     matrix = np.asarray(reference.matrix, dtype=np.float64)[:, kept]
     usable = replace(
         reference,
@@ -103,22 +108,34 @@ def _check_shape(reference: Reference, n_slopes: int, n_modes: int) -> None:
 
 
 def _without_dead_rows(reference: Reference) -> tuple[Reference, tuple[str, ...]]:
-    """Return the reference with slopes that hold no numbers as 0, and a sentence that names them.
+    """Return the reference with unusable slopes as 0, and sentences that name them.
 
-    A dead subaperture gives NaN in every column. Slopes of 0 do not count in a fit, so that it
-    costs two rows and not all columns.
+    A dead subaperture gives NaN, or 0, in every column. Slopes of 0 do not count in a fit, so that
+    it costs two rows and not all columns. Of equal rows only the first is a measurement.
     """
     unknown = ~np.isfinite(reference.matrix)
     measured = ~unknown.all(axis=0)
     if not measured.any():
         return reference, ()
     dead = unknown[:, measured].mean(axis=1) > DEAD_ROW_SHARE
-    if not dead.any():
+    rows = np.where(unknown, 0.0, reference.matrix)
+    rows[dead] = 0.0
+    kinds = find_defects(rows) if rows.shape[1] >= FEWEST_TO_COMPARE else {}
+    copies = {row: reason for row, reason in kinds.items() if reason.startswith(COPY)}
+    silent = ~rows.any(axis=1) & ~dead
+    if not (dead.any() or copies or silent.any()):
         return reference, ()
     matrix = np.array(reference.matrix)
     matrix[np.ix_(dead, measured)] = 0.0
-    rows = _listed(np.flatnonzero(dead), "slope")
-    return replace(reference, matrix=matrix), (f"not finite: {rows}",)
+    said = []
+    if dead.any():
+        said.append(f"not finite: {_listed(np.flatnonzero(dead), 'slope')}")
+    if silent.any():
+        said.append(f"zero in every column: {_listed(np.flatnonzero(silent), 'slope')}")
+    if copies:
+        matrix[np.ix_(np.array(list(copies)), measured)] = 0.0
+        said.append(f"copies: {_copied(copies, np.arange(len(matrix)), 'slope')}")
+    return replace(reference, matrix=matrix), tuple(said)
 
 
 def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
@@ -133,12 +150,29 @@ def _usable(reference: Reference) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     if not alive[finite].all():
         left_out.append(f"dead (no response): {_listed(reference.columns[finite & ~alive])}")
     kept = finite & alive
+    places = np.flatnonzero(kept)
+    equal = find_defects(np.ascontiguousarray(reference.matrix.T[kept])) if len(places) else {}
+    copies = {
+        int(places[column]): f"{COPY}{places[int(reason.removeprefix(COPY))]}"
+        for column, reason in equal.items()
+        if reason.startswith(COPY)
+    }
+    if copies:
+        kept[list(copies)] = False
+        left_out.append(f"copies: {_copied(copies, reference.columns)}")
     if not kept.any():
         raise MatrixError(
             f"reference: no usable column among {len(kept)} ({'; '.join(left_out) or 'empty'}); "
             "expected finite slopes that answer the mirror"
         )
     return kept, tuple(left_out)
+
+
+def _copied(copies: Mapping[int, str], numbers: NDArray[np.intp], what: str = "mode") -> str:
+    """Return in words which entries repeat an earlier one."""
+    first = numbers[[int(reason.removeprefix(COPY)) for reason in copies.values()]]
+    listed = _listed(numbers[list(copies)], what)
+    return f"{listed} (of {', '.join(str(number) for number in first[:8])})"
 
 
 def _listed(numbers: NDArray[np.intp], what: str = "mode") -> str:

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.importers.saved import read_npz
+from pyrcal.playback.alignment import MAX_FRAMES, measure_delay
 from service.errors import ConfigurationError, say
 from service.files import FileKind, kind_of
 from service.files.recording import Message, RecordedKind
@@ -66,6 +67,10 @@ STATUS_S: Final = 0.5
 MAX_NUMBER: Final = 1e12
 """Largest slope, command (m) or element of a reconstructor (m per slope), in whatever unit: larger
 ones overflow single precision once they are squared and summed."""
+
+MIN_APART_FRAMES: Final = 1.5
+"""Difference between the delay found and the stated one from which streams are said to be apart; a
+stated delay need not be whole."""
 
 _LOOKED_AT: Final = 2000
 """Frames of the dither in which each of its modes has to move."""
@@ -157,6 +162,31 @@ class Arrays:
                 at_s = float(since[1] + 1) / status.frame_rate_hz
                 yield Message(at_s, RecordedKind.FRAMES, payload, attachment)
         self._report_unusable(unusable, n_frames)
+
+    def misalignment(self) -> str:
+        """Return in words how far apart slopes and commands were stored; empty if they were not.
+
+        A whole number of frames is recognised, and only in a loop that is closed.
+        """
+        stated = self._number("delay_frames", 2.0, MAX_DELAY_FRAMES)
+        n_frames, n_slopes = self._shape("slopes", (None, None))
+        _, n_given = self._shape("commands_m", (n_frames, None))
+        edges = np.flatnonzero(np.diff(self._sequence(n_frames)) > 1)
+        n = min(int(edges[0]) + 1 if len(edges) else n_frames, MAX_FRAMES)
+        rows = self._rows(0, n, n_given).astype(float)
+        usable = np.all(np.abs(rows) <= MAX_NUMBER, axis=1)
+        rows = rows[: n if usable.all() else int(np.argmin(usable))]
+        commands = rows[:, n_slopes : n_slopes + n_given]
+        if self._has("dither_m"):
+            commands = commands - rows[:, n_slopes + n_given :]
+        found = measure_delay(rows[:, :n_slopes], commands, stated)
+        if found is None or abs(found - stated) < MIN_APART_FRAMES:
+            return ""
+        return (
+            f"commands change {found} frames after the slopes that led to them, delay_frames is "
+            f"{stated:g}: slopes and commands were stored {abs(found - stated):g} frames apart, or "
+            f"delay_frames is {found}; give seq, or shift one of the two"
+        )
 
     def _report_unusable(self, frames: NDArray[np.intp], n_frames: int) -> None:
         """Name frames that were left out.

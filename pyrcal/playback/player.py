@@ -73,6 +73,9 @@ class Track:
     stated: tuple[Dated, ...] = ()
     """α that the file itself says, in its order; only AOT files do."""
 
+    misaligned: str = ""
+    """How far apart slopes and commands were stored; empty: as stated, or it does not show."""
+
     n_frames: int = 0
     """Used."""
 

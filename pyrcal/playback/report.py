@@ -41,6 +41,11 @@ ENOUGH = 5
 _COLOURS = {Source.PASSIVE: "0.8", Source.RANDOM: "tab:green", Source.LOCK_IN: "tab:blue"}
 """What is drawn last decides how much of α is shown."""
 
+_OF_MISALIGNED = frozenset(
+    {"modes-contrary", "modes-uneven", "response-mismatch", "window.refused"}
+)
+"""Alarms and warnings that streams of different frames raise by themselves."""
+
 _REASONS = 8
 """Kinds of refusals and warnings that the table names."""
 
@@ -97,6 +102,8 @@ def _why_not(track: Track) -> str:
     """Return why nothing could be made of the telemetry, as far as anybody knows."""
     if not track.n_frames:
         return "no frame could be used"
+    if track.misaligned:
+        return "slopes and commands are not of the same frames"
     if track.passive:
         return f"no dithered window; of ordinary telemetry {len(track.passive)}x: " + (
             track.passive[-1].text
@@ -125,11 +132,18 @@ def _scatter(entries: Sequence[HistoryEntry]) -> list[str]:
 
 def _complaints(track: Track) -> list[str]:
     """Return alarms that last, then what else the tracker warned of, the most frequent first."""
-    lines = [f"alarm {alarm.name}: {alarm.text}" for alarm in track.state.alarms.active]
+    # answers of another frame look like those of another sign
+    led_to = _OF_MISALIGNED if track.misaligned else frozenset()
+    lines = [f"note: {track.misaligned}"] if track.misaligned else []
+    lines += [
+        f"alarm {alarm.name}: {alarm.text}"
+        for alarm in track.state.alarms.active
+        if alarm.name not in led_to
+    ]
     names: Counter[str] = Counter()
     texts: dict[str, str] = {}
     for entry in track.lines:
-        if entry.level in {Level.WARNING, Level.ALARM}:
+        if entry.level in {Level.WARNING, Level.ALARM} and entry.name not in led_to:
             names[entry.name] += 1
             texts[entry.name] = entry.text
     lines += [f"{name} ({times}x): {texts[name]}" for name, times in names.most_common(_REASONS)]
@@ -141,6 +155,7 @@ def document(track: Track, source: Path) -> dict[str, Any]:
     registration = track.state.alpha.registration
     return {
         "telemetry": str(source),
+        "misaligned": track.misaligned or None,
         "n_frames": track.n_frames,
         "n_missing": track.n_missing,
         "first_ns_utc": track.first_ns_utc,

@@ -83,10 +83,9 @@ def track(
             return _play_aot(path, instrument, settings)
         if is_session(path):
             session = Arrays(path=path, found=read_session(path, instrument), facts={})
-            return _play(session.messages(instrument), instrument, settings, instrument.name)
+            return _play_arrays(session, instrument, settings)
         with opened_arrays(path) as arrays:
-            messages = arrays.messages(instrument)
-            return _play(messages, instrument, settings, instrument.name)
+            return _play_arrays(arrays, instrument, settings)
 
 
 def _is_recording(path: Path) -> bool:
@@ -115,9 +114,14 @@ def _play_aot(path: Path, instrument: Instrument, settings: Settings) -> Track:
         )
     for note in aot.notes:
         say(f"note: {path}: {note}")
-    messages = Arrays(path=path, found=aot.arrays, facts={}).messages(instrument)
-    found = _play(messages, instrument, settings, instrument.name)
+    found = _play_arrays(Arrays(path=path, found=aot.arrays, facts={}), instrument, settings)
     return replace(found, stated=aot.registrations)
+
+
+def _play_arrays(arrays: Arrays, instrument: Instrument, settings: Settings) -> Track:
+    """Play telemetry of arrays, and say whether its streams were stored some frames apart."""
+    found = _play(arrays.messages(instrument), instrument, settings, instrument.name)
+    return replace(found, misaligned=arrays.misalignment())
 
 
 def _play(

@@ -18,6 +18,7 @@ from service.config.mirrors import Pupil, own_modes, read_mirror
 from service.config.pupils import read_pupil
 from service.config.sources import read_dataset, refuse, refuse_all
 from service.errors import ConfigurationError, ModelError
+from service.model.aperture import check_mask
 from service.model.instrument import (
     Instrument,
     Mirror,
@@ -53,6 +54,9 @@ def load_instrument(name_or_path: str | Path) -> Instrument:
         **_made(_parts(said)),
         unknown=tuple(one for one in schema.unknown_values(kind) if one in said.unknown),
     )
+    difference = check_mask(instrument)
+    if difference is not None:
+        instrument = replace(instrument, remarks=(*instrument.remarks, difference))
     whole = _in_first_mode(instrument, wfs, kind)
     _, mode = and_sensor_mode(name_or_path)
     try:

@@ -12,6 +12,7 @@ from service.config.crops import local_functions, modes_of_crops, remarks_on_cro
 from service.config.instrument_schema import MirrorTable, Section
 from service.config.sources import refuse
 from service.errors import ConfigurationError
+from service.model.defects import COPY, NOT_FINITE, ZERO, explain_defects, find_defects
 from service.model.instrument import Mirror, TabulatedModes
 from service.model.kinds import BasisKind, Influence, InfluenceShape
 from service.model.misregistration import rotation, unit_like
@@ -82,9 +83,9 @@ def read_mirror(
     """
     _check_keys(file)
     if file.said.layout is not None:
-        mirror = _analytic(file)
+        mirror, notes = _analytic(file)
         _check_width(file, mirror.positions_m, pupil)
-        return mirror, _about_segments(file, mirror)
+        return mirror, (*notes, *_about_segments(file, mirror))
     return _tabulated(file, pupil)
 
 
@@ -136,7 +137,7 @@ def _opd(file: MirrorSection, heights: NDArray[np.floating]) -> NDArray[np.float
 # --- analytic
 
 
-def _analytic(file: MirrorSection) -> Mirror:
+def _analytic(file: MirrorSection) -> tuple[Mirror, tuple[str, ...]]:
     table = file.said
     _check_layout_keys(file)
     positions = _LAYOUTS[str(table.layout)](file)
@@ -147,8 +148,8 @@ def _analytic(file: MirrorSection) -> Mirror:
             f"actuators {pair[0]} and {pair[1]} in the same place",
             "every actuator in a place of its own",
         )
-    strokes = _mode_to_actuator(file, len(positions))
-    return Mirror(
+    strokes, notes = _mode_to_actuator(file, len(positions))
+    mirror = Mirror(
         positions_m=positions,
         pitch_m=table.pitch_m or typical_pitch(positions),
         shape=InfluenceShape(influence=table.influence, coupling=table.coupling),
@@ -157,6 +158,7 @@ def _analytic(file: MirrorSection) -> Mirror:
         mode_to_actuator=None if strokes is None else _opd(file, strokes).astype(np.float64),
         **_mount(table),
     )
+    return mirror, notes
 
 
 def _about_segments(file: MirrorSection, mirror: Mirror) -> tuple[str, ...]:
@@ -304,9 +306,12 @@ def _check_number(n_actuators: int, where: str) -> None:
         refuse(where, f"{n_actuators} actuators", "at least 4: tip, tilt and something to correct")
 
 
-def _mode_to_actuator(file: MirrorSection, n_actuators: int) -> NDArray[np.float64] | None:
+def _mode_to_actuator(
+    file: MirrorSection, n_actuators: int
+) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """Return strokes ``(n_actuators, n_modes)``, those of unusable modes 0, and notes of them."""
     if file.said.mode_to_actuator is None:
-        return None
+        return None, ()
     where = file.where("mode_to_actuator")
     values = _read(file, "mode_to_actuator")
     expected = f"({n_actuators} actuators, n_modes)"
@@ -314,9 +319,17 @@ def _mode_to_actuator(file: MirrorSection, n_actuators: int) -> NDArray[np.float
         turned = values.ndim == 2 and values.shape[1] == n_actuators
         hint = " (it looks transposed)" if turned else ""
         refuse(where, f"shape {values.shape}{hint}", expected)
-    if values.shape[1] == 0 or not np.isfinite(values).all():
+    columns = np.array(values.T, dtype=np.float64)
+    # an actuator without a number would be one in all modes
+    if not np.isfinite(columns).any(axis=0).all() or not len(columns):
         refuse(where, "no mode, or strokes that are not finite", f"{expected} finite strokes")
-    return values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # one number that is not finite spoils its whole mode
+        defects = find_defects(columns + 0.0 * columns.sum(axis=1, keepdims=True))
+    columns[list(defects)] = 0.0
+    if not columns.any():
+        refuse(where, "no mode that moves an actuator", expected)
+    notes = tuple(f"{where}: {note}" for note in explain_defects(defects, "mode"))
+    return columns.T, notes
 
 
 # --- where actuators are
@@ -419,8 +432,11 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     cube = crops = _read(file, key)
     if cube.ndim != 3 or min(cube.shape) < 1:
         refuse(file.where(key), f"shape {cube.shape}", "(n, ny, nx), one table for each")
-    strokes = _strokes(file, len(cube)) if key == "influence_functions" else None
-    cube, broken = _without_broken(file, key, cube)
+    strokes: NDArray[np.floating] | None = None
+    of_strokes: tuple[str, ...] = ()
+    if key == "influence_functions":
+        strokes, of_strokes = _strokes(file, len(cube))
+    cube, broken = _without_defects(file, key, cube)
     crops = cube
     whole = None if file.said.influence_origin is not None else known_samples(cube)
     of_functions = key == "influence_functions"
@@ -436,6 +452,7 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
         if strokes is not None:
             cube = np.tensordot(strokes.T.astype(cube.dtype), cube, axes=1)
     remarks = (
+        *of_strokes,
         *broken,
         *_judged(file, pupil, key, known, file.said.modes_pitch_m),
         *remarks_on_crops(file, crops),
@@ -450,53 +467,47 @@ def _tabulated(file: MirrorSection, pupil: Pupil) -> tuple[TabulatedModes, tuple
     return modes, remarks
 
 
-def _without_broken(
+def _without_defects(
     file: MirrorSection, key: str, cube: NDArray[np.floating]
 ) -> tuple[NDArray[np.floating], tuple[str, ...]]:
-    """Return a cube whose broken influence functions are 0, and a note that names them.
+    """Return a cube whose unusable entries are 0, and notes that name them.
 
-    A function is broken if it holds no numbers in much more of the table than the others do:
-    otherwise it would make the surface unknown for all of them.
-
-    Raises
-    ------
-    ConfigurationError
-        If it is a mode: what was measured with it is not known.
+    An entry is unusable if it holds no numbers in much more of the table than the others do (it
+    would make the surface unknown for all of them), if it is zero, or if it equals an earlier one.
+    Equal crops are no copies: they lie elsewhere.
     """
     unknown = np.mean(~np.isfinite(cube), axis=(1, 2))
-    broken = np.flatnonzero(unknown > np.median(unknown) + _BROKEN_SHARE)
-    if not len(broken):
+    broken = unknown > np.median(unknown) + _BROKEN_SHARE
+    defects = {int(number): NOT_FINITE for number in np.flatnonzero(broken)}
+    usable = np.flatnonzero(~broken)
+    for place, reason in find_defects(cube[usable] if broken.any() else cube).items():
+        if reason == ZERO or (reason.startswith(COPY) and file.said.influence_origin is None):
+            copied = int(usable[int(reason.removeprefix(COPY))]) if reason != ZERO else 0
+            defects[int(usable[place])] = reason if reason == ZERO else f"{COPY}{copied}"
+    if not defects:
         return cube, ()
-    named = ", ".join(str(number) for number in broken[:12])
-    more = f" and {len(broken) - 12} more" if len(broken) > 12 else ""
-    if key == "modes":
-        refuse(
-            file.where(key),
-            f"modes {named}{more} without numbers (NaN)",
-            "numbers: leave them out of the cube, and their columns out of the matrix",
-        )
     mended = np.array(cube)
-    mended[broken] = 0.0
-    return mended, (
-        f"{file.where(key)}: functions {named}{more} hold no numbers (NaN): taken as 0, actuators "
-        "that do not move",
-    )
+    mended[list(defects)] = 0.0
+    what = "mode" if key == "modes" else "function"
+    return mended, tuple(f"{file.where(key)}: {note}" for note in explain_defects(defects, what))
 
 
-def _strokes(file: MirrorSection, n_actuators: int) -> NDArray[np.floating] | None:
-    """Return strokes ``(n_actuators, n_modes)`` of modes made of influence functions.
+def _strokes(
+    file: MirrorSection, n_actuators: int
+) -> tuple[NDArray[np.floating] | None, tuple[str, ...]]:
+    """Return strokes ``(n_actuators, n_modes)`` of modes made of influence functions, and notes.
 
     None: each makes a mode by itself.
     """
     if file.said.basis is BasisKind.ZONAL:
-        return None
-    strokes = _mode_to_actuator(file, n_actuators)
+        return None, ()
+    strokes, notes = _mode_to_actuator(file, n_actuators)
     if strokes is None:
         raise ConfigurationError(
             f"{file.where('mode_to_actuator')}: missing, mirror.influence_functions needs it, or "
             'basis = "zonal" for the actuators themselves'
         )
-    return strokes
+    return strokes, notes
 
 
 def _judged(

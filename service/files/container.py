@@ -239,8 +239,16 @@ def _image(hdu: _ImageHdu, where: str, file_bytes: int) -> StoredArray:
         shape=hdu.shape,
         dtype=np.dtype(f"f{8 if abs(hdu.header['BITPIX']) > 32 else 4}"),
         stored_bytes=file_bytes,
-        load=lambda: hdu.data,
+        load=partial(_data, hdu),
     )
+
+
+def _data(hdu: _ImageHdu) -> NDArray[Any]:
+    """Return an image; what cannot be unpacked raises ValueError."""
+    try:
+        return hdu.data
+    except Exception as error:  # cfitsio's own exceptions have no common class
+        raise ValueError(str(error).replace("\n", " ")) from error
 
 
 NUMPY_DAMAGE = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)

@@ -73,6 +73,9 @@ class RecordedKind(IntEnum):
     MATRIX = 4
 
 
+_KINDS = frozenset(int(kind) for kind in RecordedKind)
+
+
 class Message(NamedTuple):
     """One message as it was sent."""
 
@@ -107,11 +110,29 @@ class Recording:
             self._file = open_hdf5(self._path, swmr=True)
         except OSError as error:
             raise ConfigurationError(f"{self._path}: cannot be read: {error}") from error
-        found = (self._file.attrs.get("format"), int(self._file.attrs.get("version", 0)))
-        if found != (FORMAT, VERSION):
+        reason = self._check()
+        if reason:
             self._file.close()
-            raise ConfigurationError(f"{self._path}: is {found}, expected {(FORMAT, VERSION)}")
+            raise ConfigurationError(f"{self._path}: {reason}")
         return self
+
+    def _check(self) -> str:
+        """Return why the open file is no recording that can be read; empty if it is one."""
+        try:
+            attributes = dict(self._file.attrs)
+            found = (str(attributes.get("format")), str(attributes.get("version", 0)))
+            if found != (FORMAT, str(VERSION)):
+                return f"is {found}, expected {(FORMAT, VERSION)}"
+            if not isinstance(attributes.get("system"), str):
+                return "found no attribute system, expected the name of the system"
+            expected = {"messages": _ROW, "bytes": np.dtype("u1"), "dropped": np.dtype("i8")}
+            for name, kind in expected.items():
+                there = self._file.get(name)
+                if not isinstance(there, h5py.Dataset) or (there.ndim, there.dtype) != (1, kind):
+                    return f"damaged: found no {name} of type {kind}, one for each message"
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            return f"damaged: {error}"
+        return ""
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
@@ -130,14 +151,22 @@ class Recording:
         """Yield the messages in the order of sending; what a killed writer left half is not one."""
         rows, data = self._file["messages"], self._file["bytes"]
         for first in range(0, len(rows), _SLAB_ROWS):
-            slab = rows[first : first + _SLAB_ROWS]
-            start = int(slab["start"][0])
-            lengths = slab["payload_bytes"].astype(np.int64) + slab["attachment_bytes"]
-            chunk = data[start : int(slab["start"][-1]) + int(lengths[-1])].tobytes()
-            for row, length in zip(slab, lengths, strict=True):
+            try:
+                slab = rows[first : first + _SLAB_ROWS]
+                lengths = slab["payload_bytes"].astype(np.int64) + slab["attachment_bytes"]
+                start, end = int(slab["start"][0]), int(slab["start"][-1]) + int(lengths[-1])
+                chunk = data[start : max(start, end)].tobytes()
+            except _REFUSED as error:
+                raise ConfigurationError(f"{self._path}: damaged: {error}") from error
+            for number, (row, length) in enumerate(zip(slab, lengths, strict=True), first):
                 at = int(row["start"]) - start
                 if at + int(length) > len(chunk):
                     return
+                if at < 0 or int(row["kind"]) not in _KINDS or not np.isfinite(row["time_s"]):
+                    raise ConfigurationError(
+                        f"{self._path}: damaged: message {number} is of kind {row['kind']} at "
+                        f"{row['time_s']} s, {at} bytes on; expected a known kind at a finite time"
+                    )
                 middle = at + int(row["payload_bytes"])
                 yield Message(
                     time_s=float(row["time_s"]),

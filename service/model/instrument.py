@@ -106,6 +106,12 @@ class Mirror(Mount):
     mode_to_actuator: NDArray[np.float64] | None = None
     """The user's own modes ``(n_actuators, n_modes)``: strokes in metres OPD per unit command."""
 
+    @property
+    def flat_modes(self) -> NDArray[np.intp]:
+        """Modes that do not move the surface, by number."""
+        strokes = self.mode_to_actuator
+        return np.zeros(0, np.intp) if strokes is None else np.flatnonzero(~strokes.any(axis=0))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalFunctions:
@@ -158,6 +164,18 @@ class TabulatedModes(Mount):
             return 0
         strokes = self.local.strokes
         return self.local.n_functions if strokes is None else int(strokes.shape[1])
+
+    @property
+    def flat_modes(self) -> NDArray[np.intp]:
+        """Modes that do not move the surface, by number."""
+        if self.cube is not None:
+            return np.flatnonzero([not mode.any() for mode in self.cube])
+        if self.local is None:
+            return np.zeros(0, np.intp)
+        moves = np.asarray(np.diff(self.local.ends) > 0)
+        if self.local.strokes is not None:
+            moves = np.asarray(self.local.strokes[moves].any(axis=0))
+        return np.flatnonzero(~moves)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pyrcal.offline.importers.defects import COPY, explain_defects, find_defects
 from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, oriented
 from pyrcal.offline.importers.layouts import cube_of
 from service.errors import MatrixError
+from service.model.defects import COPY, explain_defects, find_defects
 
 
 @dataclass(slots=True, kw_only=True, eq=False)

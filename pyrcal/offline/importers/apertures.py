@@ -1,8 +1,6 @@
-"""Describe the mask of valid subapertures, and find it where no file has one."""
+"""Find the mask of valid subapertures where no file has one, and centre its grid."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -10,12 +8,7 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.importers.imported import Array
 from service.errors import MatrixError
-
-_SMALLEST_HOLE = 4
-"""Subapertures of the smallest central hole: fewer are dead ones."""
-
-_OFF_CENTRE_SUBAP = 0.25
-"""Offset of a mask from the middle of its grid that is mentioned."""
+from service.model.aperture import OFF_CENTRE_SUBAP, SMALLEST_HOLE
 
 _COHERENT = 0.5
 """Least correlation of a lit subaperture's response with that of its neighbours. An influence
@@ -23,55 +16,6 @@ function spans several subapertures, so lit neighbours respond alike; noise does
 
 _SMALLEST_SHARE = 0.1
 """Least share of the grid that is believed to be lit."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Aperture:
-    """Size and position of the pupil that a mask of subapertures shows."""
-
-    diameter_subap: float
-    """Of the disc with the area of the mask and its hole."""
-
-    hole_subap: float
-    """Of the disc with the area of the central hole; 0 where there is none."""
-
-    centre: tuple[float, float]
-    """Offset along x and y from the middle of the grid, subapertures."""
-
-    @property
-    def obscuration_ratio(self) -> float:
-        """Diameter of the hole over that of the pupil."""
-        return self.hole_subap / self.diameter_subap
-
-    @property
-    def words(self) -> str:
-        """Diameter, hole and centre, in words."""
-        x, y = self.centre
-        at = f", centred {x:+.2f}, {y:+.2f} from the middle of the grid" if self.is_off else ""
-        hole = f", a central hole of {self.hole_subap:.1f}" if self.hole_subap else ", no hole"
-        return f"{self.diameter_subap:.1f} subapertures across{hole}{at}"
-
-    @property
-    def is_off(self) -> bool:
-        """Whether the pupil does not lie in the middle of the grid."""
-        return float(np.hypot(*self.centre)) > _OFF_CENTRE_SUBAP
-
-
-def measure_aperture(valid: NDArray[np.bool_]) -> Aperture:
-    """Return the pupil that a mask ``(n, n)`` shows."""
-    filled = scipy.ndimage.binary_fill_holes(valid)
-    labels, _ = scipy.ndimage.label(filled & ~valid, np.ones((3, 3)))
-    middle = (np.array(valid.shape) - 1) / 2.0
-    centre = np.argwhere(filled).mean(axis=0)
-    row, column = np.rint(centre).astype(int)
-    around = labels[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-    hole = int(np.sum(labels == around.max())) if around.max() else 0
-    offset = centre - middle
-    return Aperture(
-        diameter_subap=float(np.sqrt(4.0 * filled.sum() / np.pi)),
-        hole_subap=float(np.sqrt(4.0 * hole / np.pi)) if hole >= _SMALLEST_HOLE else 0.0,
-        centre=(float(offset[1]), float(offset[0])),
-    )
 
 
 def find_lit(maps: Array, notes: list[str]) -> NDArray[np.bool_]:
@@ -127,7 +71,7 @@ def _largest_piece(lit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     gaps, n_gaps = scipy.ndimage.label(~piece)
     for number in range(1, n_gaps + 1):
         gap = gaps == number
-        if gap.sum() < _SMALLEST_HOLE and not _touches_edge(gap):
+        if gap.sum() < SMALLEST_HOLE and not _touches_edge(gap):
             piece |= gap
     return np.asarray(piece)
 
@@ -153,7 +97,7 @@ def centre_grid(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
         if np.any(start > first) or np.any(start + side - 1 < last):
             continue
         off = float(np.hypot(*(centre - start - (side - 1) / 2.0)))
-        if best is None or off < best[0] - _OFF_CENTRE_SUBAP:
+        if best is None or off < best[0] - OFF_CENTRE_SUBAP:
             best = off, side, start
     if best is None:
         return valid

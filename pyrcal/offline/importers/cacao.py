@@ -391,12 +391,18 @@ def _positions(found: _Folder, n_actuators: int) -> Array | None:
     return None
 
 
+_MAX_NUMBER = 1e5
+"""Actuators across a mirror; a larger number is a slip."""
+
+
 def _numbers(variables: Mapping[str, str], key: str) -> float | None:
+    """Return a number above 0 of cacaovars; None if there is none, or it cannot be."""
     words: Sequence[str] = variables.get(key, "").split()
     try:
-        return float(words[0])
+        number = float(words[0])
     except (IndexError, ValueError):
         return None
+    return number if 0.0 < number <= _MAX_NUMBER else None
 
 
 def _sensor(variables: Mapping[str, str], notes: list[str]) -> str:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.importers.actuators import Mirror, read_mirror
-from pyrcal.offline.importers.apertures import centre_grid, find_lit, measure_aperture
-from pyrcal.offline.importers.defects import explain_defects, find_defects
+from pyrcal.offline.importers.apertures import centre_grid, find_lit
 from pyrcal.offline.importers.frames import Frames, describe_frames, frames_of
 from pyrcal.offline.importers.imported import (
     UNKNOWN,
@@ -27,6 +26,8 @@ from pyrcal.offline.importers.imported import (
 from pyrcal.offline.importers.layouts import ROLES, maps_of, mask_of
 from pyrcal.offline.pupil_width import answers_of, seen_pupil
 from service.errors import ConfigurationError, MatrixError
+from service.model.aperture import measure_aperture
+from service.model.defects import explain_defects, find_defects
 
 UNITS_M = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
 """Metres of OPD in a unit of the commands."""
@@ -386,6 +387,8 @@ def usable_modes(
         If no column is left.
     """
     n_columns, n_modes = signals.n_columns, mirror.n_modes
+    if not n_columns:
+        raise MatrixError("matrix: found no column, expected the response to each mode")
     indices = _indices(columns, n_columns, n_modes, notes)
     dead, shapes = find_defects(signals.by_column), mirror.defects
     notes += explain_defects(dead, "column", numbers)

@@ -134,7 +134,9 @@ def cube_of(values: Array, notes: list[str]) -> NDArray[np.float32]:
 
 
 def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
-    """Return the arrays of a file by what they are for, as their names say.
+    """Return the arrays of a file by what they are for, as their names say in any letter case.
+
+    FITS has capitals only.
 
     Raises
     ------
@@ -143,7 +145,8 @@ def by_role(arrays: Mapping[str, Array], where: str) -> dict[str, Array]:
     """
     found: dict[str, Array] = {}
     for role, names in ROLES.items():
-        there = [name for name in names if name in arrays]
+        there = [one for name in names for one in arrays if one.lower() == name.lower()]
+        there = list(dict.fromkeys(there))  # two of the names differ in letter case only
         if len(there) > 1:
             raise MatrixError(f"{where}: found {' and '.join(there)}, expected one {role}")
         if there:

@@ -60,6 +60,25 @@ _OF_SENSOR = {
 }
 """Attributes of ``wfs`` that only one kind of sensor has."""
 
+_WORDS = {"tag", "postProcessing"}
+_FREE = {"sign", "flip_", "flip_lr"}
+"""Attributes that are numbers or arrays, and that are looked at as they are."""
+
+_ARRAYS = {
+    **dict.fromkeys(("pupil", "validI4Q", "valid_subapertures"), (2,)),
+    "pupilReflectivity": (0, 2),
+    "modes": (2, 3),
+    "initial_coordinates": (2,),
+    "validAct": (1, 2),
+}
+"""Attributes that are arrays, and how many axes they may have."""
+
+_COUNTS = {"resolution", "nSubap", "n_pix_subap", "binning", "nActAlongDiameter"}
+_POSITIVE = {"D", "wavelength", "mechCoupling", "pixel_scale"}
+
+_MAX_NUMBER = 1e6
+"""Largest number that any attribute has, in its own unit."""
+
 _SAME_SHAPE = 1e-3
 """Largest deviation of an influence function from the Gaussian that is told, of its height."""
 
@@ -478,7 +497,7 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     for name, values in arrays.items():
         owner, _, attribute = name.rpartition(".")
         if owner in objects:
-            setattr(objects[owner], attribute, values.item() if values.ndim == 0 else values)
+            setattr(objects[owner], attribute, _checked(f"{where}: {name}", attribute, values))
     missing = [f"{owner}.{name}" for owner, name in _missing(objects)]
     if missing:
         raise ConfigurationError(f"{where}: found no {', '.join(missing)}; expected it beside them")
@@ -491,6 +510,39 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
         arrays.get("M2C"),
         objects["ngs"],
     )
+
+
+def _checked(where: str, attribute: str, values: Array) -> object:
+    """Return an attribute as OOPAO has it: a number, a word, or an array.
+
+    Raises
+    ------
+    ConfigurationError
+        If it is of another kind, has other axes, or is a number that cannot be.
+    """
+    if attribute in _WORDS or attribute in _FREE:
+        return values.item() if values.size == 1 else values
+    if attribute in _ARRAYS:
+        axes = _ARRAYS[attribute]
+        if values.dtype.kind not in "iufb" or values.ndim not in axes or not values.size:
+            expected = " or ".join(str(n) for n in axes)
+            raise ConfigurationError(
+                f"{where}: found {values.dtype} of shape {values.shape}, expected numbers with "
+                f"{expected} axes"
+            )
+        return values
+    number = values.item() if values.size == 1 and values.dtype.kind in "iufb" else np.nan
+    low = 1.0 if attribute in _COUNTS else 0.0 if attribute in _POSITIVE else -_MAX_NUMBER
+    if not low <= float(number) <= _MAX_NUMBER or (attribute in _POSITIVE and number == 0.0):
+        found = values if values.size == 1 else f"shape {values.shape}"
+        raise ConfigurationError(f"{where}: found {found}, expected {_expected(attribute)}")
+    return number
+
+
+def _expected(attribute: str) -> str:
+    if attribute in _COUNTS:
+        return "a number of at least 1"
+    return "a number above 0" if attribute in _POSITIVE else "a finite number"
 
 
 def _missing(objects: Mapping[str, SimpleNamespace]) -> Iterator[tuple[str, str]]:

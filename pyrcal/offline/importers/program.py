@@ -20,8 +20,10 @@ from pyrcal.offline.importers.layouts import by_role, numbers_of_name, role_of_n
 from pyrcal.offline.importers.pyrtc import RECORD, calibration_of
 from pyrcal.offline.importers.saved import read_npz
 from pyrcal.offline.importers.specula import UNIT, from_specula
+from service.config import load_instrument
 from service.errors import ConfigurationError, MatrixError
 from service.files.container import opened
+from service.model.aperture import check_mask
 
 
 def _oopao(options: argparse.Namespace) -> Imported:
@@ -192,7 +194,8 @@ def main(options: argparse.Namespace) -> int:
     print(f"{saved.instrument}: {imported.source}")
     shapes = ", ".join(f"{name} {values.shape}" for name, values in imported.arrays.items())
     print(f"{saved.matrix}: {shapes}")
-    for note in imported.notes:
+    mask = check_mask(load_instrument(saved.instrument))
+    for note in (*imported.notes, *([] if mask is None else [mask])):
         print(f"note: {note}")
     print(f"next: pyrcal fit {saved.instrument} {saved.matrix}")
     return 0

@@ -146,7 +146,10 @@ def _subapertures(container: Container) -> Subapertures:
     first = container.find("1")
     if first is None:
         raise MatrixError(f"{container.path}: found no indices of pixels, expected them first")
-    indices = first.numbers().astype(np.intp)
+    if len(first.shape) != 2:
+        raise MatrixError(f"{first.where}: found shape {first.shape}, expected two axes of indices")
+    with np.errstate(invalid="ignore"):
+        indices = first.numbers().astype(np.intp)
     if "np_sub" in container.facts:  # stored as (pixels, subapertures); its map says which lenslet
         shown = container.find("2")
         listed = indices.T if shown is None else shown.numbers().astype(np.intp)

@@ -210,7 +210,7 @@ def test_silent_subapertures_do_not_count():
     silent[[7, 7 + len(silent) // 2]] = 0.0
     found = fit(silent)
     assert np.all(np.abs(error(found)) < GRID)
-    assert found.left_out[0].startswith("2 of")
+    assert any(sentence.startswith("2 of") for sentence in found.left_out)
 
 
 def test_double_pass_is_divided_out():

@@ -324,3 +324,31 @@ def test_an_aot_file_is_played_and_its_own_alpha_is_compared(telemetry, tmp_path
     status, _, said = tracked(capsys, tmp_path / "alpha.fits")
     assert status == 2
     assert "found no slopes with commands" in said
+
+
+@pytest.mark.parametrize("frames", [3, -2])
+def test_streams_that_are_frames_apart_are_said_to_be_so_and_no_sign_is_blamed(
+    telemetry, tmp_path, capsys, frames
+):
+    n = len(telemetry["slopes"]) - abs(frames)
+    first = {"slopes": max(frames, 0), "commands_m": max(-frames, 0), "dither_m": max(-frames, 0)}
+    moved = {
+        name: values[first.get(name, 0) :][:n]
+        for name, values in telemetry.items()
+        if name != "reconstructor" and values.ndim == 2
+    }
+    others = {name: values for name, values in telemetry.items() if values.ndim < 2}
+    path = saved(tmp_path, others | moved)
+    status, found, _ = tracked(capsys, path)
+    assert status == 1
+    assert f"commands change {2 + frames} frames after" in found["misaligned"]
+    assert f"{abs(frames)} frames apart" in found["misaligned"]
+    main(["track", SMALL, str(path)])
+    said = capsys.readouterr().out
+    assert found["misaligned"] in said
+    assert "modes-contrary" not in said
+
+
+def test_streams_of_the_same_frames_are_not_said_to_be_apart(telemetry, tmp_path, capsys):
+    _, found, _ = tracked(capsys, saved(tmp_path, telemetry))
+    assert found["misaligned"] is None

@@ -6,11 +6,15 @@ must not make the rest unusable, nor be left out silently.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pyrcal.offline.importers.imported import Array
+NOT_FINITE, ZERO = "NaN", "zero"
+"""Reasons of entries that hold no numbers, and nothing but zeros."""
 
 COPY = "equal to "
 """Begins the reason of an entry that repeats an earlier one, whose number follows."""
@@ -19,33 +23,35 @@ _LISTED = 12
 """Numbers that a message lists."""
 
 
-def find_defects(values: Array) -> dict[int, str]:
+def find_defects(values: NDArray[Any]) -> dict[int, str]:
     """Return the entries along the first axis that cannot be used, with the reason.
 
     An entry is unusable if it holds a NaN that not all others have at the same place (outside a
     pupil all may be unknown), if it is zero, or if it equals an earlier one.
     """
-    flat = np.asarray(values).reshape(len(values), -1)
-    unknown = ~np.isfinite(flat)
-    n_unknown = unknown.sum(axis=1)
-    usual = unknown[int(np.argmin(n_unknown))]
+    array = np.asarray(values)
+    flat = array.reshape(len(array), array[0].size if len(array) else 0)
+    n_unknown = np.array([np.sum(~np.isfinite(entry)) for entry in flat])
+    usual = ~np.isfinite(flat[int(np.argmin(n_unknown))]) if len(flat) else None
     found: dict[int, str] = {}
     seen: dict[bytes, int] = {}
-    for number, (entry, missing) in enumerate(zip(flat, unknown, strict=True)):
+    for number, entry in enumerate(flat):
+        missing = ~np.isfinite(entry)
         if n_unknown[number] == flat.shape[1] or np.any(missing & ~usual):
-            found[number] = "NaN"
+            found[number] = NOT_FINITE
             continue
         if not np.nan_to_num(entry).any():
-            found[number] = "zero"
+            found[number] = ZERO
             continue
-        first = seen.setdefault(entry.tobytes(), number)
+        # a digest, for the entries of a large table would double the memory
+        first = seen.setdefault(hashlib.blake2b(entry.tobytes()).digest(), number)
         if first != number:
             found[number] = f"{COPY}{first}"
     return found
 
 
 def explain_defects(
-    defects: Mapping[int, str], what: str, numbers: Array | None = None
+    defects: Mapping[int, str], what: str, numbers: NDArray[Any] | None = None
 ) -> list[str]:
     """Return one note for each kind of defect: ``columns 3, 7 are zero: left out``.
 
@@ -61,7 +67,7 @@ def explain_defects(
             of = known(int(reason.removeprefix(COPY)))
             listed["copies"].append(f"{known(entry)} (of {of})")
         else:
-            listed["not finite" if reason == "NaN" else "zero"].append(str(known(entry)))
+            listed["not finite" if reason == NOT_FINITE else "zero"].append(str(known(entry)))
     notes = []
     for kind, entries in listed.items():
         more = f" and {len(entries) - _LISTED} more" if len(entries) > _LISTED else ""

@@ -1,0 +1,103 @@
+"""Measure how many frames commands follow the slopes that they were computed from.
+
+An integrator changes its commands by a linear combination of the slopes ``delay_frames`` earlier,
+whatever its reconstructor. The delay at which slopes predict changes of commands is therefore seen
+without a reconstructor. Streams that were recorded without frame numbers and stored some frames
+apart show another delay; taken as they are they look like slopes of another sign.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MAX_FRAMES: Final = 3000
+"""Frames that are looked at."""
+
+MIN_FRAMES: Final = 400
+"""Fewer do not tell."""
+
+MAX_APART_FRAMES: Final = 6
+"""Streams that are further apart are not recognised."""
+
+MAX_COMPONENTS: Final = 200
+"""Principal components of the slopes that predict."""
+
+FRAMES_PER_COMPONENT: Final = 4
+
+N_MODES: Final = 16
+"""Modes whose commands are predicted: those that change most."""
+
+PREDICTED: Final = 0.3
+"""Share of the variance of changes that slopes of the right frame predict at least. Measured at the
+right delay: 0.84 to 0.95; at all others below 0."""
+
+MIN_MODES: Final = 2
+"""Modes that must be predicted: a dither of one frequency predicts itself at any delay."""
+
+CLEARER: Final = 1.5
+"""Ratio of the predicted shares of the right delay and of any other that is not its neighbour."""
+
+
+def measure_delay(slopes: Array, commands: Array, delay_frames: float) -> int | None:
+    """Return after how many frames slopes lead to commands, or None if they do not show it.
+
+    Parameters
+    ----------
+    slopes
+        ``(n_frames, n_slopes)``, without gaps.
+    commands
+        ``(n_frames, n_modes)``, without the dither where it is known.
+    delay_frames
+        As stated; delays within ``MAX_APART_FRAMES`` of it are tried.
+    """
+    n = min(len(slopes), MAX_FRAMES)
+    if n < MIN_FRAMES:
+        return None
+    seen = _components(slopes[:n], n // (2 * FRAMES_PER_COMPONENT))
+    changes = np.diff(commands[:n], axis=0)
+    strongest = np.argsort(-changes.std(axis=0))[:N_MODES]
+    changes = changes[:, strongest] - changes[:, strongest].mean(axis=0)
+    if not changes.std(axis=0).any():
+        return None
+    stated = round(delay_frames)
+    delays = np.arange(stated - MAX_APART_FRAMES, stated + MAX_APART_FRAMES + 1)
+    shares = np.array([_predicted(seen, changes, int(delay)) for delay in delays])
+    strengths = np.where(shares > PREDICTED, shares, 0.0).sum(axis=1)
+    best = int(np.argmax(strengths))
+    others = np.delete(strengths, slice(max(best - 1, 0), best + 2))
+    if np.sum(shares[best] > PREDICTED) < MIN_MODES or strengths[best] < CLEARER * others.max():
+        return None
+    return int(delays[best])
+
+
+def _components(slopes: Array, n_most: int) -> Array:
+    """Return the slopes by their strongest principal components, ``(n_frames, n_components)``."""
+    centred = slopes - slopes.mean(axis=0)
+    if centred.shape[1] <= min(n_most, MAX_COMPONENTS):
+        return np.asarray(centred)
+    some = centred[: 5 * MAX_COMPONENTS]
+    _, along = np.linalg.eigh(some @ some.T)
+    strongest = along[:, -min(n_most, MAX_COMPONENTS) :]
+    axes, _ = np.linalg.qr(some.T @ strongest)
+    return np.asarray(centred @ axes)
+
+
+def _predicted(seen: Array, changes: Array, delay: int) -> Array:
+    """Return which share of each mode's changes slopes so many frames earlier predict.
+
+    The first half of the frames gives the weights, the second half tests them.
+    """
+    first, last = max(1, delay), min(len(seen), len(seen) + delay)
+    causes, effects = seen[first - delay : last - delay], changes[first - 1 : last - 1]
+    half = len(causes) // 2
+    normal = causes[:half].T @ causes[:half]
+    normal += 1e-6 * np.trace(normal) / len(normal) * np.eye(len(normal))
+    weights = np.linalg.solve(normal, causes[:half].T @ effects[:half])
+    left = np.sum((effects[half:] - causes[half:] @ weights) ** 2, axis=0)
+    power = np.sum(effects[half:] ** 2, axis=0)
+    return np.asarray(np.where(power > 0.0, 1.0 - left / np.where(power > 0.0, power, 1.0), 0.0))

@@ -1,6 +1,6 @@
 """From an interaction matrix to a reconstructor.
 
-Two ways to invert. Truncated least squares (Heritier et al. 2018, section 2.2) needs nothing but
+Two ways to invert. Truncated least squares (Heritier et al. 2018, section 2.1) needs nothing but
 the matrix. MAP, or generalised SVD, knows how strong each mode and the noise are:
 ``R = (D^T Cn^-1 D + Cφ^-1)^-1 D^T Cn^-1`` (Gauss-Markov with a prior). It estimates every mode of
 the basis, also those the loop does not control: what they show in the slopes is then explained by
@@ -63,7 +63,7 @@ def invert(
 
     References
     ----------
-    Heritier et al. 2018, section 2.2.
+    Heritier et al. 2018, section 2.1, equation 2.
     """
     controlled = checked_columns(interaction_matrix, n_modes)
     normal = controlled.T @ controlled

@@ -157,7 +157,7 @@ class RampRequest:
     """Try gains on one group of modes after the other; keep those of least residual slopes.
 
     While a group is tried the others keep the gains they have. What was chosen is seen in the
-    status' ``gains`` (Heritier et al. 2018: tip and tilt, then modes to 100, then to 400).
+    status' ``gains`` (Heritier et al. 2018, section 5: tip and tilt, modes to 100, to 400).
     """
 
     id: codec.Id

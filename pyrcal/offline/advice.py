@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 ENOUGH_SUBAP = 0.03
 """1 σ of where the mirror is seen at the pupil's edge: three of them are the tenth of a subaperture
-beyond which a loop begins to suffer (Heritier et al. 2018, section 3)."""
+beyond which a loop begins to suffer (Heritier et al. 2018, section 3.2)."""
 
 FEWEST_SETS = 2
 """Sets of modes that can check each other."""

@@ -183,7 +183,8 @@ def _describe_fit(fit: argparse.ArgumentParser) -> None:
     fit.set_defaults(module="pyrcal.offline.fit")
     fit.description, fit.epilog = _FIT, _FIT_EPILOG
     methods = (
-        "joint: all four together (default); paper: one at a time, with parabolas; "
+        "joint: all four together (default); paper: the ten scans of "
+        "Heritier et al. 2018, Table 1, without free gains; "
         "sensitivity: projection on sensitivity matrices"
     )
     modes = "basis indices to use, like 0:400 (400 is not) or 3,5,9; default all"

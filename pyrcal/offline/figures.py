@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from pyrcal.offline.fitted import Fit
-from pyrcal.offline.methods import ScanStep
+from pyrcal.offline.methods import FITTED_HALF_WIDTH, ScanStep
 from pyrcal.offline.report import FitReport, verdict_line
 from service.errors import ConfigurationError
 from service.model.instrument import Instrument, TabulatedModes
@@ -257,7 +257,7 @@ def _mode(triple: NDArray[Any], fit: Fit, column: int) -> None:
 
 
 def scans(figure: SubFigure, steps: tuple[ScanStep, ...]) -> None:
-    """Draw χ² over the samples of every step, with the parabola through them."""
+    """Draw the criterion χ_N over the samples of every step, with the fitted polynomial."""
     grid = figure.subplots(_rows(steps, _SCANS_ACROSS), _SCANS_ACROSS, squeeze=False).ravel()
     for number, (axes, scan) in enumerate(zip(grid, steps, strict=False), start=1):
         _scan(axes, scan, number)
@@ -267,11 +267,9 @@ def scans(figure: SubFigure, steps: tuple[ScanStep, ...]) -> None:
 
 def _scan(axes: Axes, scan: ScanStep, number: int) -> None:
     axes.plot(scan.samples, scan.chi, "o", color="tab:red", markersize=3.0)
-    if len(scan.samples) >= 3:
-        middle = scan.samples.mean()
-        parabola = np.polynomial.Polynomial.fit(scan.samples - middle, scan.chi, 2)
-        fine = np.linspace(scan.samples.min(), scan.samples.max(), 50)
-        axes.plot(fine, parabola(fine - middle), color="tab:blue", linewidth=1.0)
+    fine = np.linspace(-FITTED_HALF_WIDTH, FITTED_HALF_WIDTH, 50)
+    polynomial = np.polyval(scan.coefficients, fine)
+    axes.plot(scan.minimum + scan.step * fine, polynomial, color="tab:blue", linewidth=1.0)
     axes.axvline(scan.minimum, color="0.5", linewidth=0.8)
     axes.set_title(
         f"{number}: {scan.parameter} by {scan.step:g}, {scan.minimum:.4f}", fontsize="small"

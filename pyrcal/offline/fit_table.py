@@ -199,8 +199,8 @@ def _extras(fit: Fit) -> Iterator[str]:
 
 
 def paper_lines(steps: tuple[ScanStep, ...]) -> Iterator[str]:
-    """Yield the paper's Table 1: which parameter was scanned, how finely, and its minimum."""
-    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'every':>9s}{'minimum':>11s}"
+    """Yield the paper's Table 1: which parameter was scanned, how finely, and its value."""
+    yield f"{'step':>4s}  {'parameter':15s}{'from':>11s}{'to':>11s}{'by':>9s}{'value':>11s}"
     for number, scan in enumerate(steps, start=1):
         yield (
             f"{number:4d}  {scan.parameter:15s}{scan.samples.min():11.4f}"

@@ -193,7 +193,7 @@ def _fitted(
         start = options.start
     else:
         start = pose if pose is not None else instrument.start
-    found = _found(models, target, instrument.with_anamorphosis(start), options)
+    found = _found(models, target, instrument.with_anamorphosis(start), options, tell)
     noisy = noise_columns(
         found.settled.solution, found.settled.target, instrument.slopes.kind.n_planes
     )
@@ -203,7 +203,7 @@ def _fitted(
         used = basis.subset(usable.columns)
         target, models = target_of(usable, instrument), replace(models, basis=used)
         begin = instrument.with_anamorphosis(found.settled.solution.alpha)
-        found = _found(models, target, begin, options)
+        found = _found(models, target, begin, options, tell)
     tell("verdict")
     fit = _answer(models, found, usable, untold, reported, options)
     if options.explain and not fit.accepted:
@@ -360,7 +360,11 @@ class _Found:
 
 
 def _found(
-    models: FitModels, target: Target, start: Misregistration, options: FitOptions
+    models: FitModels,
+    target: Target,
+    start: Misregistration,
+    options: FitOptions,
+    tell: Progress,
 ) -> _Found:
     nuisances = nuisances_of(
         target.valid,
@@ -380,7 +384,7 @@ def _found(
         case Method.SENSITIVITY:
             return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
         case Method.PAPER:
-            alpha, table = scan(models, target, start)
+            alpha, table = scan(models, target, start, tell=tell)
             return _Found(settled=settle_at(models, target, alpha, nuisances), table=table)
 
 

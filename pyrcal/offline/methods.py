@@ -7,25 +7,25 @@ from many.
 is projected on the derivatives of the synthetic one. It is first order, so it is repeated about
 each answer.
 
-**paper**: rotation, shift along x, shift along y and magnification are scanned in turn, the others
-held; the lowest point of a parabola through χ² is kept, and the next round takes smaller steps. χ²
-is the sum over modes of the squared difference of measured and synthetic slopes, each mode with a
-gain of its own and unit weight, the first modes left out: vibrations and the edge of the pupil
-spoil them. The order of the parameters and the parabolas are the paper's. Its step sizes are not
-reproduced from its table; those here shrink by five from a fifth of the capture range to what noise
-allows.
+**paper**: the ten steps of Table 1 of Heritier et al. 2018. One parameter is scanned at a time, the
+others held, in the order and with the step sizes of :data:`TABLE_1`. The criterion is χ_N of
+section 4.2, :func:`chi_n`: all modes, no free gain. The value of a step is the minimum of a second
+order polynomial through the samples about the lowest one. The modal gains are tuned afterwards, at
+the registration found (section 4.3).
 
 References
 ----------
-Heritier et al. 2018, MNRAS 481, 2829, section 4 and Table 1 (the scans); Kolb et al. 2012, Proc.
-SPIE 8447 (identification by sensitivity matrices at the VLT's AOF).
+Heritier et al. 2018, MNRAS 481, 2829, section 4, equations 7 and 8, Table 1; Kolb et al. 2012,
+Proc. SPIE 8447 (identification by sensitivity matrices at the VLT's AOF).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,6 @@ from pyrcal.offline.solver import (
 )
 from service.estimation.reference import Target
 from service.estimation.solver import (
-    LIMIT,
     SETTLED,
     Approach,
     Columns,
@@ -48,6 +47,7 @@ from service.estimation.solver import (
     vertex,
     within_limits,
 )
+from service.model.interaction import InteractionModel
 from service.model.misregistration import BOUNDARY_SCALE, PARAMETERS, Misregistration
 
 Array = NDArray[np.float64]
@@ -82,24 +82,32 @@ hardly change a matrix, and would wander without end."""
 REACH = 20.0
 """Derivatives within so many settling lengths of where they were taken are as good as new."""
 
-ORDER = (2, 0, 1, 3)
-"""Indices of the parameters in the order they are scanned."""
-
-ROUNDS = (
-    np.array([0.5, 0.5, 2.0, 0.02]),
-    np.array([0.1, 0.1, 0.4, 0.004]),
-    np.array([0.02, 0.02, 0.08, 0.0008]),
+TABLE_1 = (
+    ("rotation_deg", 0.125),
+    ("shift_x_subap", 0.25),
+    ("shift_y_subap", 0.25),
+    ("rotation_deg", 0.1),
+    ("shift_x_subap", 0.02),
+    ("shift_y_subap", 0.02),
+    ("rotation_deg", 0.025),
+    ("shift_x_subap", 0.02),
+    ("shift_y_subap", 0.02),
+    ("magnification", 0.0045),
 )
-"""Step of each parameter in each round, boundary units."""
+"""Parameter and distance of two samples of each step of the paper's Table 1, boundary units."""
 
-HALF_WIDTH = 2
-"""Samples on either side of where a scan begins."""
+ROUGH_RANGE = {"rotation_deg": 2.0, "shift_x_subap": 1.0, "shift_y_subap": 1.0}
+"""Error of the rough first estimate that the paper assumes (section 4), boundary units. The first
+scan of each parameter covers it."""
 
-MAX_EXTENSIONS = 2
-"""Times that a scan moves on when its lowest sample is its last."""
+HALF_WIDTH = 5
+"""Samples on either side of the start of the later scans. The paper does not print a number."""
 
-N_LEFT_OUT = 10
-"""First modes that have no part in χ², where there are enough others."""
+MAX_EXTENSION = 60
+"""Samples added at most to a scan whose lowest sample is its last."""
+
+FITTED_HALF_WIDTH = 2
+"""Samples on either side of the lowest one that the polynomial is fitted to."""
 
 MAX_MODES = 60
 """Modes, spread over those fitted, that are compared where a few will do."""
@@ -131,13 +139,16 @@ class ScanStep:
     """Distance of two samples, in boundary units (subaperture, degree, ratio)."""
 
     samples: NDArray[np.float64]
-    """``(n_samples,)`` values tried, in boundary units."""
+    """``(n_samples,)`` values tried, ascending, in boundary units."""
 
     chi: NDArray[np.float64]
-    """``(n_samples,)`` χ² at each."""
+    """``(n_samples,)`` criterion χ_N at each, (slope per metre)²."""
 
     minimum: float
-    """Lowest point of the parabola, in boundary units: where the next line begins."""
+    """Minimum of the polynomial, in boundary units: the parameter's value after this step."""
+
+    coefficients: NDArray[np.float64]
+    """``(3,)`` of the polynomial, highest order first, in ``(value - minimum) / step``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -391,28 +402,57 @@ def project_on_sensitivities(
 
 
 def scan(
-    models: FitModels, target: Target, start: Misregistration
+    models: FitModels,
+    target: Target,
+    start: Misregistration,
+    steps: Sequence[tuple[str, float]] = TABLE_1,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> tuple[Misregistration, tuple[ScanStep, ...]]:
-    """Return the end of the scans from a start, and each of them."""
-    first = N_LEFT_OUT if target.n_modes >= 3 * N_LEFT_OUT else 0
-    columns = np.arange(first, target.n_modes)
-    model = models.model(2, models.basis.subset(columns))
-    target = target.column_subset(columns)
+    """Scan the parameters one by one and return the last values and every scan.
+
+    ``steps`` are the parameter and the step size of each scan, in boundary units. ``tell`` is
+    called with a line after each scan.
+    """
     values = start.vector * BOUNDARY_SCALE
-    table = []
+    table: list[ScanStep] = []
+    for number, (parameter, step) in enumerate(steps):
+        # the value of a parameter is that of its last scan: the earlier ones lead there
+        last = all(later != parameter for later, _ in steps[number + 1 :])
+        model = models.fine if last else models.cheap
+        index, known = PARAMETERS.index(parameter), values.copy()
 
-    def chi(tried: Array) -> float:
-        return target.misfit(models.matrix(model, start.moved_to(tried / BOUNDARY_SCALE)))
-
-    for steps in ROUNDS:
-        for index in ORDER:
-            for _ in range(1 + MAX_EXTENSIONS):
-                step = _scanned(chi, values, index, float(steps[index]))
-                table.append(step)
-                values[index] = step.minimum
-                if step.samples[0] < step.minimum < step.samples[-1]:
-                    break
+        chi = partial(_chi_at, models, model, target, start, known, index)
+        first = all(done.parameter != parameter for done in table)
+        reach = ROUGH_RANGE.get(parameter, 0.0) if first else 0.0
+        half_width = max(HALF_WIDTH, round(reach / step))
+        table.append(_scanned(chi, parameter, float(values[index]), step, half_width))
+        values[index] = table[-1].minimum
+        tell(f"step {len(table)}: {parameter} by {step:g}: {table[-1].minimum:.4f}")
     return start.moved_to(values / BOUNDARY_SCALE), tuple(table)
+
+
+def _chi_at(
+    models: FitModels,
+    model: InteractionModel,
+    target: Target,
+    start: Misregistration,
+    known: Array,
+    index: int,
+    tried: float,
+) -> float:
+    """Return χ_N with one parameter at a tried value, boundary units."""
+    there = np.where(np.arange(4) == index, tried, known)
+    return chi_n(target, models.matrix(model, start.moved_to(there / BOUNDARY_SCALE)))
+
+
+def chi_n(target: Target, matrix: NDArray[Any]) -> float:
+    """Return the paper's criterion χ_N of a synthetic matrix, (slope per metre)².
+
+    It is the squared norm over the modes (equation 8) of the RMS difference between measured and
+    synthetic slopes of each mode (equation 7). No gain is left free.
+    """
+    difference = target.matrix[target.rows] - matrix[target.rows]
+    return float(np.sum(np.mean(difference**2, axis=0, dtype=np.float64)))
 
 
 def _known(models: FitModels, target: Target, alpha: Misregistration) -> Target:
@@ -428,29 +468,29 @@ def _other_starts(start: Array) -> list[Array]:
     return [nominal, *(nominal + step for step in [*turns, *corners])]
 
 
-def _scanned(chi: Callable[[Array], float], values: Array, index: int, step: float) -> ScanStep:
-    samples = values[index] + step * np.arange(-HALF_WIDTH, HALF_WIDTH + 1)
-    if index == 3:
-        samples = np.clip(samples, 1.0 - LIMIT[index], 1.0 + LIMIT[index])
-    tried = np.tile(values, (len(samples), 1))
-    tried[:, index] = samples
-    found = np.array([chi(one) for one in tried])
+def _scanned(
+    chi: Callable[[float], float], parameter: str, start: float, step: float, half_width: int
+) -> ScanStep:
+    """Scan one parameter about a start; continue where the lowest sample is the last one."""
+    found = {k: chi(start + k * step) for k in range(-half_width, half_width + 1)}
+    for _ in range(MAX_EXTENSION):
+        best = min(found, key=lambda k: found[k])
+        beyond = best - 1 if best == min(found) else best + 1
+        if beyond in found:
+            break
+        found[beyond] = chi(start + beyond * step)
+    places = np.array(sorted(found))
+    values = np.array([found[k] for k in places])
+    near = np.abs(places - best) <= FITTED_HALF_WIDTH
+    bend, slope, least = np.polyfit(places[near] - best, values[near], 2)
+    # a polynomial without a minimum near the lowest sample says nothing better than the sample
+    turn = -slope / (2.0 * bend) if bend > 0.0 and abs(slope) <= 2.0 * bend else 0.0
+    level = least + turn * (slope + bend * turn)
     return ScanStep(
-        parameter=PARAMETERS[index],
+        parameter=parameter,
         step=step,
-        samples=samples,
-        chi=found,
-        minimum=_lowest(samples, found),
+        samples=start + step * places,
+        chi=values,
+        minimum=float(start + step * (best + turn)),
+        coefficients=np.array([bend, slope + 2.0 * bend * turn, level]),
     )
-
-
-def _lowest(samples: Array, chi: Array) -> float:
-    """Return the lowest point of the parabola through the lowest sample and its neighbours.
-
-    At the end of a scan the sample itself.
-    """
-    best = int(np.argmin(chi))
-    if best in {0, len(samples) - 1}:
-        return float(samples[best])
-    step = samples[best + 1] - samples[best]
-    return float(samples[best] + step * vertex(*chi[best - 1 : best + 2]))

@@ -1,6 +1,6 @@
-"""Heritier et al. 2018 (MNRAS 481, 2829) played on the simulated telescope, figure by figure.
+"""Heritier et al. 2018 (MNRAS 481, 2829) on the simulated telescope, figure by figure.
 
-One HTML report puts every figure and table beside the paper's own values. All numbers in it come
-from the run; steps are kept on disk, so an interrupted run goes on where it was.
-Run: ``make paper``, or ``python -m pyrcal_studies.heritier2018 --quick`` for a rehearsal.
+``make paper`` writes docs/results/heritier2018.md and its pictures: every equation, table, figure
+and claim of the paper beside ours. All numbers come from the run. Each step is kept on disk, so an
+interrupted run continues where it was.
 """

@@ -147,6 +147,22 @@ class Answer:
         """Nothing but the telescope."""
         return ()
 
+    @property
+    def parts(self) -> tuple[Answer, ...]:
+        """Itself: it is one step."""
+        return (self,)
+
+    def matrix(self, store: Store) -> NDArray[np.float32]:
+        """Return ``(n_slopes, n_modes)``, slope per metre of command on the mirror."""
+        seen_once = store.read(self)["matrix"]
+        return np.asarray(seen_once * np.float32(self.occasion.passes), dtype=np.float32)
+
+    def reference(self, store: Store) -> Reference:
+        """Return it as a fit takes it."""
+        return Reference(
+            matrix=self.matrix(store).astype(np.float64), double_pass=self.occasion.passes == 2
+        )
+
     def compute(self, store: Store) -> Record:
         """Return ``matrix`` ``(n_slopes, n_modes)``, slope per metre of wavefront, seen once.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.calibration import FRAME_COST_S
-from pyrcal_studies.heritier2018.reconstructors import AnyReconstructor
+from pyrcal_studies.heritier2018.reconstructors import Inverse
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
 from service.model.misregistration import Misregistration
@@ -94,7 +94,7 @@ class GainTuning:
     alpha: Misregistration
     """The truth."""
 
-    reconstructor: AnyReconstructor
+    reconstructor: Inverse
     frames_per_gain: int
     """Half of them settle."""
 

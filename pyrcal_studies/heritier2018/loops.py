@@ -13,12 +13,13 @@ from pyrcal_studies.heritier2018 import telescope
 from pyrcal_studies.heritier2018.calibration import FRAME_COST_S
 from pyrcal_studies.heritier2018.closing import OVERHEAD_S, ClosedLoop, GainTuning
 from pyrcal_studies.heritier2018.psf import Camera
-from pyrcal_studies.heritier2018.reconstructors import AnyReconstructor
+from pyrcal_studies.heritier2018.reconstructors import Inverse
 from pyrcal_studies.heritier2018.registration import Found, resolved
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
 from service.model.misregistration import Misregistration
 from sim_rtc.computer.feed import BATCH_FRAMES
+from sim_rtc.computer.gains import by_group
 from sim_rtc.telescope.diffractive import DiffractiveOptics
 
 Array = NDArray[np.float64]
@@ -39,8 +40,9 @@ class Over(StrEnum):
     CONTROLLED = "the controlled modes"
     """As they truly are, what others have leaked into them included."""
 
-    SLOPES = "what the slopes show of them"
-    """The slopes through the loop's own reconstructor: all that a telescope can know."""
+    MIRROR = "the controlled modes, from the mirror's positions"
+    """What is played and what corrects it, together: the paper's residual. The correction of
+    vibrations is in it, the vibrations themselves are not."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,9 +53,9 @@ class LoopRun:
     alpha: Misregistration | Found
     """The truth."""
 
-    reconstructor: AnyReconstructor
+    reconstructor: Inverse
     gain: float | GainTuning
-    """Of every mode, or of each group as a ramp has found it."""
+    """Gain of every mode, or the ramp that finds one for each group of modes."""
 
     n_frames: int
     """After it has settled."""
@@ -92,7 +94,7 @@ class LoopRun:
     def compute(self, store: Store) -> Record:
         """Return the residual's error in time and by mode, nm, and its H-band image.
 
-        ``slopes_nm2`` ``(n_controlled,)`` is what the slopes show of each controlled mode, as the
+        ``mirror_nm2`` ``(n_modes,)`` is the power of the mirror's positions in each mode, as the
         sensor sees it.
         """
         passes = self.occasion.passes
@@ -102,25 +104,30 @@ class LoopRun:
         matrix = (matrix * np.float32(self.reconstructor.passes / passes)).astype(np.float32)
         gains = np.full(len(matrix), self.gain if isinstance(self.gain, float) else np.nan)
         if isinstance(self.gain, GainTuning):
-            gains = store.read(self.gain)["gains"]
+            # tuned on a reconstructor of perhaps fewer modes: its last group is extended
+            tip_tilt, *others = store.read(self.gain)["by_group"].tolist()
+            middle = others[0] if others else tip_tilt
+            rest = others[-1] if others else tip_tilt
+            gains = np.array(by_group((tip_tilt, middle, rest), len(matrix)))
         closed = ClosedLoop(
             self.occasion, alpha, matrix, self.n_frames_run, played_modes=self.played_modes
         )
-        residual, shown, n_clipped = [], [], 0
+        residual, positions, n_clipped = [], [], 0
         for row in range(0, self.n_frames_run, BATCH_FRAMES):
             result = closed.batch(row, gains)
             n_clipped += result.n_clipped
             if row >= SETTLING_FRAMES:
                 residual.append(closed.residual_m(row, result))
-                shown.append(result.slopes @ matrix.T)
+                positions.append(result.commands_m)
         plant = telescope.plant(self.occasion)
         found = statistics(
             closed.optics, plant.weights, np.array(residual), closed.incoming_m(SETTLING_FRAMES)
         )
-        power = np.mean(np.concatenate(shown).astype(np.float64) ** 2, axis=0)
+        power = np.mean(np.concatenate(positions).astype(np.float64) ** 2, axis=0)
         return {
             **found,
-            "slopes_nm2": power * (passes * 1e9) ** 2,
+            "mirror_nm2": power * (passes * 1e9) ** 2,
+            "n_controlled": np.array(len(matrix)),
             "image": Camera(plant).image(np.array(residual)),
             "n_clipped": np.array(n_clipped),
         }
@@ -178,7 +185,8 @@ def wavefront_error_nm(record: Record, *, without_first: int = 0, over: Over = O
         case Over.PUPIL:
             variance = float(record["total_nm2"]) - float(modal[:without_first].sum())
         case Over.CONTROLLED:
-            variance = float(modal[without_first : len(record["slopes_nm2"])].sum())
-        case Over.SLOPES:
-            variance = float(record["slopes_nm2"][without_first:].sum())
+            variance = float(modal[without_first : int(record["n_controlled"])].sum())
+        case Over.MIRROR:
+            shown = record["mirror_nm2"][without_first : int(record["n_controlled"])]
+            variance = float(shown.sum())
     return float(np.sqrt(max(variance, 0.0)))

@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import telescope
-from pyrcal_studies.heritier2018.calibration import Measurement
+from pyrcal_studies.heritier2018.calibration import Answer, Measurement
 from pyrcal_studies.heritier2018.registration import FitRun, Found, fitted_alpha, resolved
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from pyrcal_studies.heritier2018.telescope import Occasion
 from service.control.gains import CalibrationGains
-from service.control.reconstructor import Inversion, Prior, invert, invert_with_prior
+from service.control.reconstructor import Inversion, invert
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 
 INVERSION_COST_S = 3.0
 
 
-class Kind(StrEnum):
-    """How a matrix is inverted."""
+class Inverse(Task, Protocol):
+    """A task whose result is a reconstructor."""
 
-    TRUNCATED = "truncated SVD"
-    MAP = "MAP"
+    @property
+    def n_modes(self) -> int:
+        """Modes it controls."""
+
+    @property
+    def passes(self) -> int:
+        """How often the light meets the mirror whose commands it gives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,11 +38,8 @@ class ModelReconstructor:
     """Inverse of the model's matrix at a registration that is taken for granted."""
 
     occasion: Occasion
-    """Whose noise the prior knows."""
-
     alpha: Misregistration | Found
     n_modes: int
-    kind: Kind = Kind.TRUNCATED
 
     @property
     def passes(self) -> int:
@@ -47,7 +49,7 @@ class ModelReconstructor:
     @property
     def label(self) -> str:
         """What the progress bar shows."""
-        return f"reconstructor of the model, {self.n_modes} modes, {self.kind}"
+        return f"reconstructor of the model, {self.n_modes} modes"
 
     @property
     def cost_s(self) -> float:
@@ -63,21 +65,14 @@ class ModelReconstructor:
         """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
         alpha = resolved(self.alpha, store)
         matrix = synthetic_matrix(alpha) * self.occasion.passes
-        if self.kind is Kind.TRUNCATED:
-            return _record(invert(matrix, self.n_modes))
-        seen = telescope.optics(self.occasion, alpha)
-        prior = Prior(
-            variance_m2=telescope.basis().variance_m2,
-            slope_noise=telescope.detector(self.occasion, seen).sigma.astype(np.float64),
-        )
-        return _record(invert_with_prior(matrix, self.n_modes, prior))
+        return inverse_record(invert(matrix, self.n_modes))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeasuredReconstructor:
     """Inverse of the measured matrix itself, its noise included."""
 
-    measurement: Measurement
+    measurement: Measurement | Answer
 
     @property
     def passes(self) -> int:
@@ -106,7 +101,7 @@ class MeasuredReconstructor:
 
     def compute(self, store: Store) -> Record:
         """Return ``matrix`` ``(n_modes, n_slopes)`` and its condition number."""
-        return _record(invert(self.measurement.matrix(store), self.n_modes))
+        return inverse_record(invert(self.measurement.matrix(store), self.n_modes))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +116,7 @@ class FittedReconstructor:
     @property
     def passes(self) -> int:
         """How often the light met the mirror when the fitted matrix was measured."""
-        return self.fit.measurement.occasion.passes
+        return self.fit.source.occasion.passes
 
     @property
     def label(self) -> str:
@@ -145,16 +140,12 @@ class FittedReconstructor:
         matrix = synthetic_matrix(fitted_alpha(fit))
         if self.tuned:
             matrix = calibration_gains(fit, matrix.shape[1]).tuned(matrix)
-        return _record(invert(self.passes * matrix, self.n_modes))
-
-
-AnyReconstructor = ModelReconstructor | MeasuredReconstructor | FittedReconstructor
+        return inverse_record(invert(self.passes * matrix, self.n_modes))
 
 
 def calibration_gains(fit: Record, n_basis: int) -> CalibrationGains:
     """Return the gains that a fit found, for every mode of the basis."""
-    modes = np.arange(len(fit["gains"]))
-    return CalibrationGains.of_modes(fit["gains"], modes, n_basis)
+    return CalibrationGains.of_modes(fit["gains"], fit["modes"], n_basis)
 
 
 def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:
@@ -163,7 +154,8 @@ def synthetic_matrix(alpha: Misregistration) -> NDArray[np.float64]:
     return np.asarray(model.interaction_matrix(alpha), dtype=np.float64)
 
 
-def _record(inversion: Inversion) -> Record:
+def inverse_record(inversion: Inversion) -> Record:
+    """Return a reconstructor, its condition number and how much was truncated."""
     return {
         "matrix": inversion.matrix,
         "condition_number": np.array(inversion.condition_number),

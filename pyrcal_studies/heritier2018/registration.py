@@ -1,10 +1,10 @@
-"""Finding the hidden registration: the joint fit, and the paper's scans one after the other."""
+"""The registration of a matrix: Table 1's procedure, and the joint fit beside it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,26 +12,31 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal.offline.methods import TABLE_1, scan
+from pyrcal.offline.models import FitModels
 from pyrcal_studies.heritier2018 import telescope
-from pyrcal_studies.heritier2018.calibration import Measurement
+from pyrcal_studies.heritier2018.calibration import Answer, Measurement
 from pyrcal_studies.heritier2018.store import Record, Store, Task
 from service.errors import PyrcalError
+from service.estimation.reference import target_of
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 from service.model.slopes import Orientation
 
 Array = NDArray[np.float64]
 
-_COST_S = {Method.JOINT: 3.0, Method.PAPER: 10.0, Method.SENSITIVITY: 5.0}
+_COST_S = {Method.JOINT: 12.0, Method.PAPER: 35.0, Method.SENSITIVITY: 12.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitRun:
     """One fit to one measured matrix from one start."""
 
-    measurement: Measurement
+    source: Measurement | Answer
     method: Method
     start: Misregistration
+    modes_every: int = 1
+    """Only each such mode takes part."""
 
     @property
     def label(self) -> str:
@@ -42,17 +47,24 @@ class FitRun:
     @property
     def cost_s(self) -> float:
         """Rough time on one idle core, seconds."""
-        return _COST_S[self.method]
+        return float(_COST_S[self.method] / self.modes_every**0.5)
 
     @property
     def needs(self) -> tuple[Task, ...]:
         """The measurement."""
-        return self.measurement.parts
+        return self.source.parts
+
+    @property
+    def modes(self) -> NDArray[np.intp]:
+        """Modes that take part."""
+        return np.arange(0, self.source.n_modes, self.modes_every)
 
     def compute(self, store: Store) -> Record:
-        """Return what the fit found, flattened; a fit that gives up is a record of its reason."""
-        options = FitOptions(method=self.method, start=self.start, orientation=Orientation())
-        reference = self.measurement.reference(store)
+        """Return the fit as arrays; one that gives up is a record of its reason."""
+        options = FitOptions(
+            method=self.method, start=self.start, orientation=Orientation(), modes=self.modes
+        )
+        reference = self.source.reference(store)
         instrument, basis = telescope.instrument(), telescope.basis()
         started = time.process_time()
         try:
@@ -68,6 +80,7 @@ def flattened(fit: Fit, seconds: float) -> Record:
         "alpha": fit.alpha.vector * BOUNDARY_SCALE,
         "sigma": np.sqrt(np.diag(fit.covariance)) * BOUNDARY_SCALE,
         "gains": fit.gains,
+        "modes": fit.modes,
         "residual_fraction": np.array(fit.residual_fraction),
         "residual_by_mode": fit.residual_by_mode,
         "condition_number": np.array(fit.condition_number),
@@ -86,6 +99,7 @@ def flattened(fit: Fit, seconds: float) -> Record:
     for k, step in enumerate(steps):
         record[f"samples_{k}"] = step.samples
         record[f"chi_{k}"] = step.chi
+        record[f"coefficients_{k}"] = step.coefficients
     return record
 
 
@@ -103,6 +117,38 @@ def _gave_up(reason: str, seconds: float) -> Record:
 def fitted_alpha(record: Mapping[str, NDArray[Any]]) -> Misregistration:
     """Return the registration a fit found."""
     return Misregistration.from_vector(record["alpha"] / BOUNDARY_SCALE)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Repeat:
+    """Another estimation after Table 1's procedure: its last four steps again."""
+
+    fit: FitRun
+
+    @property
+    def label(self) -> str:
+        """What the progress bar shows."""
+        return "steps 7 to 10 of Table 1 again"
+
+    @property
+    def cost_s(self) -> float:
+        """Rough time on one idle core, seconds."""
+        return float(15.0 / self.fit.modes_every**0.5)
+
+    @property
+    def needs(self) -> tuple[Task, ...]:
+        """The procedure."""
+        return (self.fit,)
+
+    def compute(self, store: Store) -> Record:
+        """Return ``alpha`` in boundary units."""
+        plain = replace(telescope.instrument().slopes, orientation=Orientation())
+        instrument = replace(telescope.instrument(), slopes=plain)
+        models = FitModels(instrument=instrument, basis=telescope.basis().subset(self.fit.modes))
+        target = target_of(self.fit.source.reference(store), instrument)
+        target = target.column_subset(self.fit.modes)
+        alpha, _ = scan(models, target, fitted_alpha(store.read(self.fit)), TABLE_1[6:])
+        return {"alpha": alpha.vector * BOUNDARY_SCALE}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,10 +185,19 @@ def is_right(record: Mapping[str, NDArray[Any]], truth: Misregistration) -> bool
     return bool(np.all(np.abs(errors(record, truth)) <= TOLERANCE))
 
 
+ROUGH_ESTIMATE = np.array([1.0, 1.0, np.deg2rad(2.0), 0.02])
+"""Error of the rough estimate that the paper assumes: ±1 subaperture and ±2 deg (section 4); of the
+magnification, for which it assumes none, 2 % (numeric units)."""
+
+
 def random_starts(
-    truth: Misregistration, n_starts: int, rng: np.random.Generator
+    truth: Misregistration, distance: float, n_starts: int, rng: np.random.Generator
 ) -> tuple[Misregistration, ...]:
-    """Return starts about the truth: ±1.5 subapertures, ±6 deg, ±5 %, uniform."""
-    reach = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
-    steps = rng.uniform(-1.0, 1.0, (n_starts, 4)) * reach
-    return tuple(Misregistration.from_vector(truth.vector + step) for step in steps)
+    """Return starts at the corners of the rough estimate's box, scaled by a distance.
+
+    The signs are random.
+    """
+    signs = rng.choice([-1.0, 1.0], (n_starts, 4))
+    return tuple(
+        Misregistration.from_vector(truth.vector + distance * row * ROUGH_ESTIMATE) for row in signs
+    )

@@ -22,18 +22,18 @@ from sim_rtc.options import Options, parse_options
 from sim_rtc.telescope.detector import Detector, PixelDetector
 from sim_rtc.telescope.diffractive import DiffractiveOptics, DiffractivePlant
 from sim_rtc.telescope.mirror import DrawnSurface, PlantSurface
-from sim_rtc.telescope.sky import Sky
+from sim_rtc.telescope.sky import DAYTIME_LINES, Sky
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 INSTRUMENT = "flao-lbt"
 
-DRAWN, DRAWN_USUAL = "drawn", "drawn-usual"
-"""Beside the simulator's named sets: the mirror has the influence functions of the drawing."""
+DRAWN = "drawn"
+"""Beside the simulator's named sets: nothing differs from the model but the optics' computation."""
 
-_SETS = {DRAWN: "ideal", DRAWN_USUAL: "usual"}
-"""The simulator's set for all but the mirror."""
+_UNEVEN = f"{DRAWN}-uneven-"
+"""Before a number: the light departs from its mean by so much, and nothing else differs."""
 
 _PLANT, _SKY, _PHOTONS, _MEASURING = range(4)
 """Children of an occasion's seed."""
@@ -48,8 +48,8 @@ class Occasion:
 
     seed: int
     imperfections: str = "usual"
-    """How far the telescope is from the drawing, a named set of the simulator, or ``DRAWN``,
-    ``DRAWN_USUAL``."""
+    """How far the telescope is from the model: a named set of the simulator, ``DRAWN``, or
+    ``DRAWN`` in uneven light."""
 
     vibrations: bool = False
     """By day: whether anything shakes it."""
@@ -83,12 +83,37 @@ class Occasion:
     def options(self) -> Options:
         """Return the simulator's options for it."""
         words = ["--plant=diffractive", f"--seed={self.seed}", f"--mag={self.magnitude}"]
-        departures = _SETS.get(self.imperfections, self.imperfections)
+        departures = self.imperfections
+        if departures.startswith(_UNEVEN):
+            words.append(f"--unevenness={departures.removeprefix(_UNEVEN)}")
+            departures = DRAWN
+        if departures == DRAWN:
+            departures = "ideal"
         words += [f"--seeing={self.seeing_arcsec}", f"--imperfections={departures}"]
+        words += self.vibration_words
         words.append("--scene=daytime" if self.daytime else "--scene=onsky")
-        if self.daytime and not self.vibrations:
-            words.append("--vibration=none")
         return parse_options(words)
+
+    @property
+    def vibration_words(self) -> list[str]:
+        """The simulator's options for what shakes it."""
+        return ["--vibration=none"] if self.daytime and not self.vibrations else []
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShakenOccasion(Occasion):
+    """An occasion by day with stronger vibrations than the simulated dome's."""
+
+    times: float
+    """Amplitude over that of the simulated dome."""
+
+    @property
+    @override
+    def vibration_words(self) -> list[str]:
+        return [
+            f"--vibration={line.shape}:{line.frequency_hz:g}:{self.times * line.rms_m * 1e9:g}"
+            for line in DAYTIME_LINES
+        ]
 
 
 class DrawnPlant(DiffractivePlant):
@@ -137,7 +162,7 @@ def plant(occasion: Occasion) -> DiffractivePlant:
 @lru_cache(maxsize=4)
 def _plant(occasion: Occasion) -> DiffractivePlant:
     options, rng = occasion.options(), occasion.rng(_PLANT)
-    if occasion.imperfections in _SETS:
+    if occasion.imperfections.startswith(DRAWN):
         return DrawnPlant(
             instrument(),
             basis(),

@@ -153,7 +153,7 @@ def tolerance_scale(
     """Return ``(4,)`` how much more misregistration a loop tolerates than that of the reference.
 
     A loop tolerates a given share of the width of its finest mode (Heritier et al. 2018, section
-    5). That width is ``N sqrt(pi / (4 n))`` subapertures for n modes on N subapertures. A shift
+    3.2). That width is ``N sqrt(pi / (4 n))`` subapertures for n modes on N subapertures. A shift
     displaces the image as a whole, rotation and magnification displace its rim by N / 2 times the
     parameter. Never below 1: what is allowed for the reference was safe on every telescope tried.
     """

@@ -1,6 +1,6 @@
 """Inversion of an interaction matrix into a reconstructor (control matrix).
 
-There are two methods. Truncated least squares (Heritier et al. 2018, section 2.2) needs the matrix
+There are two methods. Truncated least squares (Heritier et al. 2018, section 2.1) needs the matrix
 alone. The MAP estimator, a Gauss-Markov estimator with a prior, also uses the covariances of modes
 and noise: ``R = (D^T Cn^-1 D + Cφ^-1)^-1 D^T Cn^-1``. It estimates all modes of the basis, also
 those that the loop does not control, so that their slopes do not alias into the controlled modes.
@@ -65,7 +65,7 @@ def invert(
 
     References
     ----------
-    Heritier et al. 2018, section 2.2.
+    Heritier et al. 2018, section 2.1, equation 2.
     """
     controlled = select_columns(interaction_matrix, n_modes)
     normal = controlled.T @ controlled

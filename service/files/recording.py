@@ -30,6 +30,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
+import h5py
 import numpy as np
 import structlog
 

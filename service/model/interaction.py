@@ -211,7 +211,7 @@ class InteractionModel:
 
         References
         ----------
-        Heritier et al. 2018, equation 6: D = M_WFS M_DM.
+        Heritier et al. 2018, equation 1: D = M_WFS M_DM.
         """
         return self._as_listed(self.seen(alpha, self._rendered(alpha)))
 

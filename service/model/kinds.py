@@ -127,7 +127,7 @@ class Method(StrEnum):
     """All four parameters together, by variable projection over a free gain per mode."""
 
     PAPER = "paper"
-    """One parameter at a time, with parabolas through scans (Heritier et al. 2018, section 4)."""
+    """One parameter at a time: the ten scans of Heritier et al. 2018, Table 1."""
 
     SENSITIVITY = "sensitivity"
     """Projection on sensitivity matrices about the start, iterated."""

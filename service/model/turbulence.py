@@ -31,7 +31,7 @@ def von_karman_covariance(separation_m: Array, turbulence: KarhunenLoeve) -> Arr
 
     References
     ----------
-    Conan 2000, PhD thesis; Heritier et al. 2018 use the same spectrum.
+    Conan 2000, PhD thesis.
     """
     scale = (turbulence.outer_scale_m / turbulence.r0_m) ** (5 / 3)
     shape = (

@@ -372,9 +372,9 @@ def model_error_of(
     """Return the model error by all windows so far.
 
     It is the larger of the setting and of what windows leave unexplained. A window with less
-    accuracy than this loop needs of α cannot determine it: the noise in its misfit, times its own σ,
-    would exceed any model error. ``own`` ``(4,)`` is the model error from the RTC's own matrix, a
-    lower bound that no window reduces.
+    accuracy than this loop needs of α cannot determine it: the noise in its misfit, times its own
+    σ, would exceed any model error. ``own`` ``(4,)`` is the model error from the RTC's own matrix,
+    a lower bound that no window reduces.
     """
     before = policy.floor if registration is None else registration.floor
     if own is not None:

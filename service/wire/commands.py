@@ -162,7 +162,7 @@ class RampRequest:
 
     The RTC runs each gain for ``frames_per_gain`` frames, while the other groups keep theirs, and
     keeps the gain with the smallest residual slopes. The result appears in the status' ``gains``.
-    Heritier et al. 2018 ramp tip and tilt, then the modes up to 100, then those up to 400.
+    Heritier et al. 2018, section 5, ramp tip and tilt, then the modes up to 100, then up to 400.
     """
 
     id: codec.Id

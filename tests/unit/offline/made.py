@@ -23,6 +23,7 @@ SCAN = ScanStep(
     samples=np.array([64.5, 65.0, 65.5]),
     chi=np.array([3.0, 1.0, 3.0]),
     minimum=65.0,
+    coefficients=np.array([2.0, 0.0, 1.0]),
 )
 
 

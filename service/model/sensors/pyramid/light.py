@@ -6,10 +6,11 @@ modelled as a smooth surface times what an even beam would show, diffraction inc
 edges tell the position.
 
 Slopes weigh by the light of their subaperture (global normalisation), so an unevenness of 20 % is
-20 % of a slope: larger than everything a registration does to the matrix. The paper names the
-measured illumination as its next step. The pattern belongs to the beam, that is to the pupil's
-images: with the mirror as stop it moves with them, and the map is kept relative to where they lay
-when the light was counted. With a fixed telescope stop it stays on the sensor.
+20 % of a slope: larger than everything a registration does to the matrix. Heritier et al. 2018
+(section 4.4) suggest to put the measured illumination into the model. The pattern belongs to the
+beam, that is to the pupil's images: with the mirror as stop it moves with them, and the map is kept
+relative to where they lay when the light was counted. With a fixed telescope stop it stays on the
+sensor.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pyrcal_studies.heritier2018.plan import FULL, TRUTH, fits_from_random_starts, joint_fit
+from pyrcal_studies.heritier2018.plan import FULL, TRUTH, capture_fits, joint_fit
 from pyrcal_studies.heritier2018.registration import errors, fitted_alpha, is_right, random_starts
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
@@ -32,16 +32,16 @@ def test_a_kept_fit_gives_back_its_registration() -> None:
     assert fitted_alpha(found(TRUTH)).vector == pytest.approx(TRUTH.vector)
 
 
-def test_random_starts_fill_the_capture_range_and_no_more() -> None:
-    starts = random_starts(TRUTH, 500, np.random.default_rng(1))
+def test_starts_are_corners_of_the_papers_rough_estimate() -> None:
+    starts = random_starts(TRUTH, 2.0, 50, np.random.default_rng(1))
     off = np.array([start.vector - TRUTH.vector for start in starts])
-    reach = np.array([1.5, 1.5, np.deg2rad(6.0), 0.05])
-    assert np.all(np.abs(off) <= reach)
-    assert np.all(np.abs(off).max(axis=0) > 0.95 * reach)
+    corner = 2.0 * np.array([1.0, 1.0, np.deg2rad(2.0), 0.02])
+    np.testing.assert_allclose(np.abs(off), np.tile(corner, (50, 1)))
+    assert len(np.unique(np.sign(off), axis=0)) == 16
 
 
 def test_both_methods_begin_at_the_same_starts_and_with_the_same_matrix() -> None:
-    joint, scans = (fits_from_random_starts(FULL, m) for m in (Method.JOINT, Method.PAPER))
-    assert len(joint) == 20
-    assert [run.start for run in joint] == [run.start for run in scans]
-    assert {run.measurement for run in (*joint, *scans)} == {joint_fit(FULL, 1).measurement}
+    joint, scans = (capture_fits(FULL, method) for method in (Method.JOINT, Method.PAPER))
+    for distance, fits in joint.items():
+        assert [fit.start for fit in fits] == [fit.start for fit in scans[distance]]
+        assert {fit.source for fit in (*fits, *scans[distance])} == {joint_fit(FULL, 1).source}

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from pyrcal_studies.heritier2018.calibration import Answer
-from pyrcal_studies.heritier2018.plan import AROUND, FULL, TRUTH, Variant, around_runs, in_simulator
+from pyrcal_studies.heritier2018.plan import AROUND, FULL, TRUTH, around_run, simulator_pair
 from pyrcal_studies.heritier2018.reconstructors import synthetic_matrix
 from pyrcal_studies.heritier2018.registration import Found, resolved
 from pyrcal_studies.heritier2018.store import Store
-from pyrcal_studies.heritier2018.telescope import DRAWN, Occasion
+from pyrcal_studies.heritier2018.telescope import DRAWN, Occasion, ShakenOccasion
 from service.model.kinds import Method
 from service.model.misregistration import BOUNDARY_SCALE, Misregistration
 
@@ -49,21 +49,31 @@ def test_a_telescopes_answer_is_for_one_pass_by_day_too(tmp_path: Path) -> None:
     assert by_day["singular"] == pytest.approx(by_night["singular"], rel=1e-3)
 
 
-def test_a_sweep_of_the_measured_matrix_begins_where_the_fit_found_the_mirror(
+def test_a_sweep_of_the_measured_matrix_begins_where_table_1s_procedure_found_the_mirror(
     tmp_path: Path,
 ) -> None:
     store = Store(tmp_path)
-    run = in_simulator(FULL, 1, Variant.MEASURED)
+    _, run = simulator_pair(FULL, 1)
     assert isinstance(run.alpha, Found)
-    assert run.alpha.fit.method is Method.JOINT
+    assert run.alpha.fit.method is Method.PAPER
     store.write(run.alpha.fit, {"alpha": TRUTH.vector * BOUNDARY_SCALE})
     assert resolved(run.alpha, store).vector == pytest.approx(TRUTH.vector)
     rotation = AROUND[0]
-    away, known = around_runs(FULL, rotation, 2.0)
+    away = around_run(FULL, rotation, 2.0)
     moved = resolved(away.alpha, store).vector - TRUTH.vector
     assert moved == pytest.approx([0.0, 0.0, np.deg2rad(2.0), 0.0])
     assert away.reconstructor == run.reconstructor
-    assert known.alpha == away.alpha
-    assert known.reconstructor.label != away.reconstructor.label
-    assert around_runs(FULL, rotation, 0.0)[0] == run
+    assert around_run(FULL, rotation, 0.0) == run
     assert run.occasion.imperfections == DRAWN
+
+
+def test_an_occasion_may_shake_more_or_have_uneven_light() -> None:
+    usual, strong = (
+        kind(daytime=True, seed=1, vibrations=True, **more).options().vibrations
+        for kind, more in ((Occasion, {}), (ShakenOccasion, {"times": 2.5}))
+    )
+    assert [2.5 * line.rms_m for line in usual] == pytest.approx([one.rms_m for one in strong])
+    assert Occasion(daytime=True, seed=1).options().vibrations == ()
+    uneven = Occasion(daytime=True, seed=1, imperfections=f"{DRAWN}-uneven-0.3").options()
+    assert uneven.imperfections.unevenness == 0.3
+    assert uneven.imperfections.position_error == 0.0

@@ -60,18 +60,12 @@ LOG_AFTER_NS: Final = 2 * SECOND_NS
 LOG_EVERY_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
 
-COMPLAINTS: Final = (
-    alarms.CERTIFICATE_ENDING,
-    alarms.CLOCK_LEAPT,
-    alarms.FRAMES_LOST,
-    alarms.FRAMES_UNUSED,
-    alarms.LINK_FLOODED,
-    alarms.LINK_REFUSED,
-    alarms.MESSAGES_REFUSED,
-    alarms.NO_FRAMES,
-    alarms.STATUS_FLOOD,
+DERIVED_EACH_SECOND: Final = frozenset(
+    name
+    for name, alarm in alarms.ALARMS.items()
+    if alarm.origin in ("runtime/readiness.py", "runtime/losses.py")
 )
-"""Names of the alarms that are made here."""
+"""Alarms that are derived from the link each second, and end when they are not derived again."""
 
 
 NOTHING_ELSE: Final[Mapping[str, str]] = {}
@@ -159,7 +153,9 @@ def detect_link_changes(
     if not any(f.outcome in NAMED_ELSEWHERE and f.age_s < RECENT_S for f in link.dispositions):
         also = silence(state.loop.rtc, link.frame_age_s) | dict(also)
     made |= {name: text for name, text in also.items() if text}
-    raised = {alarm.name: alarm for alarm in state.alarms.active if alarm.name in COMPLAINTS}
+    raised = {
+        alarm.name: alarm for alarm in state.alarms.active if alarm.name in DERIVED_EACH_SECOND
+    }
     for name, text in made.items():
         before = raised.get(name)
         same = before is not None and _NUMBER.sub("", before.text) == _NUMBER.sub("", text)

@@ -8,7 +8,7 @@ import pytest
 
 from service.link.statistics import Counters, Disposition, LinkStatistics
 from service.runtime.readiness import (
-    COMPLAINTS,
+    DERIVED_EACH_SECOND,
     ReadinessInputs,
     ReadinessLog,
     Revival,
@@ -143,7 +143,7 @@ def test_a_complaint_that_lasts_keeps_its_text_and_ends_some_seconds_after_the_l
     assert detect_link_changes(link(*WELL), state, START_NS + 3 * SECOND) == []
     (over,) = detect_link_changes(link(*WELL), state, START_NS + 5 * SECOND)
     assert (over.name, over.over) == ("frames-unused", True)
-    assert {made.name, over.name} <= set(COMPLAINTS)
+    assert {made.name, over.name} <= set(DERIVED_EACH_SECOND)
 
 
 def test_what_came_is_counted_for_two_seconds_and_remembered_for_good():

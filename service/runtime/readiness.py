@@ -63,9 +63,9 @@ LOG_EVERY_NS: Final = 60 * SECOND_NS
 DERIVED_EACH_SECOND: Final = frozenset(
     name
     for name, alarm in alarms.ALARMS.items()
-    if alarm.origin in ("runtime/readiness.py", "runtime/losses.py")
+    if alarm.origin in ("runtime/readiness.py", "runtime/losses.py", "runtime/supervisor.py")
 )
-"""Alarms that are derived from the link each second, and end when they are not derived again."""
+"""Alarms that are derived each second, and end when they are not derived any more."""
 
 
 NOTHING_ELSE: Final[Mapping[str, str]] = {}

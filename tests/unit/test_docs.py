@@ -212,10 +212,12 @@ def test_a_block_that_is_not_run_says_why():
         assert len(marked) == path.read_text("utf-8").count("<!-- not run"), path
 
 
-def test_the_layout_in_the_readme_is_that_of_the_code():
+def test_the_layout_on_the_architecture_page_is_that_of_the_code():
     """Its layers are those that the import contracts hold; its folders are those with code."""
     (layout,) = re.findall(
-        r"^## Layout\n```\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.M | re.S
+        r"^## Layout\n```\n(.*?)^```",
+        (DOCS / "understand" / "architecture.md").read_text("utf-8"),
+        re.M | re.S,
     )
     drawn, folders = re.split(r"\n(?=pyrcal/)", layout)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))

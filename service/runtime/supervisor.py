@@ -21,8 +21,8 @@ from service.archive.retention import EVERYTHING, RetentionPolicy
 from service.errors import LinkError, PyrcalError, StorageError
 from service.estimation import dither_windows, frames, lockin, passive_sums, random_dither
 from service.estimation.description import Description
-from service.link import matrices, statistics
 from service.estimation.windows import RefusalKind
+from service.link import matrices, statistics
 from service.model.instrument import Instrument
 from service.runtime import archiving, command_results, readiness, worker
 from service.runtime.actions import Actions

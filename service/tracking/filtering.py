@@ -370,8 +370,8 @@ def model_error_of(
     """Return the model error by all windows so far: what is set, and what they do not explain.
 
     A window weaker than what is asked of α, as far as this loop needs it, cannot tell: the chance
-    in its misfit, times its own σ, would be more than any model error. ``own`` ``(4,)`` is what the RTC's own matrix tells of it:
-    no window makes it smaller.
+    in its misfit, times its own σ, would be more than any model error. ``own`` ``(4,)`` is what the
+    RTC's own matrix tells of it: no window makes it smaller.
     """
     before = policy.floor if registration is None else registration.floor
     if own is not None:

@@ -408,6 +408,8 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
         "refused": night.state.windows.refused,
         "said": [(at, name, text) for (name, text), at in night.said.items()],
         "closed": last.closed,
+        "always_closed": all(moment.closed for moment in night.dome.moments),
+        "misfit": night.state.matrices.mode_proof.own_misfit_ratio,
     }
 
 

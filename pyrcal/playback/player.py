@@ -260,7 +260,7 @@ class Player:
             return
         matrix = self._matrices[in_use]
         self._engine.learn(in_use, matrix)
-        for event in await read_own_matrix(record, matrix, self._engine.state, self):
+        for event in await read_own_matrix(record, matrix, self._engine.state, self, self._matrix):
             self._engine.post(event)
 
     async def _age(self) -> None:

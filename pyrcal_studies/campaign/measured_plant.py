@@ -139,9 +139,8 @@ class ModalDome(Dome):
             basis_id=instrument.basis_id or "plant-1",
             config_id=instrument.config_id or "plant-1",
         )
-        if own is None:
-            own = np.linalg.pinv(response[:, :n_first])
-        own = own.astype(np.float32)
+        theirs = np.linalg.pinv(response[:, :n_first]) if own is None else own
+        first = theirs.astype(np.float32)
         self.computer = RealTimeComputer(
             self._blocks(),
             identity=identity,
@@ -153,7 +152,7 @@ class ModalDome(Dome):
                 n_controlled_next=n_first,
             ),
             reconstructor=Reconstructor.own(
-                f"own-{n_first}-{checksum(own)[:8]}", own, identity, created_ns=START_NS
+                f"own-{n_first}-{checksum(first)[:8]}", first, identity, created_ns=START_NS
             ),
             optics=self._optics,
             stroke_m=10e-6,
@@ -410,6 +409,8 @@ def came_of(plan: Plan, night: Night, response: Array, fit: Misregistration) -> 
         "refused": night.state.windows.refused,
         "said": [(at, name, text) for (name, text), at in night.said.items()],
         "closed": last.closed,
+        "always_closed": all(moment.closed for moment in night.dome.moments),
+        "misfit": night.state.matrices.mode_proof.own_misfit_ratio,
     }
 
 

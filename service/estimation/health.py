@@ -265,7 +265,7 @@ def _seen(
         average += fade * health.command
     power = float(fade) * health.turbulence**2 + float(1 - fade) * max(inner, 0.0)
     turbulence = float(np.sqrt(power))
-    steady = float(np.sqrt(max(average @ watch.inner @ average, 0.0)))
+    steady = max(float(average @ watch.inner @ average), 0.0) ** 0.5
     scale = max(turbulence, SLOW_TURBULENCE * steady, 1e-3)
     ratio = float(np.abs(watch.outer @ average).max()) / scale
     suspect_s = health.suspect_s + lasted_s if ratio > SUSPECT_RATIO else 0.0

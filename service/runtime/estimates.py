@@ -15,8 +15,10 @@ from service.errors import CommandError, ModelError, PyrcalError, UnknownIdError
 from service.estimation import lockin, openloop, orientation, random_dither
 from service.estimation.dither_windows import EndedWindow
 from service.estimation.loop import loop_numbers
+from service.estimation.own_matrix import OwnMatrix
 from service.estimation.passive_sums import PassiveSums
 from service.estimation.random_dither import Correlated, RandomEstimate, noisy_matrix
+from service.estimation.slope_convention import SlopeConvention
 from service.estimation.windows import (
     OTHER_SESSION,
     ClosedLoop,
@@ -212,14 +214,7 @@ async def read_own_matrix(
     """
     if record.judged is not None and workers.first is not None:
         return []
-    events: list[Event] = []
-    origin = _origin_of(record, state)
-    if origin is not record:
-        try:
-            matrix, record = await asyncio.to_thread(matrix_of, origin.id), origin
-        except PyrcalError as error:
-            text = f"{origin.id}, the RTC's own, is not read again: {error}"
-            events.append(ev.LogEvent(name="slopes.unknown", text=text, level=Level.WARNING))
+    record, matrix, unread = await _brought(record, matrix, state, matrix_of)
     registration = state.alpha.registration
     near = state.alpha.law.nominal if registration is None else registration.alpha
     try:
@@ -230,18 +225,46 @@ async def read_own_matrix(
                 OpticsWorker.recognise, matrix, near, dialect.rotation_rad
             )
     except PyrcalError as error:
-        text = str(error)
-        return [*events, ev.LogEvent(name="slopes.unknown", text=text, level=Level.WARNING)]
-    slopes = dialect.found if dialect.adopted else None
-    if slopes is not None:
-        text = f'orientation "auto": found {orientation.setting_written(slopes)} by {record.id}'
-        events.append(ev.LogEvent(name="slopes.adopted", text=text))
+        return [*unread, ev.LogEvent(name="slopes.unknown", text=str(error), level=Level.WARNING)]
     if not dialect.wrong:
         # a matrix that comes later finds the orientation settled, and names none
+        slopes = dialect.found if dialect.adopted else None
         workers.found_slopes = slopes or workers.found_slopes
         at, known = state.loop.config_id, workers.found_slopes
         left_over = None if own is None else own.left_over
         workers.first = partial(run_job, OpticsWorker.adopt, known, response, at, left_over)
+    return [*unread, *_what_it_shows(record, dialect, own, state)]
+
+
+async def _brought(
+    record: products.ReconstructorRecord,
+    matrix: NDArray[np.float32],
+    state: TrackerState,
+    matrix_of: MatrixOf,
+) -> tuple[products.ReconstructorRecord, NDArray[np.float32], list[Event]]:
+    """Return the RTC's own matrix that one in use descends from, or that one if it is not there."""
+    origin = _origin_of(record, state)
+    if origin is record:
+        return record, matrix, []
+    try:
+        return origin, await asyncio.to_thread(matrix_of, origin.id), []
+    except PyrcalError as error:
+        text = f"{origin.id}, the RTC's own, is not read again: {error}"
+        event = ev.LogEvent(name="slopes.unknown", text=text, level=Level.WARNING)
+        return record, matrix, [event]
+
+
+def _what_it_shows(
+    record: products.ReconstructorRecord,
+    dialect: SlopeConvention,
+    own: OwnMatrix | None,
+    state: TrackerState,
+) -> list[Event]:
+    """Return how the RTC lists its slopes and which modes the model has recognised, as events."""
+    events: list[Event] = []
+    if dialect.adopted and dialect.found is not None:
+        text = f'orientation "auto": found {orientation.setting_written(dialect.found)}'
+        events.append(ev.LogEvent(name="slopes.adopted", text=f"{text} by {record.id}"))
     wrong = dialect.wrong or (own.wrong if own is not None else "")
     if wrong or state.alarm(alarms.WRONG_MATRIX) is not None:
         text = f"{record.id}: {wrong}" if wrong else f"{record.id} agrees with the instrument file"

@@ -55,6 +55,8 @@ def test_alpha_is_that_of_the_measured_matrix_within_its_sigma():
     assert np.abs(row["off_sigma"]).max() < 3.0
     # a σ that is ten times too large would pass the line above
     assert np.abs(row["off_sigma"]).max() > 0.3
+    # the fit of the matrix itself is wrong by as much: both believe the same modes
+    assert np.abs(row["error_sigma"]).max() < 3.0
 
 
 def test_the_first_matrix_comes_soon_and_in_the_end_all_modes_are_controlled():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,15 @@ CHANCE_SIGMA = 4.0
 
 WHITE = 11.8
 """Sum of squares of two correlations of neighbours, in their σ, that noise exceeds in 0.3 %."""
+
+SMALLEST_SMEAR = 0.01
+"""Share of the column before below which pokes are said to have settled."""
+
+SMEAR_SIGMA = 5.0
+"""... or that is less than this many of its own σ."""
+
+MAX_SMEAR = 0.45
+"""Share from which a column is rather that of the poke before."""
 
 _FEWEST = 9
 """Modes below which some other order always looks alike."""
@@ -134,6 +143,59 @@ def displaced_columns(
             f"{best}; the lowest modes then correlate with the model by {found[best]:.2f}, "
             f"as listed by {here:.2f}"
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Smear:
+    """Share of the column before that each column holds."""
+
+    share: float
+    sigma: float
+    """1 σ of it, from how it scatters between columns."""
+
+    @property
+    def is_found(self) -> bool:
+        """Whether it is more than chance, and enough to matter."""
+        return self.share > max(SMALLEST_SMEAR, SMEAR_SIGMA * self.sigma)
+
+    @property
+    def words(self) -> str:
+        """What was found, how the fit allows for it, and what to do."""
+        return (
+            f"each column holds {self.share:.0%} of the column before it (+- {self.sigma:.1%}): "
+            "pokes that had not settled; the fit takes it out. Wait longer after each poke, or "
+            "subtract it"
+        )
+
+
+def measure_smear(solution: Solution, target: Target) -> Smear:
+    """Return how much more of the column before than of the one after each column holds.
+
+    Errors of the model make a column look like its neighbours on either side; a mirror that has not
+    settled only adds the one before.
+    """
+    measured = target.matrix[target.rows]
+    model = np.asarray(solution.matrix, np.float64)[target.rows] * solution.projection.gains
+    steps = np.diff(target.modes) == 1
+    middles = np.flatnonzero(steps[:-1] & steps[1:]) + 1
+    if len(middles) < _FEWEST:
+        return Smear(share=0.0, sigma=np.inf)
+    found = []
+    for k in middles:
+        own, before, after = np.linalg.lstsq(model[:, [k, k - 1, k + 1]], measured[:, k])[0]
+        found.append((before - after) / (abs(own) + abs(before) + abs(after)))
+    middle = float(np.median(found))
+    scatter = 1.4826 * float(np.median(np.abs(np.array(found) - middle)))
+    return Smear(share=middle, sigma=1.25 * scatter / float(np.sqrt(len(found))))
+
+
+def without_smear(usable: Reference, share: float) -> Reference:
+    """Return the columns without this share of the column before, one after the other."""
+    matrix = np.array(usable.matrix, dtype=np.float64)
+    ratio = share / (1.0 - share)
+    for k in np.flatnonzero(np.diff(usable.columns) == 1) + 1:
+        matrix[:, k] -= ratio * matrix[:, k - 1]
+    return replace(usable, matrix=matrix)
 
 
 def _unit(columns: Array) -> Array:

@@ -20,7 +20,7 @@ from pyrcal.offline.system import SHIFTS, Pair, System
 from pyrcal.offline.system_figures import write_system_sheet
 from pyrcal.offline.system_file import load_system
 from pyrcal.offline.system_fit import SystemFit, fit_system
-from pyrcal.offline.system_report import SystemReport, document, fill_system, table
+from pyrcal.offline.system_report import UNLIKELY, SystemReport, document, fill_system, table
 from pyrcal.terminal import show_progress
 from service.errors import MatrixError, PyrcalError
 from service.files.container import DATASET, opened
@@ -33,6 +33,10 @@ ACCEPTED, REFUSED = 0, 1
 
 PUPIL_SUBAP = 0.02
 """By which the pupil must lie elsewhere on a grid to be worth another fit."""
+
+PUPIL_EFFECT = 0.2
+"""Share of a shift of the pupil that α is off at most where the fit had the pupil in the middle.
+Pairs that disagree by more disagree for another reason."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -64,7 +68,9 @@ def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> S
     """Return where everything is, from a fit of each pair as an instrument.
 
     A sensor that is shifted has the pupil elsewhere on its grid. Where that was not known, its
-    pairs are fitted again with the pupil there.
+    pairs are fitted again with the pupil there. They are not where the pairs disagree by more than
+    such a pupil explains, for the shift is then not that of the sensor; and the first fit stands if
+    a pair that was accepted is refused with the pupil elsewhere.
     """
     fits = {pair: fit(pair, system.instrument(pair)) for pair in system.pairs}
     found = _found(system, fits, _telling(fits))
@@ -72,14 +78,24 @@ def fit_pairs(system: System, fit: Callable[[Pair, Instrument], FitReport]) -> S
         if found is None or sensor.instrument.stop is Stop.MIRROR:
             break
         shift = found.values[system.of_sensor(number)][SHIFTS]
-        if np.hypot(*(shift - [sensor.place.shift.real, sensor.place.shift.imag])) < PUPIL_SUBAP:
+        off = np.hypot(*(shift - [sensor.place.shift.real, sensor.place.shift.imag]))
+        if off < PUPIL_SUBAP or _disagree(found, PUPIL_EFFECT * float(off)):
             continue
+        again: dict[Pair, FitReport] = {}
         for pair in (pair for pair in system.pairs if pair.sensor == number):
             about = replace(system.instrument(pair), pupil_shift_subap=tuple(shift.tolist()))
-            fits[pair] = fit(pair, about)
+            again[pair] = fit(pair, about)
+        if all(one.fit.accepted or not fits[pair].fit.accepted for pair, one in again.items()):
+            fits |= again
     accepted = np.array([one.fit.accepted for one in fits.values()])
     found = _found(system, fits, accepted)
     return SystemReport(system=system, fits=tuple(fits.values()), found=found)
+
+
+def _disagree(found: SystemFit, by_subap: float) -> bool:
+    """Return whether pairs differ significantly, and in shift by more than so many subapertures."""
+    apart = np.abs(found.misfit[:, SHIFTS])
+    return found.probability < UNLIKELY and bool(np.nanmax(apart) > by_subap)
 
 
 def _telling(fits: dict[Pair, FitReport]) -> NDArray[np.bool_]:

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.advice import Advice, Grounds, explained, recommendation, with_displaced
 from pyrcal.offline.alternatives import alternatives, off_centre
-from pyrcal.offline.columns import displaced_columns, noise_columns, strange_columns
+from pyrcal.offline.columns import (
+    MAX_SMEAR,
+    Smear,
+    displaced_columns,
+    measure_smear,
+    noise_columns,
+    strange_columns,
+    without_smear,
+)
 from pyrcal.offline.control_check import GAIN, check_control
 from pyrcal.offline.disjoint_sets import mode_partitions, pupil_partitions
 from pyrcal.offline.fitted import Fit, Registration
@@ -76,6 +84,18 @@ MIN_COLUMNS = 3
 """Columns that must be left where those that hold noise only are left out."""
 
 _NAMED = 12
+
+_SMEAR_STEPS = 8
+_LONGEST_SMEAR_STEP = 0.15
+"""The registration follows the larger part of a smear of 0.3: secants over longer steps miss it."""
+_SMEAR_SETTLED = 1e-3
+"""Remaining share of the column before at which the steps end."""
+
+_LEAST_RATE = 0.1
+"""Change of the measured share over that of the one taken out, as far as it is believed."""
+
+_SMEAR_EXPLAINS = 0.9
+"""Residual without the smear, over that with it, above which it is not believed."""
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -204,6 +224,10 @@ def _fitted(
         target, models = target_of(usable, instrument), replace(models, basis=used)
         begin = instrument.with_anamorphosis(found.settled.solution.alpha)
         found = _found(models, target, begin, options, tell)
+    smear = measure_smear(found.settled.solution, found.settled.target)
+    if smear.is_found:
+        tell("fit")
+        found, usable = _settled_pokes(models, instrument, found, usable, smear, options, tell)
     tell("verdict")
     fit = _answer(models, found, usable, untold, reported, options)
     if options.explain and not fit.accepted:
@@ -227,6 +251,42 @@ def _with_mask(fit: Fit, instrument: Instrument) -> Fit:
     if not fit.accepted:
         advised = f"{Advice.DO_NOT_USE}: {difference}"
     return replace(fit, remarks=remarks, recommendation=advised)
+
+
+def _settled_pokes(
+    models: FitModels,
+    instrument: Instrument,
+    found: _Found,
+    usable: Reference,
+    first: Smear,
+    options: FitOptions,
+    tell: Progress,
+) -> tuple[_Found, Reference]:
+    """Return the fit with what each poke left of the one before taken out of the columns.
+
+    The registration itself follows part of it, so that the first measurement is too small; the
+    share at which none is left follows by secants. Where that does not explain the matrix clearly
+    better, the fit stays as it is.
+    """
+    begin = instrument.with_anamorphosis(found.settled.solution.alpha)
+    before, left_before, share = 0.0, first.share, first.share
+    again, sigma = found, first.sigma
+    for _ in range(_SMEAR_STEPS):
+        if not 0.0 < share <= MAX_SMEAR:
+            return found, usable
+        cleaned = without_smear(usable, share)
+        again = _found(models, target_of(cleaned, instrument), begin, options, tell)
+        left = measure_smear(again.settled.solution, again.settled.target)
+        rate = (left.share - left_before) / (share - before)
+        sigma = left.sigma / max(abs(rate), _LEAST_RATE)
+        if abs(left.share) < max(left.sigma, _SMEAR_SETTLED) or rate >= 0.0:
+            break
+        step = float(np.clip(-left.share / rate, -_LONGEST_SMEAR_STEP, _LONGEST_SMEAR_STEP))
+        before, left_before, share = share, left.share, min(share + step, MAX_SMEAR)
+    if again.settled.share > _SMEAR_EXPLAINS * found.settled.share:
+        return found, usable
+    again = replace(again, smear=Smear(share=share, sigma=sigma), before=found.settled.solution)
+    return again, without_smear(usable, share)
 
 
 def _without_noise(usable: Reference, noisy: NDArray[np.bool_]) -> Reference:
@@ -357,6 +417,11 @@ class _Found:
     settled: Settled
     landing: Landing | None = None
     table: tuple[ScanStep, ...] | None = None
+    smear: Smear | None = None
+    """Share of the column before that was taken out of each column."""
+
+    before: Solution | None = None
+    """The solution with the columns as they were measured, where a smear was taken out."""
 
 
 def _found(
@@ -449,6 +514,10 @@ def _answer(
     if without is not None and without.is_undecided:
         moves.append(without.moved)
         shares.append(OTHER_SHARE * floor)
+    if found.smear is not None and found.before is not None:
+        by_smear = solution.vector - found.before.vector
+        moves.append(by_smear * found.smear.sigma / found.smear.share)
+        shares.append(1.0)
     sure = before.with_moves(np.array(moves), np.array(shares))
     findings = FitFindings(
         solution=solution,
@@ -469,6 +538,7 @@ def _answer(
         stroke_known=stroke_known,
     )
     refusal, verdict = judged(findings)
+    smeared = () if found.smear is None else (found.smear.words,)
     columns = tuple(strange_columns(solution, target))
     found_origins: tuple[Origin, ...] = ()
     if findings.explained:
@@ -493,6 +563,7 @@ def _answer(
         remarks=(
             *remarks(findings, reported=reported, found=slopes, about=models.instrument),
             *columns,
+            *smeared,
         ),
         left_out=(*usable.left_out, *_rows_left_out(target, models.instrument)),
         n_evaluations=models.counter.n,

@@ -21,6 +21,13 @@ from service.model.similarity import Similarity
 
 SAME_DIAMETER = 1e-6
 
+MAX_STAR_ARCSEC = 1800.0
+"""Largest distance of a guide star from the axis; a larger one is in milliarcseconds."""
+
+MIN_STAR_ARCSEC = 0.01
+"""Smallest distance of a guide star that is not on the axis; a smaller one is in radians: 0.01 rad
+are 2000 arcseconds."""
+
 
 class PlaceTable(Table):
     """What sensors and mirrors have in common: a name, an instrument file, a nominal place."""
@@ -120,6 +127,8 @@ def load_system(path: Path) -> System:
         heights_move=said.system.stars == "direction and height",
     )
     _check_telescope(path, system)
+    for number, table in enumerate(said.sensors):
+        _check_star(f"{path}: sensors.{number}.star_arcsec", math.hypot(*table.star_arcsec))
     for number, mirror in enumerate(system.mirrors):
         _check_mirror(f"{path}: mirrors.{number}", mirror, system)
     return system
@@ -144,6 +153,23 @@ def _sensor(table: SensorTable, instrument: Instrument) -> PlacedSensor:
         place=_place(table, table.shift_subap, 0.0),
         fixed=table.fixed,
     )
+
+
+def _check_star(where: str, off_axis_arcsec: float) -> None:
+    """Refuse a direction that is in radians or milliarcseconds by its size."""
+    if off_axis_arcsec > MAX_STAR_ARCSEC:
+        refuse(
+            where,
+            f"a star {off_axis_arcsec:g} arcseconds off the axis, like milliarcseconds",
+            f"arcseconds, at most {MAX_STAR_ARCSEC:g}",
+        )
+    if 0.0 < off_axis_arcsec < MIN_STAR_ARCSEC:
+        refuse(
+            where,
+            f"a star {off_axis_arcsec:g} arcseconds off the axis, like radians "
+            f"({off_axis_arcsec / ARCSEC_RAD:.3g} arcseconds)",
+            "arcseconds, or 0 on the axis",
+        )
 
 
 def _mirror(table: MirrorTable, instrument: Instrument) -> PlacedMirror:

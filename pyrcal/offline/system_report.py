@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import h5py
@@ -11,8 +11,8 @@ import numpy as np
 
 from pyrcal.offline import report as fit_report
 from pyrcal.offline.report import FitReport
-from pyrcal.offline.system import System
-from pyrcal.offline.system_fit import SystemFit
+from pyrcal.offline.system import ARCSEC_RAD, STAR, System
+from pyrcal.offline.system_fit import SystemFit, fit_system
 from service.errors import shown
 from service.files.container import put_array
 from service.files.documents import json_text
@@ -35,6 +35,17 @@ class SystemReport:
 
     found: SystemFit | None
     """Where everything is; None: no pair was accepted."""
+
+    @property
+    def unmeasured(self) -> frozenset[str]:
+        """Sensors and mirrors of which no pair was used: nothing is known of where they are."""
+        system, used = self.system, set[str]()
+        for pair, misfit in zip(
+            system.pairs, self.found.misfit if self.found else (), strict=False
+        ):
+            if np.isfinite(misfit).all():
+                used |= set(system.names(pair))
+        return frozenset({one.name for one in (*system.sensors, *system.mirrors)} - used)
 
     @property
     def refused(self) -> tuple[str, ...]:
@@ -60,13 +71,44 @@ class SystemReport:
         agree = f"chi2 {self.found.chi2:.1f} where {self.found.n_free} is expected"
         if not self.accepted:
             return (
-                f"refused: the pairs disagree ({agree}), most {self._worst(self.found)}: an "
-                "altitude, a star or a nominal place is not as the file says, or a matrix is "
-                'another pair\'s; stars = "direction" finds directions of stars, too'
+                f"refused: the pairs disagree ({agree}), most {self._worst(self.found)}: "
+                f"{self._cause(self.found)}"
             )
         if not self.found.n_free:
             return "accepted: no number is measured twice, so that nothing checks another"
         return f"accepted: {len(self.fits)} pairs agree ({agree})"
+
+    def _cause(self, found: SystemFit) -> str:
+        """Return what in the file would make the pairs agree, as far as they show it."""
+        system = self.system
+        if not system.stars_move:
+            free = replace(system, stars_move=True)
+            alphas = np.array([one.fit.alpha.vector for one in self.fits])
+            alphas[~np.isfinite(found.misfit).all(axis=1)] = np.nan
+            moved = fit_system(free, alphas, np.array([one.fit.covariance for one in self.fits]))
+            if moved.n_free and moved.probability >= UNLIKELY:
+                return f'with stars = "direction" they agree: {self._farthest_star(moved)}'
+        return (
+            "an altitude, a star or a nominal place is not as the file says, or a matrix is "
+            "another pair's"
+        )
+
+    def _farthest_star(self, moved: SystemFit) -> str:
+        """Return which star was found farthest from the file's place, beside the other stars.
+
+        A common direction of all stars changes nothing that pairs see.
+        """
+        system = self.system
+        places = [system.of_sensor(number) for number in range(len(system.sensors))]
+        off = np.array([moved.values[one][STAR] - system.nominal[one][STAR] for one in places])
+        n_others = max(len(off) - 1, 1)
+        beside = off - (off.sum(axis=0) - off) / n_others
+        number = int(np.argmax(np.hypot(*off.T)))
+        x, y = beside[number] / ARCSEC_RAD
+        return (
+            f"the star of {system.sensors[number].name} is {x:+.2f}, {y:+.2f} arcseconds from "
+            "where the file says, beside the other stars"
+        )
 
     def _worst(self, found: SystemFit) -> str:
         number, column = np.unravel_index(np.nanargmax(np.abs(found.pulls)), found.pulls.shape)
@@ -81,7 +123,8 @@ def document(report: SystemReport) -> dict[str, Any]:
 
     ``sensors`` and ``mirrors`` have an object for each name, with ``value``, ``sigma``, ``nominal``
     and ``unseen_share`` of each number that says where it is; ``sigma`` is None of what is as the
-    file says. ``pairs`` has what ``pyrcal fit --json`` prints.
+    file says. Both are None if no pair with it was accepted. ``pairs`` has what
+    ``pyrcal fit --json`` prints.
     """
     system, found = report.system, report.found
     pairs: dict[str, dict[str, Any]] = {sensor.name: {} for sensor in system.sensors}
@@ -121,7 +164,7 @@ class _Row:
 
 
 def _rows(report: SystemReport) -> Iterator[_Row]:
-    found, system = report.found, report.system
+    found, system, unmeasured = report.found, report.system, report.unmeasured
     if found is None:
         return
     for parameter, value, sigma, nominal, share in zip(
@@ -133,11 +176,12 @@ def _rows(report: SystemReport) -> Iterator[_Row]:
         strict=True,
     ):
         finite = bool(np.isfinite(nominal))
+        known = not (parameter.free and parameter.owner in unmeasured)
         yield _Row(
             owner=parameter.owner,
             name=parameter.name,
-            value=float(value * parameter.boundary) if finite else None,
-            sigma=float(sigma * parameter.boundary) if parameter.free else None,
+            value=float(value * parameter.boundary) if finite and known else None,
+            sigma=float(sigma * parameter.boundary) if parameter.free and known else None,
             nominal=float(nominal * parameter.boundary) if finite else None,
             unseen_share=round(float(share), 4),
         )
@@ -196,8 +240,11 @@ def fill_system(file: h5py.File, report: SystemReport) -> None:
         boundary = np.array([parameter.boundary for parameter in parameters])
         described = "of the numbers that `parameters` names, in the units of their names"
         scale = np.outer(boundary, boundary)
-        put_array(file, "values", found.values * boundary, f"(n,) {described}")
-        put_array(file, "covariance", found.covariance * scale, f"(n, n) {described}; 0: not found")
+        unknown = np.array([one.free and one.owner in report.unmeasured for one in parameters])
+        values, covariance = found.values * boundary, found.covariance * scale
+        values[unknown] = covariance[unknown] = covariance[:, unknown] = np.nan
+        put_array(file, "values", values, f"(n,) {described}; NaN: no accepted pair")
+        put_array(file, "covariance", covariance, f"(n, n) {described}; 0: not found")
         put_array(file, "unseen_share", found.unseen_share, f"(n,) {described}, not seen, 0 to 1")
         put_array(file, "pulls", found.pulls, "(n_pairs, 4) what is left of each pair over 1 sigma")
         file["values"].attrs["parameters"] = [f"{one.owner}.{one.name}" for one in parameters]

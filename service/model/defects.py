@@ -32,9 +32,7 @@ def find_defects(values: NDArray[Any]) -> dict[int, str]:
     array = np.asarray(values)
     flat = array.reshape(len(array), array[0].size if len(array) else 0)
     n_unknown = np.array([np.sum(~np.isfinite(entry)) for entry in flat])
-    usual = np.zeros(flat.shape[1], dtype=bool)
-    if len(flat):
-        usual = ~np.isfinite(flat[int(np.argmin(n_unknown))])
+    usual = ~np.isfinite(flat[int(np.argmin(n_unknown))]) if len(flat) else np.zeros(0, bool)
     found: dict[int, str] = {}
     seen: dict[bytes, int] = {}
     for number, entry in enumerate(flat):

@@ -147,3 +147,29 @@ def test_defects_are_found_without_a_second_copy_of_the_table():
     table = np.ones((4, 3, 3)) * np.arange(1.0, 5.0)[:, None, None]
     table[2] = table[0]
     assert find_defects(table) == {2: "equal to 0"}
+
+
+def smeared(values, share, seed=1):
+    """Columns of pokes that had not settled: each holds a share of the one before; 1 % noise."""
+    rng = np.random.default_rng(seed)
+    made = (1.0 - share) * values
+    made[:, 1:] += share * values[:, :-1]
+    return made + 0.01 * np.abs(values).max() * rng.normal(size=values.shape)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
+def test_pokes_that_had_not_settled_are_named_with_their_share(tmp_path, share):
+    """Taken as they are, the shift along the rows of actuators was 12 to 14 sigma off."""
+    grid = GRID.replace("n_across = 5", "n_across = 7").replace("pitch_m = 1.0", "pitch_m = 0.7")
+    about = bench(tmp_path, grid + 'basis = "zonal"')
+    found = fitted(about, smeared(matrix(about), share))
+    (note,) = [remark for remark in found.remarks if "had not settled" in remark]
+    stated = float(note.partition("holds ")[2].partition("%")[0]) / 100.0
+    assert stated == pytest.approx(share, abs=0.02)
+
+
+def test_pokes_that_had_settled_are_not_said_to_be_smeared(zonal):
+    about, whole = zonal
+    for seed in range(3):
+        found = fitted(about, smeared(whole, 0.0, seed))
+        assert not any("settled" in remark for remark in found.remarks)

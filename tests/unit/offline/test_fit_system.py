@@ -9,8 +9,10 @@ import pytest
 
 from pyrcal.__main__ import main
 from pyrcal.offline.fit_system import fit_pairs
+from pyrcal.offline.system import ARCSEC_RAD, STAR
 from pyrcal.offline.system_file import load_system
-from pyrcal.offline.system_report import table
+from pyrcal.offline.system_report import document, fill_system, table
+from service.errors import ConfigurationError
 from service.model.misregistration import Misregistration
 from tests.unit.offline import systems
 from tests.unit.offline.made import a_fit, a_report
@@ -208,3 +210,69 @@ def test_a_refused_pair_is_left_out_and_named(folder):
     assert np.isnan(report.found.misfit[1]).all()
     assert "  refused" in table(report)
     assert len(asked_for) == 4  # nor does it say where the pupil lies
+
+
+def test_a_pair_refused_with_the_pupil_elsewhere_keeps_its_first_fit(folder):
+    system = load_system(folder / "system.toml")
+    values = system.nominal.copy()
+    values[system.of_sensor(1)][:2] = [0.3, -0.1]
+    fit = told_by(system, values, [])
+
+    def refused_elsewhere(pair, about):
+        report = fit(pair, about)
+        if about.pupil_shift_subap is None:
+            return report
+        verdict = 'refused: with stop = "mirror" the misfit is 10%'
+        return replace(report, fit=replace(report.fit, accepted=False, verdict=verdict))
+
+    report = fit_pairs(system, refused_elsewhere)
+    assert report.accepted
+    assert "stop" not in report.verdict
+
+
+@pytest.mark.parametrize("off_arcsec", [2.0, -5.0])
+def test_a_star_that_is_elsewhere_is_named_and_no_pupil_is_moved(folder, off_arcsec):
+    system, asked_for = load_system(folder / "system.toml"), []
+    values = system.nominal.copy()
+    values[system.of_sensor(0)][STAR] += np.array([off_arcsec, 0.0]) * ARCSEC_RAD
+    report = fit_pairs(system, told_by(system, values, asked_for))
+    assert not report.accepted
+    assert len(asked_for) == len(system.pairs)
+    assert f"the star of lgs1 is {off_arcsec:+.2f}, " in report.verdict
+    assert "stop" not in report.verdict
+
+
+def test_a_sensor_without_an_accepted_pair_has_no_values(folder, tmp_path):
+    system = load_system(folder / "system.toml")
+    fit = told_by(system, system.nominal, [])
+
+    def without_ngs(pair, about):
+        report = fit(pair, about)
+        if pair.sensor == 0:
+            return report
+        return replace(report, fit=replace(report.fit, accepted=False, converged=False))
+
+    report = fit_pairs(system, without_ngs)
+    assert report.unmeasured == {"ngs"}
+    found = document(report)
+    for number in ("shift_x_subap", "rotation_deg", "magnification"):
+        assert found["sensors"]["ngs"][number]["value"] is None
+        assert found["sensors"]["ngs"][number]["sigma"] is None
+        assert found["sensors"]["lgs1"][number]["sigma"] > 1e-6
+    assert "ngs shift_x_subap" not in table(report)
+    with h5py.File(tmp_path / "out.h5", "w") as file:
+        fill_system(file, report)
+        of_ngs = [name.startswith("ngs.shift") for name in file["values"].attrs["parameters"]]
+        assert np.isnan(file["values"][()][of_ngs]).all()
+
+
+@pytest.mark.parametrize(
+    ("star", "unit"), [("[9.7e-5, 0.0]", "like radians (20 arcs"), ("[2e4, 0.0]", "milliarcsec")]
+)
+def test_a_star_in_another_unit_is_refused_by_its_size(star, unit, tmp_path):
+    text = systems.SYSTEM.replace("[20.0, 0.0]", star)
+    with pytest.raises(
+        ConfigurationError, match=r"sensors\.0\.star_arcsec: found a star "
+    ) as error:
+        systems.written(tmp_path, text)
+    assert unit in str(error.value)

@@ -46,6 +46,13 @@ def service(archive):
     return service
 
 
+async def test_the_service_answers_at_the_root_of_its_name_only(client):
+    """As the page on deploying says: what a proxy passes on below a path is not found."""
+    for path in ("/pyrcal", "/pyrcal/", "/pyrcal/v1/state"):
+        assert (await client.get(path)).status_code == 404
+    assert (await client.get("/")).status_code == 200
+
+
 # --- its files
 
 

@@ -95,6 +95,18 @@ def test_a_loop_at_a_third_of_its_gain_is_worse_though_no_mode_rings():
     assert unread.residual_ratio is None
 
 
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_loop_that_is_worse_by_a_half_is_found_however_restless_it_was_before(seed):
+    """The limit of the measured noise alone would be 2.1; a healthy loop is not taken back."""
+    levels = (1.0, 0.4, 1.0, 2.0, 1.0, 0.4, 1.0, 2.0)
+    restless = [("a", 0.5, MATRIX, level) for level in levels]
+    (found,) = judged([*restless, ("b", 4.5, 0.3 * MATRIX, 1.0)], seed)
+    assert found.verdict is Verdict.WORSE
+    assert found.residual_ratio < 1.7
+    (healthy,) = judged([*restless, ("b", 4.5, MATRIX, 1.0)], seed)
+    assert healthy.verdict is Verdict.AS_GOOD
+
+
 @pytest.mark.parametrize("seeing", [0.6, 0.8, 1.25, 1.6])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_same_matrix_in_other_seeing_is_not(seeing, seed):

@@ -1,4 +1,8 @@
-"""The arguments of ``pyrcal check-rtc``; quick to import."""
+"""Command line of ``pyrcal check-rtc``.
+
+The checks themselves are imported after the arguments have been parsed, so that ``--help`` and
+usage errors are instant.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +16,10 @@ from pyrcal.options import add, words
 from service.cli.program import OneLineParser, imported_and_run, leave
 
 _EPILOG = """
-One line for each requirement of docs/rtc.md: the finding, the requirement, its place. WRONG breaks
-the contract, seen is allowed and worth a look, skipped says why. Checks that move anything ask
-first; without a terminal they are skipped unless --yes. Exit status: 0 nothing is wrong, 1
-something is, 2 nothing could be checked.
+Prints one line for each requirement of docs/rtc.md: the finding, the requirement, its section.
+WRONG: the contract is broken. seen: allowed, but unusual. skipped: not checked, with the reason.
+Checks that move anything ask for consent first; without a terminal they are skipped unless --yes
+is given. Exit status: 0 nothing is wrong, 1 something is, 2 nothing could be checked.
 """
 
 
@@ -23,49 +27,52 @@ def check_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     check = OneLineParser(prog="pyrcal check-rtc")
     check.description = (
-        "Listen to an RTC in the service's place, ask it things, and say whether it keeps the "
-        "contract of docs/rtc.md. End the service first, or --connect to its router with --passive."
+        "Check whether an RTC keeps the contract of docs/rtc.md. The checker takes the place of "
+        "the service: end the service first, or --connect to its router with --passive."
     )
     check.epilog = _EPILOG
     add(
         check,
         words(
             "--instrument NAME|FILE",
-            "what slopes and commands are held against; default flao-lbt, and with --connect the "
-            "packaged one of the system's name",
+            "instrument with which slopes and commands are compared; default flao-lbt, and with "
+            "--connect the packaged instrument of the system's name",
         ),
         words(
             "--system NAME",
-            "of the keys; default the instrument's name, and with --connect that of the RTC found",
+            "name of the system in the keys; default the instrument's name, and with --connect "
+            "that of the RTC found",
         ),
     )
     add(
         check.add_mutually_exclusive_group(),
         words("--listen ENDPOINT", "default tcp/127.0.0.1:7447"),
-        words("--connect ENDPOINT", "a router that is there already"),
+        words("--connect ENDPOINT", "router to connect to"),
     )
-    secured = "settings, TOML: [zenoh] says how to connect to a secured link, as the service's do"
+    secured = "TOML settings of the service, whose [zenoh] connects to a secured link"
     add(
         check,
         words("--config FILE", secured, type=Path),
-        words("--seconds S", "to listen, default %(default)g", type=seconds, default=8.0),
-        words("--wait S", "for the RTC, default %(default)g", type=seconds, default=30.0),
-        words("--only CHECK,...", "these checks and no others", type=_names, default=()),
-        words("--passive", "only listen: ask and move nothing"),
-        words("--open-loop", "also what opens the loop: loop, measure"),
-        words("--move-image", "also what moves the mirror's image on the sensor: offload"),
-        words("--yes", "move without asking"),
+        words(
+            "--seconds S", "duration of listening, default %(default)g", type=seconds, default=8.0
+        ),
+        words("--wait S", "timeout for the RTC, default %(default)g", type=seconds, default=30.0),
+        words("--only CHECK,...", "run these checks only", type=_split_names, default=()),
+        words("--passive", "only listen; send no command"),
+        words("--open-loop", "also run checks that open the loop: loop, measure"),
+        words("--move-image", "also run the check that moves the mirror's image: offload"),
+        words("--yes", "consent to all movements beforehand"),
         words("--json", "print one JSON object at the end"),
     )
     return check
 
 
-def _names(text: str) -> tuple[str, ...]:
+def _split_names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check; return the exit status: 0 nothing is wrong, 1 something is, 2 nothing was checked."""
+    """Run the checks; return 0 if nothing is wrong, 1 if something is, 2 if nothing was checked."""
     options = check_parser().parse_args(arguments)
 
     def load() -> Callable[[], int]:
@@ -73,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         return lambda: check(options)
 
-    # told to end, it first stops its dither and closes the loop again
+    # On both signals the checks are unwound, which stops the dither and closes the loop again.
     signals = (signal.SIGINT, signal.SIGTERM)
     return imported_and_run(load, own_process=arguments is None, received=signals)
 

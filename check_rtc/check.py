@@ -1,4 +1,4 @@
-"""Check an RTC and print one line for each requirement."""
+"""Run of ``pyrcal check-rtc``: find the RTC, make the checks, print the results."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from check_rtc.client import RtcClient
-from check_rtc.connection import RtcConnection, systems_with_rtc
+from check_rtc.connection import RtcConnection, find_systems_with_rtc
 from check_rtc.examine import Examination, examine
-from check_rtc.offload import Registered
-from check_rtc.requirements import REQUIREMENTS, Checked, Outcome
-from check_rtc.telemetry_checks import ImagePlaces
+from check_rtc.offload import RegistrationFit
+from check_rtc.requirements import REQUIREMENTS, CheckResult, Outcome
+from check_rtc.telemetry_checks import ImageOffsets
 from check_rtc.watch import TelemetryObserver
 from service.config import load_instrument, packaged_instrument
 from service.config.link_tables import ZenohTable, link_security, read_link_tables
@@ -39,37 +39,37 @@ from service.model.slopes import likely_kind
 if TYPE_CHECKING:
     from service.runtime.worker import OpticsWorker
 
-KEPT, BROKEN = 0, 1
+EXIT_OK, EXIT_WRONG = 0, 1
 
-PAGE = "docs/rtc.md"
+CONTRACT_PAGE = "docs/rtc.md"
 
-DEFAULT = "flao-lbt"
-"""Instrument of an RTC that is waited for, where none is named."""
+DEFAULT_INSTRUMENT = "flao-lbt"
+"""Instrument of the RTC if neither an instrument nor a system is given."""
 
-NO_FILE = "slopes and commands are held against nothing; name its file with --instrument"
+NO_INSTRUMENT_HINT = "slopes and commands are not compared; give its file with --instrument"
 
 
 def check(options: argparse.Namespace) -> int:
-    """Check, print, and return the exit status: 0 nothing is wrong, 1 something is.
+    """Make the checks and print them; return 0 if nothing is wrong, 1 if something is.
 
     Raises
     ------
     PyrcalError
-        If nothing could be checked: no RTC, no link, or options that make no sense.
+        If nothing can be checked: no RTC, no link, or contradictory options.
     """
     unknown = [name for name in options.only if name not in REQUIREMENTS]
     if unknown:
         raise ConfigurationError(
             f"--only: found {', '.join(unknown)}, expected some of {', '.join(REQUIREMENTS)}"
         )
-    endpoint, instrument = _whom(options)
+    endpoint, instrument = _find_rtc(options)
     examination = Examination(
         only=frozenset(options.only),
         passive=options.passive,
         open_loop=options.open_loop,
         listen_s=options.seconds,
         wait_s=options.wait,
-        consent=lambda moved: _agreed(moved, yes=options.yes),
+        consent=lambda moved: _ask_consent(moved, yes=options.yes),
         move_image=options.move_image,
     )
     if instrument is not None:
@@ -77,59 +77,59 @@ def check(options: argparse.Namespace) -> int:
             examination,
             basis_id=instrument.basis_id,
             config_id=instrument.config_id,
-            dialect=lambda matrix: compared(instrument, matrix),
-            images=lambda flux: found_images(instrument, flux),
-            registered=registering(instrument),
+            compare_matrix=lambda matrix: compare_matrix(instrument, matrix),
+            find_images=lambda flux: measure_image_offsets(instrument, flux),
+            fit_registration=make_registration_fit(instrument),
         )
-    checks = []
-    with RtcConnection(endpoint, as_service=not options.passive) as ear:
-        for one in examine(
-            RtcClient(ear, TelemetryObserver(endpoint, time.monotonic)), examination
-        ):
-            checks.append(one)
+    results = []
+    with RtcConnection(endpoint, as_service=not options.passive) as connection:
+        client = RtcClient(connection, TelemetryObserver(endpoint, time.monotonic))
+        for result in examine(client, examination):
+            results.append(result)
             if not options.json:
-                print(shown(line(one)), flush=True)
+                print(shown(format_line(result)), flush=True)
     if options.json:
-        print(json.dumps({"checks": [as_document(one) for one in checks]}, indent=2))
-    broken = [one.name for one in checks if one.outcome is Outcome.WRONG]
-    say(f"{len(checks)} checks, {len(broken)} wrong{': ' if broken else ''}{', '.join(broken)}")
-    return BROKEN if broken else KEPT
+        print(json.dumps({"checks": [as_document(result) for result in results]}, indent=2))
+    broken = [result.name for result in results if result.outcome is Outcome.WRONG]
+    say(f"{len(results)} checks, {len(broken)} wrong{': ' if broken else ''}{', '.join(broken)}")
+    return EXIT_WRONG if broken else EXIT_OK
 
 
-def _whom(options: argparse.Namespace) -> tuple[Endpoint, Instrument | None]:
-    """Return the system to listen to, and its instrument; None: no file describes it.
+def _find_rtc(options: argparse.Namespace) -> tuple[Endpoint, Instrument | None]:
+    """Return the link to the RTC's system, and its instrument; None if no file describes it.
 
     Raises
     ------
     PyrcalError
-        If there is no RTC at a router, or there are several and none was named.
+        If there is no RTC at the router, or there are several and ``--system`` was not given.
     """
     zenoh = read_link_tables(options.config, listen=options.listen, connect=options.connect)
     if options.instrument is not None or (options.system is None and not zenoh.connect):
-        instrument = load_instrument(options.instrument or DEFAULT)
-        return _endpoint(zenoh, options.system or instrument.name), instrument
+        instrument = load_instrument(options.instrument or DEFAULT_INSTRUMENT)
+        return _make_endpoint(zenoh, options.system or instrument.name), instrument
     system = options.system
     if system is None:
-        system = _only_system(_endpoint(zenoh, "any"), options.wait)
-        say(f"the RTC there is that of system {system}")
-    endpoint = _endpoint(zenoh, system)
+        system = _find_system(_make_endpoint(zenoh, "any"), options.wait)
+        say(f"found the RTC of system {system}")
+    endpoint = _make_endpoint(zenoh, system)
     try:
         return endpoint, packaged_instrument(endpoint.system)
     except ConfigurationError:
-        say(f"no instrument of that name is packaged: {NO_FILE}")
+        # Most checks need no instrument, so an unknown name is not an error here.
+        say(f"no instrument named {endpoint.system} is packaged: {NO_INSTRUMENT_HINT}")
         return endpoint, None
 
 
-def _endpoint(zenoh: ZenohTable, system: str) -> Endpoint:
+def _make_endpoint(zenoh: ZenohTable, system: str) -> Endpoint:
     security = link_security(zenoh, system)
     return Endpoint(system=system, listen=zenoh.listen, connect=zenoh.connect, security=security)
 
 
-def _only_system(endpoint: Endpoint, wait_s: float) -> str:
-    found = systems_with_rtc(endpoint, wait_s)
+def _find_system(endpoint: Endpoint, wait_s: float) -> str:
+    found = find_systems_with_rtc(endpoint, wait_s)
     where = ", ".join(endpoint.connect)
     if not found:
-        raise LinkError(f"no RTC of any system was at {where} within {wait_s:g} s: start it")
+        raise LinkError(f"no RTC of any system came to {where} within {wait_s:g} s: start it")
     if len(found) > 1:
         raise ConfigurationError(
             f"--system: found RTCs of {', '.join(found)} at {where}, expected the name of one"
@@ -137,33 +137,38 @@ def _only_system(endpoint: Endpoint, wait_s: float) -> str:
     return found[0]
 
 
-def line(one: Checked) -> str:
-    """Return a check on one line: finding, requirement, place in the contract."""
-    article = one.requirement
+def format_line(result: CheckResult) -> str:
+    """Return a result on one line: finding, requirement, section of the contract."""
+    requirement = result.requirement
     return (
-        f"{one.outcome:8}{one.name:12} {one.found} "
-        f"[contract: {article.says}; {PAGE}#{article.anchor}]"
+        f"{result.outcome:8}{result.name:12} {result.found} "
+        f"[contract: {requirement.says}; {CONTRACT_PAGE}#{requirement.anchor}]"
     )
 
 
-def as_document(one: Checked) -> dict[str, str]:
-    """Return a check as JSON."""
-    article = one.requirement
+def as_document(result: CheckResult) -> dict[str, str]:
+    """Return a result as a JSON object."""
+    requirement = result.requirement
     return {
-        "check": one.name,
-        "outcome": one.outcome.lower(),
-        "found": one.found,
-        "contract": article.says,
-        "where": f"{PAGE}#{article.anchor}",
-        "moves": article.moves.value,
+        "check": result.name,
+        "outcome": result.outcome.lower(),
+        "found": result.found,
+        "contract": requirement.says,
+        "where": f"{CONTRACT_PAGE}#{requirement.anchor}",
+        "moves": requirement.moves.value,
     }
 
 
-def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConvention | str:
-    """Return how the matrix in use compares with the instrument file."""
+def compare_matrix(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConvention | str:
+    """Return the slope convention that the matrix in use implies, or the reason why not.
+
+    ``matrix`` is ``(n_controlled, n_slopes)`` as the RTC uses it. It is compared with the model of
+    the instrument at its start registration.
+    """
     folder: Path = usual_folder(os.environ)
     try:
         basis = DiskCache(folder).basis(instrument)
+        # A coarse model is quicker to compute, and shows signs, order and axes as well.
         model = RtcInteractionModel(instrument, basis, pupil_sampling=3, detector_nodes=3)
         response = model.interaction_matrix(instrument.start)
         if matrix.shape[1] != len(response) or len(matrix) > response.shape[1]:
@@ -172,16 +177,19 @@ def compared(instrument: Instrument, matrix: NDArray[np.float32]) -> SlopeConven
                 f"{len(response)} slopes and {response.shape[1]} modes"
                 f"{likely_kind(matrix.shape[1], len(response))}"
             )
-        dialect = of_reconstructor(
+        convention = of_reconstructor(
             matrix, instrument, basis, near=instrument.start, response=response
         )
     except ModelError as error:
-        return f"the model of {instrument.name} cannot tell: {error}"
-    return replace(dialect, adopted=instrument.slopes.orientation is None)
+        return f"the model of {instrument.name} cannot be computed: {error}"
+    return replace(convention, adopted=instrument.slopes.orientation is None)
 
 
-def found_images(instrument: Instrument, flux: bytes) -> ImagePlaces | str:
-    """Return where the pupil images lie by the flux of a status, in the RTC's own axes."""
+def measure_image_offsets(instrument: Instrument, flux: bytes) -> ImageOffsets | str:
+    """Return the offsets of the pupil images in the flux of a status, or the reason why not.
+
+    Offsets are in the axes of the RTC, because the RTC and its instrument file use these.
+    """
     kind = kind_of(instrument)
     as_listed = replace(instrument, slopes=replace(instrument.slopes, orientation=None))
     light = kind.light(as_listed)
@@ -194,35 +202,39 @@ def found_images(instrument: Instrument, flux: bytes) -> ImagePlaces | str:
     if isinstance(found, CannotTell):
         return found.reason
     stated = kind.image_offsets(as_listed)
-    return ImagePlaces(
-        found_px=found.subap * instrument.binning,
+    return ImageOffsets(
+        measured_px=found.subap * instrument.binning,
         sigma_px=found.sigma_subap * instrument.binning,
-        stated_px=None if stated is None else stated * instrument.binning,
+        nominal_px=None if stated is None else stated * instrument.binning,
     )
 
 
-def registering(instrument: Instrument) -> Registered:
-    """Return a function that fits α to a window of dither as the service does."""
+def make_registration_fit(instrument: Instrument) -> RegistrationFit:
+    """Return a function that fits α to a window of dither, as the service does."""
 
     @functools.cache
     def worker() -> OpticsWorker:
+        # Most runs make no check of the offload, and the worker imports the whole model.
         from service.runtime.worker import OpticsWorker
         from service.runtime.worker.records import Compute
 
         return OpticsWorker(instrument, Compute(cache=usual_folder(os.environ)))
 
-    def registered(window: Spectra, loop: ClosedLoop) -> LockInEstimate | WindowRefused:
+    def fit_registration(window: Spectra, loop: ClosedLoop) -> LockInEstimate | WindowRefused:
         try:
             worker().read_slope_convention(loop.reconstructor, None)
             return worker().fit(window, loop, None)
         except ModelError as error:
             return WindowRefused(reason=str(error), t_ns_utc=window.t_end_ns_utc)
 
-    return registered
+    return fit_registration
 
 
-def _agreed(moved: tuple[str, ...], *, yes: bool) -> bool:
-    """Print what will move, and ask."""
+def _ask_consent(moved: tuple[str, ...], *, yes: bool) -> bool:
+    """Print what will be moved and return True if the user agrees.
+
+    Without a terminal nobody can answer, so only ``yes`` counts.
+    """
     for each in moved:
         say(f"will move: {each}")
     if yes or not sys.stdin.isatty():

@@ -1,4 +1,7 @@
-"""Checks that ask the RTC; they move nothing but a dither."""
+"""Checks that send commands to the RTC: replies, signatures, and a small dither.
+
+Also :class:`RtcClient`, which all checks use to wait for messages.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,8 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.connection import ANSWER_S, RtcConnection
-from check_rtc.requirements import Checked, fine, seen, skipped, wrong
+from check_rtc.connection import ANSWER_TIMEOUT_S, RtcConnection
+from check_rtc.requirements import CheckResult, fine, seen, skipped, wrong
 from check_rtc.watch import TelemetryObserver
 from service.errors import LinkError, WireError
 from service.estimation.dither_monitor import DitherMeasurement, DitherMonitor, measure_block
@@ -30,39 +33,45 @@ from service.wire import (
     encode,
 )
 
-REPLY_S: Final = 1.0
-"""Within which a command is answered."""
+MAX_REPLY_DELAY_S: Final = 1.0
+"""Longest time from a command to its reply by the contract, seconds."""
 
-TOTAL_M: Final = 7e-9
-"""RMS of all lines of the check's dither together: below what the service plays by itself."""
+DITHER_RMS_M: Final = 7e-9
+"""RMS of all lines of the dither together, metres OPD; less than the service's default budget."""
 
-LINES: Final = (0.08, 0.211, 0.239)
-"""Of the frame rate. The slow one tells a sign from a lag."""
+LINE_RATIOS: Final = (0.08, 0.211, 0.239)
+"""Frequencies of the dither over the frame rate.
 
-DITHER_S: Final = 6.0
-"""Asked for; it is stopped before."""
+At the slow one a lag of a few frames is a small phase, so that it differs from a reversed sign.
+"""
 
-PLAYED_S: Final = 2.5
-"""Of dither that is looked at."""
+DITHER_DURATION_S: Final = 6.0
+"""Duration of the dither in the command, which is stopped earlier."""
 
-LAGS: Final = np.arange(-3.0, 3.01, 0.05)
-"""Frames by which slopes may lag the commands of their row."""
+ANALYSED_S: Final = 2.5
+"""Duration of the dither that is analysed."""
 
-MOST_LAG: Final = 0.2
-NOISY: Final = 0.3
-"""Noise over answer from which on a line tells nothing."""
+LAG_GRID_FRAMES: Final = np.arange(-3.0, 3.01, 0.05)
+"""Lags of slopes behind the commands of their row that are tried, frames."""
 
-SILENT: Final = 0.1
-"""Least answer over command, noise included, of a mirror that moves."""
+MAX_LAG_FRAMES: Final = 0.2
+"""Largest lag of slopes and commands of the same exposure, frames."""
 
-_SIDES: Final = (-4.0, -3.0, 3.0, 4.0)
-"""Bins beside a line, where its noise is."""
+MAX_NOISE_RATIO: Final = 0.3
+"""Largest noise over response with which a response is judged."""
 
-_STOPS_S: Final = 2.0
+MIN_RESPONSE_RATIO: Final = 0.1
+"""Smallest response over command, noise added, of a mirror that moves."""
+
+_NOISE_BINS: Final = (-4.0, -3.0, 3.0, 4.0)
+"""Frequency bins beside a line in which its noise is measured; the nearest have its leakage."""
+
+_STOP_TIMEOUT_S: Final = 2.0
+"""Longest time from the command to stop until frames and status show no dither."""
 
 
 class RtcClient:
-    """A connection and an observer of telemetry, pumped while something is awaited."""
+    """Connection to an RTC with the observer of its telemetry, and waiting for conditions."""
 
     def __init__(
         self,
@@ -71,18 +80,18 @@ class RtcClient:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
-        self.connection, self.watch, self.clock = connection, observer, clock
+        self.connection, self.observer, self.clock = connection, observer, clock
         self._sleep = sleep
 
     def listen(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Listen for so long, or until a condition holds; return whether it does."""
+        """Receive messages for ``seconds`` or until a condition holds; return True if it does."""
         end_s = self.clock() + seconds
         while not until():
             left_s = end_s - self.clock()
             if left_s <= 0.0:
                 return False
             self._sleep(min(left_s, 0.02))
-            self.watch.take(self.connection.take())
+            self.observer.take(self.connection.take())
         return True
 
 
@@ -90,20 +99,23 @@ class RtcClient:
 
 
 @dataclass(frozen=True, slots=True)
-class _Question:
-    """A command that must be refused."""
+class _InvalidCommand:
+    """Command that an RTC must refuse."""
 
     kind: CommandKind
     payload: bytes
     what: str
-    words: tuple[str, ...] = ("range", "unsupported", "busy")
-    """With one of which the reason may begin."""
+    """Description for the report."""
+
+    codes: tuple[str, ...] = ("range", "unsupported", "busy")
+    """Words with one of which the reason of the refusal must begin."""
 
     optional: bool = False
+    """True if an RTC may have no such command at all."""
 
 
-def _questions(client: RtcClient, status: Status) -> list[_Question]:
-    """Return commands that no RTC can carry out."""
+def _invalid_commands(client: RtcClient, status: Status) -> list[_InvalidCommand]:
+    """Return commands that no RTC may carry out, with values that would do no harm if it did."""
     new, n_modes = client.connection.new_id, status.n_modes
     dither = DitherRequest(
         id=new("dither"),
@@ -113,7 +125,7 @@ def _questions(client: RtcClient, status: Status) -> list[_Question]:
         frequency_hz=(0.1 * status.frame_rate_hz,),
         duration_s=0.01,
     )
-    told = msgpack.unpackb(encode(dither))
+    keys = msgpack.unpackb(encode(dither))
     gains = encode(LoopRequest(id=new("loop"), gains=(0.0,) * (n_modes + 1)))
     measure = {"v": 1, "id": new("measure"), "pattern": "push-pull-modal", "modes": [n_modes]}
     measure |= dict.fromkeys(("frequency_hz", "duration_s"))
@@ -122,31 +134,33 @@ def _questions(client: RtcClient, status: Status) -> list[_Question]:
     offload = {"v": 1, "id": new("offload"), "rotation_deg": 0.0, "magnification": 0.0}
     offload |= {"shift_x_subap": 0.0}
     dithering = CommandKind.DITHER
-    without = {key: value for key, value in told.items() if key != "modes"}
+    without = {key: value for key, value in keys.items() if key != "modes"}
     return [
-        _Question(dithering, b"\xc1", "bytes of no message", ("range", "signature")),
-        _Question(
+        _InvalidCommand(dithering, b"\xc1", "bytes of no message", ("range", "signature")),
+        _InvalidCommand(
             dithering,
             msgpack.packb({**without, "id": new("missing")}),
             "a dither without the key modes",
             ("missing",),
         ),
-        _Question(
+        _InvalidCommand(
             dithering,
-            msgpack.packb({**told, "v": 2, "id": new("version")}),
+            msgpack.packb({**keys, "v": 2, "id": new("version")}),
             "a dither of version 2",
             ("v",),
         ),
-        _Question(dithering, msgpack.packb(told), f"a dither of mode {n_modes}"),
-        _Question(CommandKind.LOOP, gains, "one gain more than modes"),
-        _Question(
+        _InvalidCommand(dithering, msgpack.packb(keys), f"a dither of mode {n_modes}"),
+        _InvalidCommand(CommandKind.LOOP, gains, "one gain more than modes"),
+        _InvalidCommand(
             CommandKind.MEASURE,
             msgpack.packb(measure),
             f"a measurement of mode {n_modes}",
             optional=True,
         ),
-        _Question(CommandKind.RAMP, msgpack.packb(ramp), "a ramp of modes 1 to 0", optional=True),
-        _Question(
+        _InvalidCommand(
+            CommandKind.RAMP, msgpack.packb(ramp), "a ramp of modes 1 to 0", optional=True
+        ),
+        _InvalidCommand(
             CommandKind.OFFLOAD,
             msgpack.packb(offload),
             "an offload demand of 0 without the key shift_y_subap",
@@ -156,64 +170,68 @@ def _questions(client: RtcClient, status: Status) -> list[_Question]:
     ]
 
 
-def replies(client: RtcClient, status: Status) -> Checked:
-    """Send commands that must be refused; one of them twice, with the same id."""
+def check_replies(client: RtcClient, status: Status) -> CheckResult:
+    """Check the replies to commands that must be refused; one of them is sent twice."""
     problems, absent, slowest_s, first = [], [], 0.0, b""
-    questions = _questions(client, status)
-    for question in questions:
-        answer, took_s = client.connection.ask(question.kind, question.payload)
+    commands = _invalid_commands(client, status)
+    for command in commands:
+        answer, took_s = client.connection.ask(command.kind, command.payload)
         if answer is None:
-            if question.optional and took_s < ANSWER_S / 2:
-                absent.append(question.kind.value)
+            # zenoh says at once that a key has no queryable; a queryable that does not answer
+            # costs the whole timeout.
+            if command.optional and took_s < ANSWER_TIMEOUT_S / 2:
+                absent.append(command.kind.value)
             else:
-                problems.append(f"no answer to {question.what}")
+                problems.append(f"no answer to {command.what}")
             continue
         slowest_s = max(slowest_s, took_s)
-        problems += _wrong_reply(answer, question, took_s)
-        first = answer if question is questions[3] else first
-    again, _ = client.connection.ask(questions[3].kind, questions[3].payload)
+        problems += _find_reply_problems(answer, command, took_s)
+        first = answer if command is commands[3] else first
+    again, _ = client.connection.ask(commands[3].kind, commands[3].payload)
     if first and (again is None or decode(Reply, again) != decode(Reply, first)):
-        problems.append("the same id got another answer when asked again")
+        problems.append("a repeated id had another reply")
     if problems:
         return wrong("replies", "; ".join(problems))
-    found = f"{len(questions) - len(absent)} refusals in their words, within {slowest_s:.2f} s"
+    found = f"{len(commands) - len(absent)} refusals with their codes within {slowest_s:.2f} s"
     without = f"; it offers no {' and no '.join(absent)}" if absent else ""
-    return fine("replies", f"{found}, twice the same for the same id{without}")
+    return fine("replies", f"{found}, and the same reply for a repeated id{without}")
 
 
-def _wrong_reply(answer: bytes, question: _Question, took_s: float) -> list[str]:
+def _find_reply_problems(answer: bytes, command: _InvalidCommand, took_s: float) -> list[str]:
     try:
         reply = decode(Reply, answer)
     except WireError as error:
-        return [f"the reply to {question.what} cannot be read: {error}"]
+        return [f"the reply to {command.what} cannot be read: {error}"]
     if reply.accepted:
-        return [f"{question.what} was accepted"]
+        return [f"{command.what} was accepted"]
     word = reply.reason.partition(":")[0]
-    if word not in question.words:
-        wanted = " or ".join(question.words)
-        return [f"{question.what} was refused with {reply.reason!r:.60}, expected {wanted}: ..."]
-    return [f"the reply to {question.what} took {took_s:.1f} s"] if took_s > REPLY_S else []
+    if word not in command.codes:
+        wanted = " or ".join(command.codes)
+        return [f"{command.what} was refused with {reply.reason!r:.60}, expected {wanted}: ..."]
+    return (
+        [f"the reply to {command.what} took {took_s:.1f} s"] if took_s > MAX_REPLY_DELAY_S else []
+    )
 
 
-def signatures(client: RtcClient, status: Status) -> Checked:
-    """Send an order that changes nothing: without its signature, with it, again, and changed."""
+def check_signatures(client: RtcClient, status: Status) -> CheckResult:
+    """Check signatures with a command that changes nothing: it sets the leak in use."""
     connection, kind = client.connection, CommandKind.LOOP
-    if not connection.signs:
+    if not connection.has_secret:
         return skipped("signatures", "no secret is shared: [zenoh.signing] in --config")
     plain = encode(LoopRequest(id=connection.new_id("signed"), leak=status.leak))
-    signed = connection.signed(kind, plain)
+    signed = connection.sign(kind, plain)
     changed = signed[:-1] + bytes([signed[-1] ^ 1])
     problems = []
     for what, payload, expected in (
-        ("what is not signed", plain, False),
-        ("what was changed on its way", changed, False),
-        ("what is signed", signed, True),
-        ("what was sent before", signed, False),
+        ("an unsigned command", plain, False),
+        ("a modified command", changed, False),
+        ("a signed command", signed, True),
+        ("a replayed command", signed, False),
     ):
-        answer, _ = connection.ask(kind, payload, as_it_is=True)
+        answer, _ = connection.ask(kind, payload, is_signed=True)
         reply = None if answer is None else decode(Reply, answer)
         if reply is None:
-            problems.append(f"no answer to {what}")
+            problems.append(f"no reply to {what}")
         elif reply.accepted is not expected:
             problems.append(f"{what} was {'accepted' if reply.accepted else reply.reason}")
         elif not expected and not reply.reason.startswith("signature"):
@@ -221,14 +239,14 @@ def signatures(client: RtcClient, status: Status) -> Checked:
             problems.append(f"{found}, expected signature: ...")
     if problems:
         return wrong("signatures", "; ".join(problems))
-    return fine("signatures", "refused: not signed, changed on its way, sent before")
+    return fine("signatures", "refused: unsigned, modified and replayed commands")
 
 
 # --- the dither
 
 
-class _Ledger:
-    """The dither in the frames, summed block by block."""
+class _DitherRecorder:
+    """Record of a dither in the frames, block by block."""
 
     def __init__(
         self, asked: ExpectedDither, matrix: NDArray[np.float32] | None, in_loop: list[int]
@@ -244,7 +262,7 @@ class _Ledger:
         self._span = asked.first_seq, asked.stop_seq
 
     def take(self, block: FrameBlock) -> None:
-        """Take frames."""
+        """Add a block of frames."""
         self.next_seq = block.next_seq
         if block.dither_m is not None:
             rows = np.flatnonzero(block.dither_m.any(axis=1))
@@ -263,22 +281,25 @@ class _Ledger:
         self.moved_m.append(np.asarray(block.commands_m[:, modes], dtype=float))
 
 
-def dither(
-    client: RtcClient, status: Status, matrix: NDArray[np.float32] | None, most_m: float = TOTAL_M
-) -> list[Checked]:
-    """Have a small dither played and stopped, and say what the frames held of it."""
+def check_dither(
+    client: RtcClient,
+    status: Status,
+    matrix: NDArray[np.float32] | None,
+    most_m: float = DITHER_RMS_M,
+) -> list[CheckResult]:
+    """Check that a small dither is played as requested and stops, and the columns of frames."""
     if status.dither is not None:
         why = f"{status.dither_id} plays: stop it first"
         return [skipped("dither", why), skipped("columns", why)]
-    modes = dithered_modes(status)
+    modes = choose_dither_modes(status)
     amplitude = min(most_m / np.sqrt(len(modes)), status.max_dither_m)
     request = DitherRequest(
         id=client.connection.new_id("dither"),
         kind=DitherKind.SINE,
         modes=modes,
         amplitude_m=(float(amplitude),) * len(modes),
-        frequency_hz=tuple(line * status.frame_rate_hz for line in LINES[: len(modes)]),
-        duration_s=DITHER_S,
+        frequency_hz=tuple(line * status.frame_rate_hz for line in LINE_RATIOS[: len(modes)]),
+        duration_s=DITHER_DURATION_S,
     )
     try:
         reply = client.connection.command(request)
@@ -288,45 +309,50 @@ def dither(
         found = f"refused: {reply.reason}" if not reply.accepted else "start_seq is nil"
         return [wrong("dither", found), skipped("columns", "there was no dither")]
     try:
-        ledger = _listen_to_dither(client, status, request, reply.start_seq, matrix)
-    finally:  # also where it is broken off
-        ended = stopped(client)
-    ordered_seq = ledger.next_seq
+        recorder = _record_dither(client, status, request, reply.start_seq, matrix)
+    finally:  # also if the user interrupts the check
+        ended = stop_dither(client)
+    ordered_seq = recorder.next_seq
     gone = client.listen(
-        _STOPS_S,
+        _STOP_TIMEOUT_S,
         lambda: (
-            client.watch.status is not None
-            and client.watch.status.dither is None
-            and ledger.next_seq > ledger.last_seq + 50
+            client.observer.status is not None
+            and client.observer.status.dither is None
+            and recorder.next_seq > recorder.last_seq + 50
         ),
     )
-    client.watch.block_takers.remove(ledger.take)
-    judged = _judged(client, request, reply.start_seq, ledger)
+    client.observer.block_callbacks.remove(recorder.take)
+    judged = _compare_dither(client, request, reply.start_seq, recorder)
     if not judged and not (ended.accepted and gone):
-        still_s = (ledger.last_seq - ordered_seq) / status.frame_rate_hz
+        still_s = (recorder.last_seq - ordered_seq) / status.frame_rate_hz
         judged = (
-            f"ordered to stop, it went on for {still_s:.1f} s, or its status does: {ended.reason}"
+            f"not stopped: frames have it {still_s:.1f} s after the command to stop, or the status "
+            f"still has it; reply: {ended.reason or 'accepted'}"
         )
     if judged:
-        return [wrong("dither", judged), _columns(ledger, modes, status)]
-    found_m = ledger.findings[-1].found_m
+        return [wrong("dither", judged), _check_columns(recorder, modes, status)]
+    found_m = recorder.findings[-1].found_m
     found = (
         f"{1e9 * found_m:.2f} nm RMS on modes {', '.join(map(str, modes))} from frame "
-        f"{reply.start_seq} as asked for, stopped at {ledger.last_seq}"
+        f"{reply.start_seq} as requested, until {recorder.last_seq}"
     )
-    return [fine("dither", found), _columns(ledger, modes, status)]
+    return [fine("dither", found), _check_columns(recorder, modes, status)]
 
 
-def stopped(client: RtcClient) -> Reply:
-    """Stop the dither; return the reply, if there is one."""
+def stop_dither(client: RtcClient) -> Reply:
+    """Stop the dither; return the reply, or a refusal if there is none."""
     try:
         return client.connection.command(DitherStop(id=client.connection.new_id("stop")))
     except LinkError as error:
         return Reply(id=None, accepted=False, reason=str(error), start_seq=None)
 
 
-def dithered_modes(status: Status) -> tuple[int, ...]:
-    """Return two modes of the loop and one outside it, as far as there are any."""
+def choose_dither_modes(status: Status) -> tuple[int, ...]:
+    """Return two controlled modes and an uncontrolled one, as far as there are any.
+
+    Two controlled modes are needed for the lag; the amplitude of the uncontrolled one is not
+    reduced by the loop.
+    """
     in_loop = status.in_loop
     chosen = [in_loop[min(8, len(in_loop) // 4)], in_loop[len(in_loop) // 3]] if in_loop else []
     if status.n_controlled < status.n_modes or not in_loop:
@@ -335,16 +361,16 @@ def dithered_modes(status: Status) -> tuple[int, ...]:
     return tuple(dict.fromkeys(min(mode, status.n_modes - 1) for mode in chosen))[:most]
 
 
-def _listen_to_dither(
+def _record_dither(
     client: RtcClient,
     status: Status,
     request: DitherRequest,
     start_seq: int,
     matrix: NDArray[np.float32] | None,
-) -> _Ledger:
-    """Listen to a dither that has been accepted."""
+) -> _DitherRecorder:
+    """Record the dither after its command has been accepted."""
     rate_hz = status.frame_rate_hz
-    stop_seq = start_seq + round(PLAYED_S * rate_hz)
+    stop_seq = start_seq + round(ANALYSED_S * rate_hz)
     own = tuple(mode not in status.in_loop for mode in request.modes)
     asked = ExpectedDither(
         modes=request.modes,
@@ -356,68 +382,81 @@ def _listen_to_dither(
         own=own,
     )
     in_loop = [mode for mode, outside in zip(request.modes, own, strict=True) if not outside]
-    ledger = _Ledger(asked, matrix, in_loop)
-    client.watch.block_takers.append(ledger.take)
-    client.listen(2.0 * PLAYED_S, lambda: ledger.next_seq >= stop_seq)
-    return ledger
+    recorder = _DitherRecorder(asked, matrix, in_loop)
+    client.observer.block_callbacks.append(recorder.take)
+    client.listen(2.0 * ANALYSED_S, lambda: recorder.next_seq >= stop_seq)
+    return recorder
 
 
-def _judged(client: RtcClient, request: DitherRequest, start_seq: int, ledger: _Ledger) -> str:
-    """Return how the dither differs from the request; empty: it does not."""
-    if ledger.first_seq is None:
-        return f"accepted from frame {start_seq}, and the frames hold none of it"
-    late = ledger.first_seq - start_seq
+def _compare_dither(
+    client: RtcClient, request: DitherRequest, start_seq: int, recorder: _DitherRecorder
+) -> str:
+    """Return the difference between the dither and the request; empty if there is none."""
+    if recorder.first_seq is None:
+        return f"accepted from frame {start_seq}, but no frame contains it"
+    late = recorder.first_seq - start_seq
     if late not in {0, 1}:  # the first value of a sine is 0
-        return f"it begins at frame {ledger.first_seq}, {late} after the one announced"
-    texts = [finding.text for finding in ledger.findings if finding.text]
+        return f"it begins at frame {recorder.first_seq}, {late} after its start_seq"
+    texts = [finding.text for finding in recorder.findings if finding.text]
     if texts:
         return texts[0]
-    if not ledger.findings:
+    if not recorder.findings:
         return "less than a second of it has come"
-    told = [status.dither for _, status in client.watch.statuses if status.dither_id == request.id]
-    if not told or told[0] is None:
+    shown = [
+        status.dither for _, status in client.observer.statuses if status.dither_id == request.id
+    ]
+    if not shown or shown[0] is None:
         return "no status shows it"
-    if told[0].start_seq != start_seq or told[0].request != request:
-        return "the status shows it otherwise than asked for"
+    if shown[0].start_seq != start_seq or shown[0].request != request:
+        return "the status shows another dither than requested"
     return ""
 
 
-def _columns(ledger: _Ledger, modes: tuple[int, ...], status: Status) -> Checked:
-    """Say how far slopes and commands of a row are apart, from two lines in the loop."""
-    n_lines = ledger.seen_m[0].shape[1] if ledger.seen_m else 0
-    if n_lines < 2 or ledger.first_seq is None:
-        return skipped("columns", "it takes a dither on two modes of the loop and its matrix")
-    seq = np.concatenate(ledger.seq)
-    turns = 2 * np.pi * np.array(LINES[: len(modes)])[[mode in status.in_loop for mode in modes]]
-    answer, noise = _transfer(
-        seq, np.concatenate(ledger.seen_m), np.concatenate(ledger.moved_m), turns
+def _check_columns(
+    recorder: _DitherRecorder, modes: tuple[int, ...], status: Status
+) -> CheckResult:
+    """Check that slopes and commands of a row are of one exposure, from two controlled modes.
+
+    The matrix in use turns slopes into modes. Their phase at the dither lines against that of the
+    commands is a lag, if it is proportional to frequency, or a reversed sign.
+    """
+    n_lines = recorder.seen_m[0].shape[1] if recorder.seen_m else 0
+    if n_lines < 2 or recorder.first_seq is None:
+        return skipped("columns", "needs the matrix in use and a dither on two controlled modes")
+    seq = np.concatenate(recorder.seq)
+    turns = (
+        2 * np.pi * np.array(LINE_RATIOS[: len(modes)])[[mode in status.in_loop for mode in modes]]
     )
-    if (np.abs(answer) + noise < SILENT).all():
-        return wrong("columns", "no slope answers what the commands hold: the mirror stands still")
-    if (noise > NOISY * np.abs(answer)).any():
-        return skipped("columns", f"too noisy: {np.max(noise / np.abs(answer)):.2f} of the answer")
+    answer, noise = _measure_transfer(
+        seq, np.concatenate(recorder.seen_m), np.concatenate(recorder.moved_m), turns
+    )
+    if (np.abs(answer) + noise < MIN_RESPONSE_RATIO).all():
+        return wrong("columns", "slopes do not respond to the commands: the mirror does not move")
+    if (noise > MAX_NOISE_RATIO * np.abs(answer)).any():
+        ratio = np.max(noise / np.abs(answer))
+        return skipped("columns", f"too noisy: noise is {ratio:.2f} of the response")
     unit, weight = answer / np.abs(answer), np.abs(answer) / np.maximum(noise, 1e-9)
-    models = np.exp(-1j * np.outer(LAGS, turns))
+    models = np.exp(-1j * np.outer(LAG_GRID_FRAMES, turns))
     misfit = np.stack([np.abs(unit - sign * models) ** 2 @ weight**2 for sign in (1.0, -1.0)])
     k_sign, k_lag = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
-    lag, sigma = float(LAGS[k_lag]), float(1.0 / np.sqrt(np.sum((weight * turns) ** 2)))
+    lag, sigma = float(LAG_GRID_FRAMES[k_lag]), float(1.0 / np.sqrt(np.sum((weight * turns) ** 2)))
     share = float(np.median(np.abs(answer)))
     if k_sign:
-        return wrong("columns", "slopes times matrix have the other sign than the commands")
+        return wrong("columns", "slopes times matrix have the opposite sign of the commands")
     found = f"slopes lag {lag:+.2f} frames behind the commands of their row"
-    if abs(lag) > MOST_LAG + 3.0 * sigma:
+    if abs(lag) > MAX_LAG_FRAMES + 3.0 * sigma:
         return wrong("columns", found)
-    found += f", and answer {share:.2f} of them by the matrix in use"
+    found += f"; their response by the matrix in use is {share:.2f}"
     return (fine if 0.1 < share < 3.0 else seen)("columns", found)
 
 
-def _transfer(
+def _measure_transfer(
     seq: NDArray[np.int64],
     seen_m: NDArray[np.float64],
     moved_m: NDArray[np.float64],
     turns: NDArray[np.float64],
 ) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
-    """Return ``(n_lines,)`` answer over command at the lines, and its noise."""
+    """Return the response over the command at each line ``(n_lines,)``, complex, and its noise."""
     window = np.hanning(len(seq))
     bin_rad = 2 * np.pi / max(int(seq[-1] - seq[0]), 1)
 
@@ -426,6 +465,6 @@ def _transfer(
         return np.asarray(np.sum(phasors * (columns - columns.mean(axis=0)), axis=0))
 
     moved = at(moved_m, 0.0)
-    sides = np.stack([at(seen_m - moved_m, shift) for shift in _SIDES])
+    sides = np.stack([at(seen_m - moved_m, shift) for shift in _NOISE_BINS])
     noise = np.sqrt(np.mean(np.abs(sides) ** 2, axis=0)) / np.abs(moved)
     return at(seen_m, 0.0) / moved, noise

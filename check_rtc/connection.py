@@ -1,4 +1,4 @@
-"""The checker's end of the link."""
+"""Connection of the checker to an RTC, in the role of the service."""
 
 from __future__ import annotations
 
@@ -32,51 +32,51 @@ from service.wire.signing import Signatures
 if TYPE_CHECKING:
     import zenoh
 
-MOST_WAITING: Final = 20_000
-"""Messages that wait to be looked at; beyond it the oldest are dropped."""
+MAX_QUEUED_MESSAGES: Final = 20_000
+"""Largest number of received messages in the queue; beyond it the oldest are dropped."""
 
-OFFERED_S: Final = 600.0
-"""A matrix can be asked for this long."""
+OFFER_DURATION_S: Final = 600.0
+"""Time for which the RTC can query a matrix that was sent."""
 
-ANSWER_S: Final = 2.0
-"""For the answer to a question of any other kind than a command."""
+ANSWER_TIMEOUT_S: Final = 2.0
+"""Time to wait for the reply to a query."""
 
 
 class Topic(StrEnum):
-    """The kind of key a message came on."""
+    """Kind of key on which a message came."""
 
     FRAMES = "frames"
     STATUS = "status"
     ACK = "ack"
     MEASURED = "im"
     ALIVE = "alive"
-    ASKED = "asked"
-    """The RTC asked for a matrix: the key has which, and which part."""
+    QUERY = "query"
+    """A query of the RTC for a matrix; the key names the matrix and the chunk."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReceivedMessage:
-    """One message of an RTC."""
+    """Message received from an RTC."""
 
     topic: Topic
     key: str
     at_s: float
-    """When it came, on a monotonic clock."""
+    """Time of arrival on a monotonic clock, seconds."""
 
     data: bytes = b""
     attachment: bytes | None = None
     recoverable: bool = False
-    """Whether its publisher keeps what it has sent."""
+    """True if its publisher has a cache from which lost messages can be recovered."""
 
     alive: bool = False
-    """Of a token: whether it came; else it went."""
+    """For a liveliness token: True if it appeared, False if it disappeared."""
 
     refused: str = ""
-    """Why its signature is not accepted; empty: it is, or none is asked for."""
+    """Reason for which its signature is not accepted; empty if it is, or none is required."""
 
 
-def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
-    """Return the systems whose RTC is at a router, waiting at most ``wait_s``.
+def find_systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
+    """Return the names of systems whose RTC is at a router, waiting at most ``wait_s``.
 
     Raises
     ------
@@ -96,9 +96,10 @@ def systems_with_rtc(endpoint: Endpoint, wait_s: float) -> list[str]:
 
 
 class RtcConnection:
-    """The link, a context manager; messages wait until they are taken.
+    """Connection to an RTC, a context manager; messages are queued until :meth:`take`.
 
-    Where no service is there it is one to the RTC: it holds the token, and answers for matrices.
+    If no service is on the link, the connection takes its role: it declares the service's
+    liveliness token and answers queries for matrices.
     """
 
     def __init__(self, endpoint: Endpoint, *, as_service: bool = True) -> None:
@@ -106,25 +107,25 @@ class RtcConnection:
         self.keys = Keys(endpoint.system)
         self._signatures = Signatures(endpoint.security.secret, Role.SERVICE)
         self._as_service = as_service
-        self._outbox = Outbox(OFFERED_S)
-        self._messages: deque[ReceivedMessage] = deque(maxlen=MOST_WAITING)
+        self._outbox = Outbox(OFFER_DURATION_S)
+        self._messages: deque[ReceivedMessage] = deque(maxlen=MAX_QUEUED_MESSAGES)
         self._session: zenoh.Session | None = None
         self._held: list[object] = []
         self._ids = itertools.count()
         self.other_service = False
-        """Whether a service drives this RTC: then nothing but listening is allowed."""
+        """True if a service is connected to this RTC; the checker then only listens."""
 
     def __enter__(self) -> Self:
-        """Open the link."""
+        """Open the connection."""
         self.open()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it."""
+        """Close the connection."""
         self.close()
 
     def open(self) -> None:
-        """Subscribe, and declare the service's token.
+        """Subscribe to the messages of the RTC, and declare the service's token.
 
         Raises
         ------
@@ -133,6 +134,7 @@ class RtcConnection:
         """
         self._session = session = link.open_session(self._endpoint)
         keys = self.keys
+        # Read before the own token is declared, which would be found as well.
         self.other_service = bool(link.tokens(session, keys.alive(Role.SERVICE)))
         self._held = [
             link.subscribe(session, keys.acknowledgement, self._on_message(Topic.ACK)),
@@ -163,42 +165,43 @@ class RtcConnection:
 
     @property
     def own_router(self) -> bool:
-        """Whether the RTC's router is this program."""
+        """True if this program is the router to which the RTC connects."""
         return not self._endpoint.connect
 
     def new_id(self, what: str) -> str:
-        """Return an id that was never used."""
+        """Return an id that was never used before, not even by an earlier run."""
         return f"check-{what}-{time.time_ns()}-{next(self._ids)}"
 
     def command(self, command: Command) -> Reply:
-        """Return the RTC's reply.
+        """Send a command and return the RTC's reply.
 
         Raises
         ------
         LinkError
-            If there is none, or one that cannot be read.
+            If there is no reply, or it breaks the contract.
         """
-        answer = link.send_command(self._opened, self._endpoint, command, self._signatures)
+        answer = link.send_command(self._require_session, self._endpoint, command, self._signatures)
         try:
             return decode(Reply, answer)
         except WireError as error:
             raise LinkError(f"the reply is unusable: {error}") from error
 
     @property
-    def signs(self) -> bool:
-        """Whether RTC and checker share a secret."""
+    def has_secret(self) -> bool:
+        """True if RTC and checker share a secret for signatures."""
         return self._endpoint.security.secret is not None
 
-    def signed(self, kind: CommandKind, payload: bytes) -> bytes:
-        """Return a request with its signature."""
+    def sign(self, kind: CommandKind, payload: bytes) -> bytes:
+        """Return the bytes of a command with its signature."""
         return self._signatures.sign(self.keys.command(kind), payload)
 
     def ask(
-        self, kind: CommandKind, payload: bytes, *, as_it_is: bool = False
+        self, kind: CommandKind, payload: bytes, *, is_signed: bool = False
     ) -> tuple[bytes | None, float]:
-        """Return the reply to these bytes and its delay; None: there is none.
+        """Send the bytes of a command; return the reply, None if there is none, and its delay.
 
-        They are signed where a secret is shared, unless they are to be sent ``as_it_is``.
+        The bytes are signed if there is a secret, unless ``is_signed`` says that they are already,
+        or are meant to be sent unsigned.
 
         Raises
         ------
@@ -207,45 +210,47 @@ class RtcConnection:
         """
         began_s = time.monotonic()
         selector = self.keys.command(kind)
-        signed = payload if as_it_is else self.signed(kind, payload)
-        answer = link.ask(self._opened, selector, ANSWER_S, signed, Encodings.COMMAND)
+        signed = payload if is_signed else self.sign(kind, payload)
+        answer = link.ask(
+            self._require_session, selector, ANSWER_TIMEOUT_S, signed, Encodings.COMMAND
+        )
         return answer, time.monotonic() - began_s
 
-    def applied(self) -> tuple[Manifest, NDArray[np.float32]]:
-        """Return the matrix that the RTC says it uses.
+    def fetch_applied(self) -> tuple[Manifest, NDArray[np.float32]]:
+        """Return manifest and numbers of the matrix in use, as the RTC reports them.
 
         Raises
         ------
         WireError
-            If what comes breaks the contract or the checksum differs.
+            If the answer breaks the contract, or the checksum differs.
         LinkError
             If there is no answer.
         """
-        return link.fetch_applied(self._opened, self.keys, self._signatures)
+        return link.fetch_applied(self._require_session, self.keys, self._signatures)
 
     def offer(self, manifest: Manifest, matrix: NDArray[np.float32]) -> None:
-        """Serve a matrix from now on.
+        """Answer queries for this matrix from now on.
 
         Raises
         ------
         WireError
-            If its id names another one.
+            If another matrix was offered under the same id.
         """
         self._outbox.add(Offer.of(manifest, matrix))
 
     def put_chunk(self, matrix_id: str, index: int, data: bytes) -> None:
-        """Send one part of a matrix."""
+        """Send one chunk of a matrix."""
         key = self.keys.chunk(matrix_id, index)
-        link.put(self._opened, key, data, Encodings.BYTES, urgent=False)
+        link.put(self._require_session, key, data, Encodings.BYTES, urgent=False)
 
     def put_commit(self, matrix_id: str, data: bytes) -> None:
-        """Send a manifest, or bytes that are none."""
+        """Send the bytes of a manifest, which may be malformed on purpose."""
         key = self.keys.commit(matrix_id)
         signed = self._signatures.sign(key, data)
-        link.put(self._opened, key, signed, Encodings.COMMIT, urgent=True)
+        link.put(self._require_session, key, signed, Encodings.COMMIT, urgent=True)
 
     @property
-    def _opened(self) -> zenoh.Session:
+    def _require_session(self) -> zenoh.Session:
         if self._session is None:
             raise LinkError("the link is not open")
         return self._session
@@ -261,17 +266,20 @@ class RtcConnection:
                     at_s=time.monotonic(),
                     data=data,
                     attachment=attachment,
-                    refused=self._why_unsigned(topic, key, data, attachment),
+                    refused=self._check_signature(topic, key, data, attachment),
                     recoverable=sample.source_info is not None,
                 )
             )
 
         return on_sample
 
-    def _why_unsigned(self, topic: Topic, key: str, data: bytes, attachment: bytes | None) -> str:
+    def _check_signature(
+        self, topic: Topic, key: str, data: bytes, attachment: bytes | None
+    ) -> str:
         try:
             if topic is Topic.FRAMES:
                 self._signatures.check(key, attachment or b"", data)
+            # Chunks are not signed: the signed manifest has their checksum.
             elif topic is not Topic.MEASURED or self.keys.chunk_index_of(key) is None:
                 self._signatures.check(key, data)
         except WireError as error:
@@ -287,9 +295,9 @@ class RtcConnection:
     def _answer(self, query: zenoh.Query) -> None:
         with query:
             key, part = str(query.key_expr), query.parameters.get("chunk")
-            asked = key if part is None else f"{key}?chunk={part}"
+            selector = key if part is None else f"{key}?chunk={part}"
             self._messages.append(
-                ReceivedMessage(topic=Topic.ASKED, key=asked, at_s=time.monotonic())
+                ReceivedMessage(topic=Topic.QUERY, key=selector, at_s=time.monotonic())
             )
             try:
                 data = self._outbox.asked(self.keys, key, part, time.monotonic())

@@ -1,4 +1,4 @@
-"""One examination: listen, ask, and move what the user agrees to."""
+"""Sequence of checks: listen first, then send commands, then move what the user agrees to."""
 
 from __future__ import annotations
 
@@ -10,185 +10,207 @@ import numpy as np
 from numpy.typing import NDArray
 
 from check_rtc.client import (
-    TOTAL_M,
+    DITHER_RMS_M,
     RtcClient,
-    dither,
-    dithered_modes,
-    replies,
-    signatures,
+    check_dither,
+    check_replies,
+    check_signatures,
+    choose_dither_modes,
 )
 from check_rtc.moving import (
-    OPEN_S,
+    OPEN_LOOP_S,
     STROKE_M,
     MatrixInUse,
-    chunks,
-    commit,
-    loop,
-    measure,
-    reconnect,
-    rejection,
+    check_chunks,
+    check_commit,
+    check_loop,
+    check_measure,
+    check_reconnect,
+    check_rejection,
 )
-from check_rtc.offload import STEP, Registered, offload
-from check_rtc.requirements import REQUIREMENTS, Checked, Moves, skipped, wrong
-from check_rtc.telemetry_checks import About, ImagePlaces, find_all
+from check_rtc.offload import STEP_SUBAP, RegistrationFit, check_offload
+from check_rtc.requirements import REQUIREMENTS, CheckResult, Moves, skipped, wrong
+from check_rtc.telemetry_checks import ImageOffsets, TelemetryContext, run_telemetry_checks
 from service.errors import LinkError, WireError
 from service.estimation.slope_convention import SlopeConvention
 from service.estimation.windows import WindowRefused
 from service.wire import Status
 
-_SWAPS: Final = ("commit", "chunks", "rejection")
-_UNKNOWN: Final = "the matrix in use is not to be had on rtc/cm/applied"
+_MATRIX_CHECKS: Final = ("commit", "chunks", "rejection")
+_NO_MATRIX: Final = "rtc/cm/applied does not give the matrix in use"
 
-NO_INSTRUMENT: Final = "no instrument was named"
+NO_INSTRUMENT: Final = "no instrument is given"
 NO_ANSWER: Final = "no answer"
-"""How an error begins that says that nobody was there."""
+"""First words of the error if nothing answers a query."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Examination:
-    """Which checks to make, and with what permission."""
+    """Selection of checks, permissions, and comparisons with an instrument."""
 
     only: frozenset[str] = frozenset()
-    """Names of checks; empty: all that neither open the loop nor move the image."""
+    """Names of checks; if empty, all that neither open the loop nor move the image."""
 
     passive: bool = False
-    """Only what moves and asks nothing."""
+    """True to run only checks that listen."""
 
     open_loop: bool = False
-    """Also what opens the loop."""
+    """True to run also checks that open the loop."""
 
     move_image: bool = False
-    """Also what moves the mirror's image on the sensor."""
+    """True to run also checks that move the mirror's image on the sensor."""
 
     listen_s: float = 8.0
+    """Duration of listening, seconds."""
+
     wait_s: float = 30.0
-    """For an RTC to be heard."""
+    """Longest wait for the first message of the RTC, seconds."""
 
     basis_id: str | None = None
+    """Id of the modal basis in the instrument file; None if it gives none."""
+
     config_id: str | None = None
-    """As the instrument file pins them."""
+    """Id of the sensor configuration in the instrument file; None if it gives none."""
 
     consent: Callable[[tuple[str, ...]], bool] = lambda _: False
-    """Shows what would be moved, and returns whether it may be."""
+    """Shows the user what will be moved, and returns True if the user agrees."""
 
-    dialect: Callable[[NDArray[np.float32]], SlopeConvention | str] = lambda _: NO_INSTRUMENT
-    """Compares the matrix in use with the instrument file; a text says why it does not."""
+    compare_matrix: Callable[[NDArray[np.float32]], SlopeConvention | str] = lambda _: NO_INSTRUMENT
+    """Compares the matrix in use with the instrument file; returns a reason if it cannot."""
 
-    images: Callable[[bytes], ImagePlaces | str] = lambda _: NO_INSTRUMENT
-    """Finds the pupil images in the flux of a status; a text says why they are not found."""
+    find_images: Callable[[bytes], ImageOffsets | str] = lambda _: NO_INSTRUMENT
+    """Measures pupil images in the flux of a status; returns a reason if it cannot."""
 
-    registered: Registered = lambda _, __: WindowRefused(reason=NO_INSTRUMENT, t_ns_utc=0)
-    """Makes α of a window of dither, by the instrument file."""
+    fit_registration: RegistrationFit = lambda _, __: WindowRefused(
+        reason=NO_INSTRUMENT, t_ns_utc=0
+    )
+    """Fits α to a window of dither with the model of the instrument."""
 
-    def wants(self, name: str) -> bool:
-        """Whether a check is wanted."""
+    def includes(self, name: str) -> bool:
+        """Return True if a check is selected and permitted."""
         moves = REQUIREMENTS[name].moves
         if self.passive and moves is not Moves.NOTHING:
             return False
         if self.only:
             return name in self.only
-        agreed = {Moves.LOOP: self.open_loop, Moves.IMAGE: self.move_image}
-        return agreed.get(moves, True)
+        permitted = {Moves.LOOP: self.open_loop, Moves.IMAGE: self.move_image}
+        return permitted.get(moves, True)
 
 
-def examine(client: RtcClient, examination: Examination) -> Iterator[Checked]:
-    """Yield each check when it is made.
+def examine(client: RtcClient, examination: Examination) -> Iterator[CheckResult]:
+    """Run the selected checks and yield the result of each as soon as it is known.
 
     Raises
     ------
     LinkError
-        If no RTC is heard.
+        If no message of an RTC comes within ``examination.wait_s``.
     """
-    yield from (one for one in _listening(client, examination) if examination.wants(one.name))
-    n_refused = len(client.watch.refused)
-    status = client.watch.status
-    asking = [name for name, of in REQUIREMENTS.items() if of.moves is not Moves.NOTHING]
-    asking = [name for name in asking if examination.wants(name)]
-    if status is None or not asking:
+    for result in _run_telemetry_checks(client, examination):
+        if examination.includes(result.name):
+            yield result
+    n_refused = len(client.observer.refused)
+    status = client.observer.status
+    active = [
+        name
+        for name, requirement in REQUIREMENTS.items()
+        if requirement.moves is not Moves.NOTHING and examination.includes(name)
+    ]
+    if status is None or not active:
         return
-    why = _why_not(client, examination, status, asking)
-    if why:
-        yield from (skipped(name, why) for name in asking)
+    reason = _explain_refusal(client, examination, status, active)
+    if reason:
+        yield from (skipped(name, reason) for name in active)
         return
-    yield from (one for one in _asking(client, examination, status) if one.name in asking)
-    later = client.watch.refused[n_refused:]
-    if later and examination.wants("messages"):
+    # Some functions return several results, of which only one may have been selected.
+    for result in _run_active_checks(client, examination, status):
+        if result.name in active:
+            yield result
+    later = client.observer.refused[n_refused:]
+    if later and examination.includes("messages"):
         texts = "; ".join(dict.fromkeys(refused.text for refused in later))
-        yield wrong("messages", f"meanwhile {len(later)} could not be read: {texts}")
+        yield wrong("messages", f"{len(later)} messages since then broke the contract: {texts}")
 
 
-def _listening(client: RtcClient, examination: Examination) -> Iterator[Checked]:
-    observer = client.watch
+def _run_telemetry_checks(client: RtcClient, examination: Examination) -> Iterator[CheckResult]:
+    """Listen to the RTC and yield the results of all checks that need telemetry only."""
+    observer = client.observer
     if not client.listen(examination.wait_s, lambda: bool(observer.arrivals or observer.statuses)):
         raise LinkError(
             f"no RTC of system {client.connection.keys.system} was seen within "
-            f"{examination.wait_s:g} s: start it, or name its system with --system"
+            f"{examination.wait_s:g} s: start it, or give its system with --system"
         )
+    # A status comes once a second only, so the other kind of message may follow a little later.
     client.listen(
         min(examination.wait_s, 3.0), lambda: bool(observer.arrivals and observer.statuses)
     )
-    about = About(keys=client.connection.keys, began_s=client.clock(), ended_s=client.clock())
+    context = TelemetryContext(
+        keys=client.connection.keys, began_s=client.clock(), ended_s=client.clock()
+    )
+    # The matrix is fetched before listening, so that commands can be compared with slopes.
     try:
-        manifest, matrix = client.connection.applied()
+        manifest, matrix = client.connection.fetch_applied()
     except (LinkError, WireError) as error:
-        offered = not str(error).startswith(NO_ANSWER)
-        about = replace(about, not_applied=str(error), offered=offered)
+        is_served = not str(error).startswith(NO_ANSWER)
+        context = replace(context, applied_error=str(error), is_served=is_served)
     else:
-        about = replace(about, applied=manifest)
+        context = replace(context, applied=manifest)
         observer.loop.use(manifest.id, matrix)
     client.listen(examination.listen_s)
-    about = replace(
-        about,
+    context = replace(
+        context,
         ended_s=client.clock(),
         basis_id=examination.basis_id,
         config_id=examination.config_id,
-        dialect="the matrix in use is not known",
+        slope_convention="the matrix in use is not known",
     )
-    if observer.loop.matrix is not None and examination.wants("orientation"):
-        about = replace(about, dialect=examination.dialect(observer.loop.matrix))
-    if examination.wants("images"):
-        about = replace(about, images=_images(observer.status, examination))
-    yield from find_all(observer, about)
+    if observer.loop.matrix is not None and examination.includes("orientation"):
+        convention = examination.compare_matrix(observer.loop.matrix)
+        context = replace(context, slope_convention=convention)
+    if examination.includes("images"):
+        context = replace(context, images=_find_images(observer.status, examination))
+    yield from run_telemetry_checks(observer, context)
 
 
-def _images(status: Status | None, examination: Examination) -> ImagePlaces | str:
-    """Return where the pupil images lie, or why that is not known."""
+def _find_images(status: Status | None, examination: Examination) -> ImageOffsets | str:
+    """Return the offsets of the pupil images, or the reason why they are unknown."""
     if status is None:
         return "no status has come"
     if status.flux is None:
-        return "the status has no flux, which is optional: it would show where the pupil images lie"
-    return examination.images(status.flux)
+        return "the status has no flux, which is optional and would show the pupil images"
+    return examination.find_images(status.flux)
 
 
-def _why_not(client: RtcClient, examination: Examination, status: Status, names: list[str]) -> str:
-    """Return why the RTC must not be asked; empty: it may be."""
+def _explain_refusal(
+    client: RtcClient, examination: Examination, status: Status, names: list[str]
+) -> str:
+    """Return the reason not to send commands to the RTC; empty if there is none."""
     if client.connection.other_service:
         return "a service drives this RTC: end it first, or listen with --passive"
-    moved = moved_by(names, status)
+    moved = list_moves(names, status)
     if moved and not examination.consent(moved):
-        return "not agreed to: --yes agrees beforehand"
+        return "the user did not agree; --yes gives consent beforehand"
     return ""
 
 
-def moved_by(names: list[str], status: Status) -> tuple[str, ...]:
-    """Return what these checks will move, a line for each kind; empty: nothing."""
+def list_moves(names: list[str], status: Status) -> tuple[str, ...]:
+    """Return one line for each kind of movement of these checks, empty if there is none."""
     lines = []
     kinds = {REQUIREMENTS[name].moves for name in names}
     if Moves.MIRROR in kinds:
-        modes = ", ".join(map(str, dithered_modes(status)))
+        modes = ", ".join(map(str, choose_dither_modes(status)))
         lines.append(
-            f"dither, columns: the mirror, {1e9 * TOTAL_M:.0f} nm RMS of sines on modes {modes} "
-            "for some 4 s, added to the loop"
+            f"dither, columns: the mirror, by {1e9 * DITHER_RMS_M:.0f} nm RMS of sines on modes "
+            f"{modes} for about 4 s, in addition to the loop"
         )
     if Moves.MATRIX in kinds:
         lines.append(
-            "commit, chunks, rejection: the matrix in use is sent again under new ids, the same "
-            "numbers; two of them will be swapped in"
+            "commit, chunks, rejection: matrices with the same numbers as the one in use are sent "
+            "under new ids, and two of them are swapped in"
         )
     if "reconnect" in names:
         lines.append("reconnect: the link only; the RTC loses its router for a second")
     if "loop" in names:
-        lines.append(f"loop: THE LOOP IS OPENED for some {OPEN_S:.0f} s, and closed again")
+        lines.append(f"loop: THE LOOP IS OPENED for about {OPEN_LOOP_S:.0f} s and closed again")
     if "measure" in names:
         lines.append(
             "measure: the RTC opens THE LOOP, pushes and pulls two modes by "
@@ -196,60 +218,70 @@ def moved_by(names: list[str], status: Status) -> tuple[str, ...]:
         )
     if "offload" in names:
         lines.append(
-            f"offload: THE MIRROR'S IMAGE is moved by {STEP:g} subap along x, and back; meanwhile "
-            f"{1e9 * TOTAL_M:.0f} nm RMS of dither"
+            f"offload: THE MIRROR'S IMAGE is moved by {STEP_SUBAP:g} subap along x and back, with "
+            f"{1e9 * DITHER_RMS_M:.0f} nm RMS of dither"
         )
     return tuple(lines)
 
 
-def _asking(client: RtcClient, examination: Examination, status: Status) -> Iterator[Checked]:
-    """Make the checks that ask, those that move least first."""
-    yield from _asking_words(client, examination, status)
-    if examination.wants("dither") or examination.wants("columns"):
-        yield from dither(client, status, client.watch.loop.matrix)
-    if any(examination.wants(name) for name in _SWAPS):
-        yield from _swapping(client, examination)
-    if examination.wants("reconnect"):
-        yield reconnect(client)
-    if examination.wants("loop"):
-        yield loop(client, client.watch.status or status)
-    if examination.wants("measure"):
-        in_use = _in_use(client)
-        found = skipped("measure", _UNKNOWN)
-        yield found if in_use is None else measure(client, client.watch.status or status, in_use)
-    if examination.wants("offload"):
-        yield offload(client, client.watch.loop.matrix, examination.registered)
+def _run_active_checks(
+    client: RtcClient, examination: Examination, status: Status
+) -> Iterator[CheckResult]:
+    """Run the checks that send commands, those that move least first."""
+    yield from _run_reply_checks(client, examination, status)
+    if examination.includes("dither") or examination.includes("columns"):
+        yield from check_dither(client, status, client.observer.loop.matrix)
+    if any(examination.includes(name) for name in _MATRIX_CHECKS):
+        yield from _run_matrix_checks(client, examination)
+    if examination.includes("reconnect"):
+        yield check_reconnect(client)
+    if examination.includes("loop"):
+        yield check_loop(client, client.observer.status or status)
+    if examination.includes("measure"):
+        # Fetched again: an earlier check may have swapped in a matrix with another id.
+        in_use = _fetch_matrix(client)
+        if in_use is None:
+            yield skipped("measure", _NO_MATRIX)
+        else:
+            yield check_measure(client, client.observer.status or status, in_use)
+    if examination.includes("offload"):
+        yield check_offload(client, client.observer.loop.matrix, examination.fit_registration)
 
 
-def _asking_words(client: RtcClient, examination: Examination, status: Status) -> Iterator[Checked]:
-    if examination.wants("replies"):
-        yield replies(client, status)
-    if "signatures" in examination.only or client.connection.signs:
-        yield signatures(client, status)
+def _run_reply_checks(
+    client: RtcClient, examination: Examination, status: Status
+) -> Iterator[CheckResult]:
+    if examination.includes("replies"):
+        yield check_replies(client, status)
+    if "signatures" in examination.only or client.connection.has_secret:
+        yield check_signatures(client, status)
 
 
-def _swapping(client: RtcClient, examination: Examination) -> Iterator[Checked]:
-    """Send the matrix in use again and again; an RTC that does not answer is asked once."""
-    in_use = _in_use(client)
+def _run_matrix_checks(client: RtcClient, examination: Examination) -> Iterator[CheckResult]:
+    """Send the matrix in use again under new ids.
+
+    If the first commit fails, the other checks are skipped: each would wait for its timeout.
+    """
+    in_use = _fetch_matrix(client)
     if in_use is None:
-        yield from (skipped(name, _UNKNOWN) for name in _SWAPS)
+        yield from (skipped(name, _NO_MATRIX) for name in _MATRIX_CHECKS)
         return
-    outcome, applied = commit(client, in_use)
+    outcome, applied = check_commit(client, in_use)
     yield outcome
     if applied is None:
-        yield from (skipped(name, "commit has to succeed first") for name in _SWAPS[1:])
+        yield from (skipped(name, "commit has to succeed first") for name in _MATRIX_CHECKS[1:])
         return
-    if examination.wants("chunks"):
-        outcome, later = chunks(client, applied)
+    if examination.includes("chunks"):
+        outcome, later = check_chunks(client, applied)
         applied = later or applied
         yield outcome
-    if examination.wants("rejection"):
-        yield rejection(client, applied)
+    if examination.includes("rejection"):
+        yield check_rejection(client, applied)
 
 
-def _in_use(client: RtcClient) -> MatrixInUse | None:
+def _fetch_matrix(client: RtcClient) -> MatrixInUse | None:
     try:
-        manifest, matrix = client.connection.applied()
+        manifest, matrix = client.connection.fetch_applied()
     except (LinkError, WireError):
         return None
     return MatrixInUse(manifest=manifest, matrix=matrix)

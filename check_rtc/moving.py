@@ -1,6 +1,7 @@
-"""Checks that move the RTC's matrix, loop or link.
+"""Checks that change the RTC's matrix, loop or link.
 
-A matrix that is sent always has the numbers in use already, under a new id.
+Every matrix that is sent has the numbers of the matrix in use under a new id, so that the loop does
+not change whatever the RTC does with it.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.client import RtcClient
-from check_rtc.requirements import Checked, fine, seen, skipped, wrong
+from check_rtc.client import MAX_NOISE_RATIO, RtcClient
+from check_rtc.requirements import CheckResult, fine, seen, skipped, wrong
 from service.errors import LinkError, WireError
 from service.link.matrices import MeasuredIntake, MeasuredMatrix
 from service.wire import (
@@ -34,277 +35,296 @@ from service.wire import (
     split,
 )
 
-APPLIED_S: Final = 2.0
-"""From the commit to the acknowledgement "applied"."""
+MAX_APPLY_DELAY_S: Final = 2.0
+"""Longest time from a commit to its acknowledgement "applied" by the contract, seconds."""
 
-PATIENCE_S: Final = 6.0
-"""For an answer that comes late."""
+ACKNOWLEDGEMENT_TIMEOUT_S: Final = 6.0
+"""Time to wait for an acknowledgement, so that a late one is reported as late and not missing."""
 
-MISSING_S: Final = 2.0
-"""After which an RTC asks for the chunks that have not come."""
+CHUNK_REQUEST_DELAY_S: Final = 2.0
+"""Time after which an RTC has to query chunks that have not come, by the contract."""
 
-TOLD_S: Final = 1.5
-"""For the status to name the new matrix."""
+STATUS_TIMEOUT_S: Final = 1.5
+"""Longest time until the status names a new matrix; a status comes at least once a second."""
 
-_PARTS: Final = 4
-_LEFT_OUT: Final = 1
+_N_CHUNKS: Final = 4
+"""Number of chunks in which a matrix is sent."""
+
+_OMITTED_CHUNK: Final = 1
+"""Index of the chunk that is not sent, which the RTC must query."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatrixInUse:
-    """The matrix that an RTC uses, by its manifest and numbers."""
+    """Matrix that the RTC uses: manifest and numbers."""
 
     manifest: Manifest
     matrix: NDArray[np.float32]
 
-    def named(self, name: str) -> MatrixInUse:
-        """Return the same numbers under another id, in some parts."""
-        size = min(max(math.ceil(self.matrix.nbytes / _PARTS), 1), CHUNK_LIMIT)
+    def copy_as(self, name: str) -> MatrixInUse:
+        """Return the same numbers under the id ``name``, in several chunks."""
+        size = min(max(math.ceil(self.matrix.nbytes / _N_CHUNKS), 1), CHUNK_LIMIT)
         layout = layout_of(self.matrix, size)
         manifest = replace(self.manifest, id=name, layout=layout, parent=self.manifest.id)
         return MatrixInUse(manifest=manifest, matrix=self.matrix)
 
     @property
     def parts(self) -> list[bytes]:
-        """Its bytes as they travel."""
+        """Chunks of the matrix as they are sent."""
         return split(self.matrix, self.manifest.layout.chunk_bytes)
 
 
-def commit(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
-    """Send the matrix again, commit last; return the outcome and the matrix applied."""
-    new = before.named(client.connection.new_id("commit"))
+def check_commit(client: RtcClient, before: MatrixInUse) -> tuple[CheckResult, MatrixInUse | None]:
+    """Send the matrix again, commit last; return the result, and the new matrix if applied."""
+    new = before.copy_as(client.connection.new_id("commit"))
     name = new.manifest.id
     client.connection.offer(new.manifest, new.matrix)
     for index, part in enumerate(new.parts):
         client.connection.put_chunk(name, index, part)
     began_s = client.clock()
     client.connection.put_commit(name, encode(new.manifest))
-    answers = _answers(client, name, PATIENCE_S)
+    answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S)
     last = answers[-1][1] if answers else None
     if last is None or last.state is not AckState.APPLIED:
-        return wrong("commit", _without(client, name, answers)), None
+        return wrong("commit", _explain_outcome(client, name, answers)), None
+    # Acknowledgement, frames and status must agree on the first frame of the new matrix.
     took_s = answers[-1][0] - began_s
-    client.watch.loop.use(name, new.matrix)
-    found = f"applied {took_s:.2f} s after its commit, from frame {last.frame_seq}"
-    client.listen(TOLD_S, lambda: _status_names(client, name))
-    problems = _problems(client, new, last)
-    if took_s > APPLIED_S:
-        problems.insert(0, f"more than {APPLIED_S:g} s")
+    client.observer.loop.use(name, new.matrix)
+    found = f"applied {took_s:.2f} s after its commit, from frame {last.frame_seq} on"
+    client.listen(STATUS_TIMEOUT_S, lambda: _status_has_matrix(client, name))
+    problems = _find_contradictions(client, new, last)
+    if took_s > MAX_APPLY_DELAY_S:
+        problems.insert(0, f"more than {MAX_APPLY_DELAY_S:g} s")
     if problems:
         return wrong("commit", f"{found}: {'; '.join(problems)}"), new
-    return fine("commit", f"{found} on, as frames and status say"), new
+    return fine("commit", f"{found}; frames and status agree"), new
 
 
-def chunks(client: RtcClient, before: MatrixInUse) -> tuple[Checked, MatrixInUse | None]:
-    """Send the commit first and leave one part out: the RTC has to ask for it."""
-    new = before.named(client.connection.new_id("chunks"))
+def check_chunks(client: RtcClient, before: MatrixInUse) -> tuple[CheckResult, MatrixInUse | None]:
+    """Check that the RTC queries a chunk that does not come after its commit."""
+    new = before.copy_as(client.connection.new_id("chunks"))
     name = new.manifest.id
     client.connection.offer(new.manifest, new.matrix)
     began_s = client.clock()
     client.connection.put_commit(name, encode(new.manifest))
     for index, part in enumerate(new.parts):
-        if index != _LEFT_OUT:
+        if index != _OMITTED_CHUNK:
             client.connection.put_chunk(name, index, part)
-    wanted = f"{client.connection.keys.matrix(name)}?chunk={_LEFT_OUT}"
-    answers = _answers(client, name, PATIENCE_S)
-    asked = [at_s - began_s for at_s, key in client.watch.asked if key == wanted]
+    wanted = f"{client.connection.keys.matrix(name)}?chunk={_OMITTED_CHUNK}"
+    answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S)
+    asked = [at_s - began_s for at_s, key in client.observer.queries if key == wanted]
     if not answers or answers[-1][1].state is not AckState.APPLIED:
-        tail = _without(client, name, answers)
-        when = f"it asked for it after {asked[0]:.1f} s" if asked else "it did not ask for it"
-        return wrong("chunks", f"chunk {_LEFT_OUT} was left out: {when}; {tail}"), None
-    client.watch.loop.use(name, new.matrix)
+        tail = _explain_outcome(client, name, answers)
+        when = f"it was queried after {asked[0]:.1f} s" if asked else "it was not queried"
+        return wrong("chunks", f"chunk {_OMITTED_CHUNK} was left out: {when}; {tail}"), None
+    client.observer.loop.use(name, new.matrix)
     if not asked:
-        return wrong("chunks", f"applied though chunk {_LEFT_OUT} never came"), new
-    found = f"chunk {_LEFT_OUT}, left out, was asked for after {asked[0]:.1f} s"
-    late = asked[0] > MISSING_S + 1.0
-    return (wrong if late else fine)("chunks", f"{found}; then it was applied"), new
+        return wrong("chunks", f"applied though chunk {_OMITTED_CHUNK} never came"), new
+    found = f"chunk {_OMITTED_CHUNK} was left out and queried after {asked[0]:.1f} s"
+    late = asked[0] > CHUNK_REQUEST_DELAY_S + 1.0
+    return (wrong if late else fine)("chunks", f"{found}; then the matrix was applied"), new
 
 
-def rejection(client: RtcClient, in_use: MatrixInUse) -> Checked:
-    """Send what must be rejected, with the numbers in use."""
+def check_rejection(client: RtcClient, in_use: MatrixInUse) -> CheckResult:
+    """Check that invalid commits are rejected; their chunks have the numbers in use."""
     problems, reasons = [], []
     for what, manifest in _bad_manifests(client, in_use):
         name = manifest.id
-        known = len(client.watch.acknowledgements)
-        for index, part in enumerate(in_use.named(name).parts):
+        known = len(client.observer.acknowledgements)
+        for index, part in enumerate(in_use.copy_as(name).parts):
             client.connection.put_chunk(name, index, part)
         client.connection.put_commit(name, encode(manifest))
-        answers = _answers(client, name, PATIENCE_S, known)
+        answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S, known)
         if not answers or answers[-1][1].state is not AckState.REJECTED:
-            problems.append(f"{what}: {_without(client, name, answers)}")
+            problems.append(f"{what}: {_explain_outcome(client, name, answers)}")
         else:
             reasons.append(f"{what} ({answers[-1][1].reason:.40})")
-    problems += _repeated(client, in_use)
-    problems += _unreadable(client)
+    problems += _check_repeat(client, in_use)
+    problems += _check_unreadable_commit(client)
     if problems:
         return wrong("rejection", "; ".join(problems))
-    return fine("rejection", f"rejected: {'; '.join(reasons)}; a repeat was answered again")
+    return fine(
+        "rejection", f"rejected: {'; '.join(reasons)}; a repeated commit was acknowledged again"
+    )
 
 
 def _bad_manifests(client: RtcClient, in_use: MatrixInUse) -> list[tuple[str, Manifest]]:
     new = client.connection.new_id
     other_sum = hashlib.sha256(b"other numbers").hexdigest()
-    of_sum = in_use.named(new("sum")).manifest
-    of_basis = in_use.named(new("basis")).manifest
+    first = in_use.copy_as(new("sum")).manifest
+    second = in_use.copy_as(new("basis")).manifest
     used = in_use.manifest
     return [
-        ("a wrong sum", replace(of_sum, layout=replace(of_sum.layout, sha256=other_sum))),
-        ("another basis", replace(of_basis, basis_id="no-basis-of-this-rtc")),
+        ("a wrong checksum", replace(first, layout=replace(first.layout, sha256=other_sum))),
+        ("another basis", replace(second, basis_id="no-basis-of-this-rtc")),
         ("a used id", replace(used, layout=replace(used.layout, sha256=other_sum))),
     ]
 
 
-def _repeated(client: RtcClient, in_use: MatrixInUse) -> list[str]:
-    """Send the commit of the matrix in use again: its acknowledgement must come again."""
-    name, known = in_use.manifest.id, len(client.watch.acknowledgements)
+def _check_repeat(client: RtcClient, in_use: MatrixInUse) -> list[str]:
+    """Send the commit of the matrix in use again; return a problem if no acknowledgement comes."""
+    name, known = in_use.manifest.id, len(client.observer.acknowledgements)
     client.connection.put_commit(name, encode(in_use.manifest))
-    answers = _answers(client, name, APPLIED_S, known)
+    answers = _wait_for_acknowledgements(client, name, MAX_APPLY_DELAY_S, known)
     if answers and answers[-1][1].state is AckState.APPLIED:
         return []
-    return [f"the same commit again: {_without(client, name, answers)}"]
+    return [f"the repeated commit: {_explain_outcome(client, name, answers)}"]
 
 
-def _unreadable(client: RtcClient) -> list[str]:
-    """Send an unreadable commit: it must be rejected without id and sum."""
-    known = len(client.watch.acknowledgements)
+def _check_unreadable_commit(client: RtcClient) -> list[str]:
+    """Send bytes that are no manifest; return a problem if they are not rejected without an id."""
+    known = len(client.observer.acknowledgements)
     client.connection.put_commit(client.connection.new_id("unreadable"), b"\xc1 no manifest")
 
     def answered() -> bool:
         return any(
             acknowledgement.id is None
-            for _, acknowledgement in client.watch.acknowledgements[known:]
+            for _, acknowledgement in client.observer.acknowledgements[known:]
         )
 
-    if client.listen(APPLIED_S, answered):
+    if client.listen(MAX_APPLY_DELAY_S, answered):
         return []
-    return ["a commit that cannot be read: no acknowledgement with id nil"]
+    return ["an unreadable commit: no acknowledgement with id nil"]
 
 
-def _answers(
+def _wait_for_acknowledgements(
     client: RtcClient, name: str, patience_s: float, n_known: int = 0
 ) -> list[tuple[float, Acknowledgement]]:
-    """Return the acknowledgements of a matrix until a final one or the time is over."""
+    """Return the acknowledgements of a matrix up to a final one or the timeout."""
 
     def answers() -> list[tuple[float, Acknowledgement]]:
-        every = client.watch.acknowledgements[n_known:]
+        every = client.observer.acknowledgements[n_known:]
         return [(at_s, one) for at_s, one in every if one.id == name]
 
     client.listen(patience_s, lambda: any(one.state is not AckState.STAGED for _, one in answers()))
     return answers()
 
 
-def _without(
+def _explain_outcome(
     client: RtcClient, name: str, acknowledgements: list[tuple[float, Acknowledgement]]
 ) -> str:
-    """Return in words why a matrix was not applied, or that no answer came."""
+    """Return a text on what became of a matrix: its last acknowledgement, or that none came."""
     if acknowledgements and acknowledgements[-1][1].state is AckState.REJECTED:
         return f"rejected: {acknowledgements[-1][1].reason}"
     if acknowledgements and acknowledgements[-1][1].state is AckState.APPLIED:
         return "applied"
     words = "staged, and not applied" if acknowledgements else "no acknowledgement"
-    frames = [a.header.seq0 for a in client.watch.arrivals if a.header.cm_id == name]
-    named = f", though frames name it from {frames[0]} on" if frames else ""
-    return f"{words} within {PATIENCE_S:g} s{named}"
+    frames = [a.header.seq0 for a in client.observer.arrivals if a.header.cm_id == name]
+    in_frames = f", though frames name it from {frames[0]} on" if frames else ""
+    return f"{words} within {ACKNOWLEDGEMENT_TIMEOUT_S:g} s{in_frames}"
 
 
-def _status_names(client: RtcClient, name: str) -> bool:
-    status = client.watch.status
+def _status_has_matrix(client: RtcClient, name: str) -> bool:
+    status = client.observer.status
     return status is not None and status.cm_id == name
 
 
-def _problems(client: RtcClient, new: MatrixInUse, acknowledgement: Acknowledgement) -> list[str]:
-    """Return what contradicts the acknowledgement of a matrix that is in use."""
+def _find_contradictions(
+    client: RtcClient, new: MatrixInUse, acknowledgement: Acknowledgement
+) -> list[str]:
+    """Return contradictions between the acknowledgement of a matrix, frames and status."""
     name, problems = new.manifest.id, []
-    frames = [a.header.seq0 for a in client.watch.arrivals if a.header.cm_id == name]
+    frames = [a.header.seq0 for a in client.observer.arrivals if a.header.cm_id == name]
     if not frames:
         problems.append("no frame names it")
     elif min(frames) != acknowledgement.frame_seq:
         problems.append(f"frames name it from {min(frames)} on")
-    if not _status_names(client, name):
-        problems.append(f"the status does not within {TOLD_S:g} s")
-    status = client.watch.status
+    if not _status_has_matrix(client, name):
+        problems.append(f"the status does not name it within {STATUS_TIMEOUT_S:g} s")
+    status = client.observer.status
     if status is not None and acknowledgement.session != status.session:
         problems.append(
-            f"it is of session {acknowledgement.session}, the status of {status.session}"
+            f"its acknowledgement has session {acknowledgement.session}, the status has "
+            f"{status.session}"
         )
     if acknowledgement.sha256 != new.manifest.layout.sha256:
-        problems.append("its sum is another one")
+        problems.append("its acknowledgement has another checksum")
     return problems
 
 
-AWAY_S: Final = 1.0
-BACK_S: Final = 10.0
-"""For an RTC to come back to its router."""
+# --- link and loop
 
-CHANGED_S: Final = 5.0
-"""For frames and status to show a loop that was opened or closed."""
+ROUTER_DOWN_S: Final = 1.0
+"""Time without a router."""
 
-OPEN_S: Final = 1.0
-"""For which the loop stays open."""
+RECONNECT_TIMEOUT_S: Final = 10.0
+"""Longest time until an RTC connects to its router again."""
+
+LOOP_CHANGE_TIMEOUT_S: Final = 5.0
+"""Longest time until frames and status show that the loop was opened or closed."""
+
+OPEN_LOOP_S: Final = 1.0
+"""Time for which the loop stays open."""
 
 STROKE_M: Final = 20e-9
-"""RMS of a push or pull, metres OPD: the service's own."""
+"""RMS of a push or pull, metres OPD; the default of the service."""
 
-MEASURED_S: Final = 20.0
-_STANDING: Final = 5
-"""Batches with one and the same command: it stands."""
+MEASURE_TIMEOUT_S: Final = 20.0
+"""Longest time from the command to the measured matrix."""
 
-NOISY: Final = 0.3
-"""What other modes measure, over a mode's own, from which on it tells nothing."""
+_N_EQUAL_BATCHES: Final = 5
+"""Number of batches with the same command from which the mirror counts as still."""
 
-NEIGHBOURS: Final = 10
-"""Modes next to a measured one that tell how noisy it is."""
+N_NOISE_MODES: Final = 10
+"""Number of modes next to a measured one whose responses give the noise."""
 
-LIKELY: Final = (0.2, 3.0)
-"""What a mode measures of itself by the matrix in use: optical gain, double pass."""
+PLAUSIBLE_RESPONSE: Final = (0.2, 3.0)
+"""Range of a mode's response by the matrix in use: from a low optical gain to double pass."""
 
 
-def reconnect(client: RtcClient) -> Checked:
-    """Take the router away for a moment."""
+def check_reconnect(client: RtcClient) -> CheckResult:
+    """Check that the RTC reconnects after its router was away for a second."""
     if not client.connection.own_router:
-        return skipped("reconnect", "the router is not this program's")
-    before = client.watch.session
-    n_asked = len(client.watch.asked)
+        return skipped("reconnect", "the router is another program")
+    before = client.observer.session
+    n_asked = len(client.observer.queries)
     client.connection.close()
-    client.listen(AWAY_S)
+    client.listen(ROUTER_DOWN_S)
     opened_s = client.clock()
     client.connection.open()
-    n_known = len(client.watch.arrivals)
-    if not client.listen(BACK_S, lambda: len(client.watch.arrivals) > n_known + 2):
-        return wrong("reconnect", f"no frame came within {BACK_S:g} s after the router was back")
+    n_known = len(client.observer.arrivals)
+    if not client.listen(RECONNECT_TIMEOUT_S, lambda: len(client.observer.arrivals) > n_known + 2):
+        return wrong(
+            "reconnect", f"no frame came within {RECONNECT_TIMEOUT_S:g} s after the router was back"
+        )
     client.listen(1.0)
-    back_s = client.watch.arrivals[n_known].at_s - opened_s
+    back_s = client.observer.arrivals[n_known].at_s - opened_s
     found = f"frames again {back_s:.1f} s after the router was back"
-    sessions = {arrival.header.session for arrival in client.watch.arrivals[n_known:]}
+    sessions = {arrival.header.session for arrival in client.observer.arrivals[n_known:]}
     if sessions != {before}:
+        # A session means that the integrator started at zero. A lost link must not open the loop.
         return wrong("reconnect", f"{found}, in session {', '.join(sessions)} instead of {before}")
     current = client.connection.keys.current
-    again = any(key == current for _, key in client.watch.asked[n_asked:])
-    before_that = any(key == current for _, key in client.watch.asked[:n_asked])
+    again = any(key == current for _, key in client.observer.queries[n_asked:])
+    before_that = any(key == current for _, key in client.observer.queries[:n_asked])
     if again and before_that:
-        return seen("reconnect", f"{found}; it asked cm/current again: once a session is enough")
+        return seen("reconnect", f"{found}; it queried cm/current again: once a session is enough")
     return fine("reconnect", f"{found}, in the same session")
 
 
-def loop(client: RtcClient, status: Status) -> Checked:
-    """Open the loop, and close it again."""
+def check_loop(client: RtcClient, status: Status) -> CheckResult:
+    """Check that the loop opens with a zero integrator, and closes again."""
     if status.loop == Loop.OPEN:
         return skipped("loop", "the loop is open")
-    refused = _refusal_of(client, LoopRequest(id=client.connection.new_id("open"), loop=Loop.OPEN))
+    refused = _send_command(
+        client, LoopRequest(id=client.connection.new_id("open"), loop=Loop.OPEN)
+    )
     if refused:
-        return wrong("loop", f"it would not open: {refused}")
+        return wrong("loop", f"it did not open: {refused}")
     try:
-        opened = client.listen(CHANGED_S, lambda: _loop_is(client, Loop.OPEN))
-        during = client.watch.status
-        client.listen(OPEN_S)
-    finally:  # whoever breaks it off wants the loop as it was all the more
-        refused = _refusal_of(
+        opened = client.listen(LOOP_CHANGE_TIMEOUT_S, lambda: _loop_is(client, Loop.OPEN))
+        during = client.observer.status
+        client.listen(OPEN_LOOP_S)
+    finally:  # also if the user interrupts the check: the loop must not stay open
+        refused = _send_command(
             client, LoopRequest(id=client.connection.new_id("close"), loop=Loop.CLOSED)
         )
-    problems = _after_opening(client, status) if opened else ["no status says that it is open"]
-    closed = client.listen(CHANGED_S, lambda: not _loop_is(client, Loop.OPEN))
-    client.listen(OPEN_S)
-    after = client.watch.status
+    problems = (
+        _find_opening_problems(client, status) if opened else ["no status says that it is open"]
+    )
+    closed = client.listen(LOOP_CHANGE_TIMEOUT_S, lambda: not _loop_is(client, Loop.OPEN))
+    client.listen(OPEN_LOOP_S)
+    after = client.observer.status
     if refused or not closed or after is None or during is None:
         problems.append(f"it is not closed again: {refused or 'the status says so'}")
     else:
@@ -317,23 +337,24 @@ def loop(client: RtcClient, status: Status) -> Checked:
     return fine("loop", f"opened in session {during.session if during else ''}, closed in it again")
 
 
-def _after_opening(client: RtcClient, before: Status) -> list[str]:
+def _find_opening_problems(client: RtcClient, before: Status) -> list[str]:
     problems = []
-    now = client.watch.status
-    later = [a for a in client.watch.arrivals if a.header.session != before.session]
+    now = client.observer.status
+    later = [a for a in client.observer.arrivals if a.header.session != before.session]
     if now is not None and now.session == before.session:
         problems.append("opening began no new session")
     elif not later:
         problems.append("no frame is of the new session")
-    last_m = [arrival.largest_m for arrival in later[-_STANDING:]]
-    # what is played on the mirror moves, a mirror that lags comes to rest
-    if len(last_m) == _STANDING and last_m[0] > 0.0 and len(set(last_m)) == 1:
-        problems.append(f"a command of {1e9 * last_m[0]:.3g} nm stands: the integrator is not 0")
+    last_m = [arrival.largest_m for arrival in later[-_N_EQUAL_BATCHES:]]
+    # A constant command above 0 is an integrator that kept its value. A dither changes with each
+    # frame, and a mirror that returns slowly ends at 0.
+    if len(last_m) == _N_EQUAL_BATCHES and last_m[0] > 0.0 and len(set(last_m)) == 1:
+        problems.append(f"the command stays at {1e9 * last_m[0]:.3g} nm: the integrator is not 0")
     return problems
 
 
-def measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> Checked:
-    """Have two modes measured, and compare the result with the matrix in use."""
+def check_measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> CheckResult:
+    """Check the measurement of two modes against the matrix in use."""
     n_rows = len(in_use.matrix)
     modes = tuple(sorted({0, n_rows // 3}))
     name = client.connection.new_id("measure")
@@ -344,30 +365,34 @@ def measure(client: RtcClient, status: Status, in_use: MatrixInUse) -> Checked:
         amplitude_m=(STROKE_M,) * len(modes),
         n_average=4,
     )
-    n_known = len(client.watch.measured)
-    refused = _refusal_of(client, request)
+    n_known = len(client.observer.measured)
+    refused = _send_command(client, request)
     if refused.startswith(("unsupported", "busy", "no answer")):
-        return skipped("measure", f"it will not: {refused}")
+        return skipped("measure", f"not offered now: {refused}")
     if refused:
         return wrong("measure", refused)
-    found = _awaited(client, n_known)
+    found = _wait_for_matrix(client, n_known)
     was_open = status.loop == Loop.OPEN
-    back = client.listen(CHANGED_S, lambda: _loop_is(client, Loop.OPEN) is was_open)
-    client.listen(OPEN_S)
+    back = client.listen(LOOP_CHANGE_TIMEOUT_S, lambda: _loop_is(client, Loop.OPEN) is was_open)
+    client.listen(OPEN_LOOP_S)
     if not back:
-        return wrong("measure", "the loop is not as it was before")
-    return wrong("measure", found) if isinstance(found, str) else _measured(found, request, in_use)
+        return wrong("measure", "the loop was not restored to its state before")
+    return (
+        wrong("measure", found)
+        if isinstance(found, str)
+        else _compare_measured(found, request, in_use)
+    )
 
 
-def _awaited(client: RtcClient, n_known: int) -> MeasuredMatrix | str:
-    """Return the measured matrix, or why there is none."""
+def _wait_for_matrix(client: RtcClient, n_known: int) -> MeasuredMatrix | str:
+    """Return the measured matrix, or the reason why there is none."""
     collector, found = MeasuredIntake(client.connection.keys), list[MeasuredMatrix | str]()
-    looked_at = n_known
+    n_read = n_known
 
     def come() -> bool:
-        nonlocal looked_at
-        for item in client.watch.measured[looked_at:]:
-            looked_at += 1
+        nonlocal n_read
+        for item in client.observer.measured[n_read:]:
+            n_read += 1
             try:
                 matrix = collector.take(item.key, item.data)
             except WireError as error:
@@ -376,48 +401,53 @@ def _awaited(client: RtcClient, n_known: int) -> MeasuredMatrix | str:
                 found.extend([] if matrix is None else [matrix])
         return bool(found)
 
-    client.listen(MEASURED_S, come)
-    return found[0] if found else f"no matrix within {MEASURED_S:g} s"
+    client.listen(MEASURE_TIMEOUT_S, come)
+    return found[0] if found else f"no matrix within {MEASURE_TIMEOUT_S:g} s"
 
 
-def _measured(found: MeasuredMatrix, request: MeasureRequest, in_use: MatrixInUse) -> Checked:
+def _compare_measured(
+    found: MeasuredMatrix, request: MeasureRequest, in_use: MatrixInUse
+) -> CheckResult:
     manifest, matrix, modes = found.manifest, found.matrix, request.modes
     if matrix is None:
         return wrong("measure", f"it failed: {manifest.reason}")
     if (manifest.id, manifest.modes) != (request.id, modes):
-        return wrong("measure", f"it is called {manifest.id} and of modes {manifest.modes}")
+        return wrong("measure", f"the matrix has id {manifest.id} and modes {manifest.modes}")
     if matrix.shape[0] != in_use.matrix.shape[1]:
         return wrong(
             "measure", f"it has {matrix.shape[0]} rows for {in_use.matrix.shape[1]} slopes"
         )
+    # R D_measured: on its diagonal the optical gain if sign and unit are right, elsewhere noise.
     by_modes = in_use.matrix @ matrix
-    of_itself = np.diag(by_modes[list(modes)])
+    own_responses = np.diag(by_modes[list(modes)])
     noise = max(
-        float(np.median(np.abs(_beside(column, modes, mode))))
+        float(np.median(np.abs(_neighbouring_responses(column, modes, mode))))
         for column, mode in zip(by_modes.T, modes, strict=True)
     )
-    if noise > NOISY * np.abs(of_itself).max():
-        return skipped("measure", f"{list(matrix.shape)}; too noisy to compare: {noise:.2g}")
-    own = " and ".join(f"{share:.2f}" for share in of_itself)
-    text = f"{list(matrix.shape)}; by the matrix in use a metre of a mode measures {own}"
-    if (of_itself < LIKELY[0]).any() or (of_itself > LIKELY[1]).any():
-        return wrong("measure", f"{text}, expected {LIKELY[0]:g} to {LIKELY[1]:g}: sign or unit")
+    if noise > MAX_NOISE_RATIO * np.abs(own_responses).max():
+        return skipped("measure", f"{list(matrix.shape)}; too noisy: noise is {noise:.2g}")
+    own = " and ".join(f"{share:.2f}" for share in own_responses)
+    text = f"{list(matrix.shape)}; response of the modes by the matrix in use: {own}"
+    low, high = PLAUSIBLE_RESPONSE
+    if (own_responses < low).any() or (own_responses > high).any():
+        return wrong("measure", f"{text}, expected {low:g} to {high:g}: sign or unit")
     return fine("measure", text)
 
 
-def _beside(
+def _neighbouring_responses(
     column: NDArray[np.floating], measured: Sequence[int], mode: int
 ) -> NDArray[np.floating]:
-    """Return what a measured column has of the modes next to its own: all noise.
+    """Return the responses of modes next to the measured one, which are noise.
 
-    Modes far off have another noise: a sensor's own, or turbulence, has most of the lowest.
+    Modes further away have another noise level, because turbulence and the noise of a sensor are
+    strongest in the lowest modes.
     """
     others = np.setdiff1d(np.arange(len(column)), measured)
-    return column[others[np.argsort(np.abs(others - mode), kind="stable")[:NEIGHBOURS]]]
+    return column[others[np.argsort(np.abs(others - mode), kind="stable")[:N_NOISE_MODES]]]
 
 
-def _refusal_of(client: RtcClient, command: Command) -> str:
-    """Send a command; return why it was not accepted, empty: it was."""
+def _send_command(client: RtcClient, command: Command) -> str:
+    """Send a command; return the reason of its refusal, empty if it was accepted."""
     try:
         reply = client.connection.command(command)
     except LinkError as error:
@@ -426,5 +456,5 @@ def _refusal_of(client: RtcClient, command: Command) -> str:
 
 
 def _loop_is(client: RtcClient, wanted: Loop) -> bool:
-    status = client.watch.status
+    status = client.observer.status
     return status is not None and status.loop == wanted

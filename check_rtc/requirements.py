@@ -1,4 +1,8 @@
-"""The table of requirements: what the contract says, where, what a check moves."""
+"""Requirements of the contract that are checked, and the results of checks.
+
+:data:`REQUIREMENTS` names each requirement, its section in docs/rtc.md, and the part of the
+telescope that its check moves.
+"""
 
 from __future__ import annotations
 
@@ -12,108 +16,107 @@ class Outcome(StrEnum):
     """Outcome of one check."""
 
     OK = "ok"
-    """As the contract says."""
+    """The requirement is met."""
 
     WRONG = "WRONG"
-    """Otherwise than the contract says."""
+    """The contract is broken."""
 
     SEEN = "seen"
-    """Allowed, and still worth a look."""
+    """Allowed by the contract, but unusual."""
 
     SKIPPED = "skipped"
-    """Not looked at; the text says why."""
+    """Not checked; the text gives the reason."""
 
 
 class Moves(StrEnum):
-    """The part of the telescope that a check moves."""
+    """Part of the telescope that a check moves."""
 
     NOTHING = "nothing"
-    """It listens, and reads the matrix in use."""
+    """The check listens, and reads the matrix in use."""
 
     WORDS = "words"
-    """It asks what must be refused, and moves nothing."""
+    """The check sends commands that must be refused, and moves nothing."""
 
     MATRIX = "matrix"
-    """It sends the matrix in use again, under new ids: other names for the same numbers."""
+    """The check sends the numbers of the matrix in use again under new ids."""
 
     MIRROR = "mirror"
-    """It plays a small dither."""
+    """The check plays a small dither."""
 
     LOOP = "loop"
-    """It opens the loop for some seconds, and closes it again."""
+    """The check opens the loop for some seconds and closes it again."""
 
     IMAGE = "image"
-    """It has the mirror's image moved on the sensor, and back."""
+    """The check moves the mirror's image on the sensor, and back."""
 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One requirement of the contract."""
+    """Requirement of the contract."""
 
     says: str
-    """In a line."""
+    """Text of the requirement, one line."""
 
     anchor: str
-    """Of the section of docs/rtc.md."""
+    """Anchor of its section in docs/rtc.md."""
 
     moves: Moves = Moves.NOTHING
 
 
 REQUIREMENTS: Final[dict[str, Requirement]] = {
-    "connection": Requirement("the token alive/rtc is there, and stays", "connection"),
-    "messages": Requirement("every message is as its table says", "messages"),
+    "connection": Requirement("the token alive/rtc is declared and stays", "connection"),
+    "messages": Requirement("every message agrees with its table", "messages"),
     "frames": Requirement(
-        "frames come at the rate that status and dt_ns say, 10 to 100 messages a second", "frames"
+        "frames come at the rate that status and dt_ns report, 10 to 100 messages a second",
+        "frames",
     ),
-    "sizes": Requirement(
-        "slopes and modes of a frame are those of the status, and stay so", "frames"
-    ),
-    "numbers": Requirement("every number is finite, and slopes are new ones", "frames"),
+    "sizes": Requirement("the sizes of frames are those of the status and constant", "frames"),
+    "numbers": Requirement("all numbers are finite, and slopes change with each frame", "frames"),
     "sequence": Requirement(
-        "each frame comes once, none is lost, seq0 never goes back", "sessions-sequence-time"
+        "each frame comes once, none is lost, seq0 never decreases", "sessions-sequence-time"
     ),
-    "clock": Requirement("t0_ns goes on by dt_ns a frame", "sessions-sequence-time"),
-    "delivery": Requirement("a batch is sent when its last frame is there", "timing"),
+    "clock": Requirement("t0_ns increases by dt_ns per frame", "sessions-sequence-time"),
+    "delivery": Requirement("a batch is sent as soon as its last frame is complete", "timing"),
     "session": Requirement(
-        "one session, until the RTC or its integrator starts over", "sessions-sequence-time"
+        "one session, until the RTC restarts or resets its integrator", "sessions-sequence-time"
     ),
-    "status": Requirement("a status 1 to 10 times a second, that agrees with the frames", "status"),
+    "status": Requirement("a status 1 to 10 times a second that agrees with the frames", "status"),
     "images": Requirement(
-        "the pupil images in the flux of the status lie where the instrument file has them",
-        "status",
+        "the pupil images in the flux of the status are where the instrument file says", "status"
     ),
     "ids": Requirement(
         "one basis and one configuration, in frames, status and manifest",
         "slopes-commands-orientation",
     ),
     "matrix": Requirement(
-        "rtc/cm/applied answers with manifest and parts of the matrix in use", "reconstructors"
+        "rtc/cm/applied answers with manifest and chunks of the matrix in use", "reconstructors"
     ),
-    "law": Requirement("leak, gain and delay of the frames are those of the status", "the-loop"),
-    "obedience": Requirement("every mode does what the loop asks of it", "the-loop"),
+    "law": Requirement("leak, gain and delay in the frames are those of the status", "the-loop"),
+    "obedience": Requirement("every mode follows the commands of the loop", "the-loop"),
     "orientation": Requirement(
         "sign, order, axes and unit are those of the instrument file", "slopes-commands-orientation"
     ),
     "late-join": Requirement(
-        "cm/current is asked once a session, when alive/service appears", "reconstructors"
+        "cm/current is queried once a session, when alive/service appears", "reconstructors"
     ),
     "replies": Requirement(
-        "a reply within 1 s to everything, refusals with their word, once for each id",
+        "every command has a reply within 1 s, refusals begin with their code, and a repeated id "
+        "has the same reply",
         "commands",
         Moves.WORDS,
     ),
     "signatures": Requirement(
-        "with a shared secret, what is not signed, changed or sent before is refused",
+        "with a shared secret, unsigned, modified and replayed commands are refused",
         "signatures",
         Moves.WORDS,
     ),
     "dither": Requirement(
-        "a dither begins at start_seq as asked for, is in the status, and stops on request",
+        "a dither begins at start_seq as requested, is in the status, and stops on request",
         "dither",
         Moves.MIRROR,
     ),
     "columns": Requirement(
-        "row k holds the slopes and the command of one exposure, of the matrix's sign",
+        "row k has slopes and command of the same exposure, with the sign of the matrix",
         "frames",
         Moves.MIRROR,
     ),
@@ -123,59 +126,60 @@ REQUIREMENTS: Final[dict[str, Requirement]] = {
         Moves.MATRIX,
     ),
     "chunks": Requirement(
-        "a commit may overtake its chunks; what is missing after 2 s is asked for",
+        "a commit may come before its chunks; chunks that are missing after 2 s are queried",
         "reconstructors",
         Moves.MATRIX,
     ),
     "rejection": Requirement(
-        "a wrong sum, basis or manifest and a used id are rejected, a repeat answered again",
+        "a wrong checksum, basis or manifest and a used id are rejected, and a repeated commit is "
+        "acknowledged again",
         "reconstructors",
         Moves.MATRIX,
     ),
     "reconnect": Requirement(
-        "the RTC comes back after the router was away, in the same session",
+        "the RTC reconnects after the router was away, in the same session",
         "connection",
         Moves.WORDS,
     ),
     "loop": Requirement(
-        "opening zeroes the integrator in a new session; closing goes on in it; the matrix "
-        "survives",
+        "opening the loop begins a session with a zero integrator; closing continues it; the "
+        "matrix stays in use",
         "loop",
         Moves.LOOP,
     ),
     "measure": Requirement(
-        "a measured matrix comes in slope per metre; the loop is closed again",
+        "a measured matrix is in slope per metre, and the loop is closed again",
         "measure",
         Moves.LOOP,
     ),
     "offload": Requirement(
-        "a demand moves the image as asked for, once, and stands still from start_seq on",
+        "a demand moves the image as requested, once, and it is still from start_seq on",
         "offload",
         Moves.IMAGE,
     ),
 }
-"""By name, in the order in which they are told."""
+"""Requirements by the name of their check, in the order of the report."""
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """One check that was made."""
+class CheckResult:
+    """Result of one check."""
 
     outcome: Outcome
     name: str
-    """Of its article."""
+    """Name of the check in :data:`REQUIREMENTS`."""
 
     found: str
-    """Or why it was not made."""
+    """Finding, or the reason for which the check was skipped."""
 
     @property
     def requirement(self) -> Requirement:
-        """The requirement that was checked."""
+        """Requirement that was checked."""
         return REQUIREMENTS[self.name]
 
 
-fine = partial(Checked, Outcome.OK)
-wrong = partial(Checked, Outcome.WRONG)
-seen = partial(Checked, Outcome.SEEN)
-skipped = partial(Checked, Outcome.SKIPPED)
-"""A check by its name, and what was found."""
+fine = partial(CheckResult, Outcome.OK)
+wrong = partial(CheckResult, Outcome.WRONG)
+seen = partial(CheckResult, Outcome.SEEN)
+skipped = partial(CheckResult, Outcome.SKIPPED)
+"""Constructors of results from the name of a check and its finding."""

@@ -1,4 +1,7 @@
-"""Checks that need telemetry alone, one function each."""
+"""Checks that need nothing but the RTC's telemetry, one function each.
+
+Each function takes the observer of the telemetry and its context, and returns one result.
+"""
 
 from __future__ import annotations
 
@@ -12,78 +15,88 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from check_rtc.requirements import Checked, fine, seen, skipped, wrong
-from check_rtc.watch import Arrival, TelemetryObserver, in_order, of_session
+from check_rtc.requirements import CheckResult, fine, seen, skipped, wrong
+from check_rtc.watch import Arrival, TelemetryObserver, select_session, sort_by_frame
 from service.estimation.orientation import setting_written
 from service.estimation.slope_convention import SlopeConvention
 from service.runtime.readiness import MAX_STATUSES_HZ
 from service.wire import Keys, Manifest, Status
 
-SLOWEST, FASTEST = 0.8, 1.1
-"""Frames a second by the clock here, over those stated: a simulated RTC may be slower."""
+MIN_RATE_RATIO, MAX_RATE_RATIO = 0.8, 1.1
+"""Range of the measured over the nominal frame rate; a simulated RTC may run slower."""
 
-MESSAGES_HZ: Final = (8.0, 120.0)
-STATUSES_HZ: Final = (0.8, 12.0)
+MESSAGE_RATE_RANGE_HZ: Final = (8.0, 120.0)
+"""Usual range of batches per second; the contract says 10 to 100."""
 
-LATE_S: Final = 0.25
-"""A batch that comes so much later than the one before lets expect is worth a look."""
+STATUS_RATE_RANGE_HZ: Final = (0.8, 12.0)
+"""Usual range of statuses per second; the contract says 1 to 10."""
 
-TOO_LATE_S: Final = 0.5
-"""The service holds frames back for no longer."""
+NOTABLE_DELAY_S: Final = 0.25
+"""Delay of a batch against the one before from which it is reported."""
 
-FAR_NS: Final = 86_400 * 10**9
-"""Between the RTC's clock and the one here."""
+MAX_DELAY_S: Final = 0.5
+"""Largest delay of a batch; the service does not wait longer for missing frames."""
+
+MAX_CLOCK_OFFSET_NS: Final = 86_400 * 10**9
+"""Largest usual difference between the RTC's clock and this one."""
 
 
 NOTABLE_PX: Final = 0.03
-"""RMS displacement of pupil images that an instrument file should state: 0.05 pixel left out of the
-model moves a fitted shift by 0.016 subaperture."""
+"""RMS offset of pupil images from which the instrument file should give it, in pixels.
 
-SURE_SIGMA: Final = 3.0
+An offset of 0.05 pixel that the model does not have moves a fitted shift by 0.016 subaperture.
+"""
+
+DETECTION_SIGMA: Final = 3.0
+"""Number of σ from which an offset counts as detected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ImagePlaces:
-    """Where the pupil images lie on the detector, beside their places on the pixel grid."""
+class ImageOffsets:
+    """Offsets of the pupil images on the detector from their places on the pixel grid."""
 
-    found_px: NDArray[np.float64]
-    """``(4, 2)`` displacement x, y of the images at -x -y, +x -y, -x +y, +x +y, detector pixels in
-    the RTC's axes; their mean is 0."""
+    measured_px: NDArray[np.float64]
+    """``(4, 2)`` offsets x, y of the images at -x -y, +x -y, -x +y, +x +y, detector pixels in the
+    RTC's axes; their mean is 0."""
 
     sigma_px: NDArray[np.float64]
-    """``(4, 2)`` 1 σ of each."""
+    """``(4, 2)`` 1 σ of ``measured_px``, detector pixels."""
 
-    stated_px: NDArray[np.float64] | None
-    """``(4, 2)`` those of the instrument file, less their mean; None if it states none."""
+    nominal_px: NDArray[np.float64] | None
+    """``(4, 2)`` offsets in the instrument file, less their mean; None if it has none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class About:
-    """Context of the telemetry: instrument, matrix, duration."""
+class TelemetryContext:
+    """Context in which telemetry is judged: instrument, matrix in use, duration."""
 
     keys: Keys
     began_s: float
-    """When listening began, on the clock of what was heard."""
+    """Start of listening on a monotonic clock, seconds."""
 
     ended_s: float
+    """End of listening on the same clock, seconds."""
+
     applied: Manifest | None = None
-    """Of the matrix in use; None: it is not to be had."""
+    """Manifest of the matrix in use; None if the RTC does not give it."""
 
-    not_applied: str = ""
-    """Why not; empty: it is."""
+    applied_error: str = ""
+    """Reason for which there is no matrix in use; empty if there is one."""
 
-    offered: bool = True
-    """Whether anybody answers for it at all."""
+    is_served: bool = True
+    """False if nothing answers on the key of the matrix in use, which is optional."""
 
     basis_id: str | None = None
+    """Id of the modal basis in the instrument file; None if any is accepted."""
+
     config_id: str | None = None
-    """As the instrument file pins them; None: any."""
+    """Id of the sensor configuration in the instrument file; None if any is accepted."""
 
-    dialect: SlopeConvention | str = ""
-    """What the matrix says of signs and axes, or why nobody looked."""
+    slope_convention: SlopeConvention | str = ""
+    """Signs and axes by the matrix in use, or the reason why they are unknown."""
 
-    images: ImagePlaces | str = ""
-    """Where the pupil images lie by the flux of the status, or why that is not known."""
+    images: ImageOffsets | str = ""
+    """Offsets of the pupil images in the flux of the status, or the reason why they are unknown."""
 
     @property
     def span_s(self) -> float:
@@ -91,37 +104,39 @@ class About:
         return self.ended_s - self.began_s
 
 
-def find_all(observer: TelemetryObserver, about: About) -> Iterator[Checked]:
-    """Yield the finding of every check in the telemetry."""
-    for look in _LOOKS:
-        yield look(observer, about)
+def run_telemetry_checks(
+    observer: TelemetryObserver, context: TelemetryContext
+) -> Iterator[CheckResult]:
+    """Yield the result of every check of the telemetry."""
+    for check in _CHECKS:
+        yield check(observer, context)
 
 
-def _connection(observer: TelemetryObserver, _: About) -> Checked:
+def _connection(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
     came = [at_s for at_s, alive in observer.tokens if alive]
     gone = [at_s for at_s, alive in observer.tokens if not alive]
     if not came:
-        return wrong("connection", "there is no token alive/rtc, though telemetry comes")
+        return wrong("connection", "telemetry comes, but the token alive/rtc is not declared")
     if not gone:
-        return fine("connection", "the token is there")
+        return fine("connection", "the token is declared")
     if observer.tokens[-1][1]:
         away_s = came[-1] - gone[-1]
-        return seen("connection", f"the token was gone for {away_s:.1f} s, and came back")
-    return wrong("connection", "the token has gone")
+        return seen("connection", f"the token was away for {away_s:.1f} s and came back")
+    return wrong("connection", "the token has disappeared")
 
 
-def _messages(observer: TelemetryObserver, _: About) -> Checked:
+def _messages(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
     counts = Counter(refused.topic for refused in observer.refused)
     if not counts:
         n = len(observer.arrivals) + len(observer.statuses) + len(observer.acknowledgements)
-        return fine("messages", f"{n} messages, each as its table says")
+        return fine("messages", f"{n} messages agree with their tables")
     which = ", ".join(f"{n} {topic}" for topic, n in counts.items())
     texts = dict.fromkeys(refused.text for refused in observer.refused)
-    return wrong("messages", f"{which} cannot be read: {'; '.join(list(texts)[:3])}")
+    return wrong("messages", f"unreadable: {which}: {'; '.join(list(texts)[:3])}")
 
 
-def _frames(observer: TelemetryObserver, _: About) -> Checked:
-    arrivals = of_session(observer.arrivals, _chief_session(observer))
+def _frames(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
+    arrivals = select_session(observer.arrivals, _main_session(observer))
     if len(arrivals) < 3:
         return wrong("frames", f"{len(arrivals)} messages of frames have come")
     first, last = arrivals[0], arrivals[-1]
@@ -131,26 +146,27 @@ def _frames(observer: TelemetryObserver, _: About) -> Checked:
     nominal_hz = 1e9 / last.header.dt_ns
     found = (
         f"{rate_hz:.0f} frames a second in {messages_hz:.0f} messages of up to "
-        f"{max(a.header.n for a in arrivals)}; dt_ns says {nominal_hz:.4g} Hz"
+        f"{max(a.header.n for a in arrivals)}; {nominal_hz:.4g} Hz by dt_ns"
     )
     status = observer.status
     if status is not None and abs(status.frame_rate_hz / nominal_hz - 1.0) > 1e-3:
-        return wrong("frames", f"{found}, the status {status.frame_rate_hz:.6g} Hz")
-    if rate_hz > FASTEST * nominal_hz:
+        return wrong("frames", f"{found}, {status.frame_rate_hz:.6g} Hz by the status")
+    if rate_hz > MAX_RATE_RATIO * nominal_hz:
         return wrong("frames", found)
-    if rate_hz < SLOWEST * nominal_hz:
-        return seen("frames", f"{found}: it runs slower than it says")
-    if not MESSAGES_HZ[0] <= messages_hz <= MESSAGES_HZ[1]:
+    if rate_hz < MIN_RATE_RATIO * nominal_hz:
+        return seen("frames", f"{found}: slower than nominal")
+    if not MESSAGE_RATE_RANGE_HZ[0] <= messages_hz <= MESSAGE_RATE_RANGE_HZ[1]:
         return seen("frames", found)
     if not last.recoverable:
-        return seen("frames", f"{found}; a plain publisher: what is lost stays lost")
+        return seen("frames", f"{found}; a plain publisher: lost frames cannot be recovered")
     return fine("frames", found)
 
 
 def _rate_hz(arrivals: list[Arrival]) -> float:
-    """Return frames a second: the median of some spans, for a loop may stand still in one.
+    """Return the frame rate by the times of arrival: the median of several spans.
 
-    What had waited for somebody to listen comes in a burst at first.
+    The median ignores a span in which the loop paused. The first quarter is left out, because
+    frames from the publisher's cache come in a burst.
     """
     later = arrivals[len(arrivals) // 4 :]
     n = max(len(later) // 3, 2)
@@ -162,7 +178,7 @@ def _rate_hz(arrivals: list[Arrival]) -> float:
     return float(np.median(rates_hz))
 
 
-def _sizes(observer: TelemetryObserver, _: About) -> Checked:
+def _sizes(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
     sizes = Counter((a.header.n_slopes, a.header.n_modes) for a in observer.arrivals)
     status = observer.status
     words = " and ".join(f"{slopes} slopes, {modes} modes" for slopes, modes in sizes)
@@ -171,28 +187,26 @@ def _sizes(observer: TelemetryObserver, _: About) -> Checked:
             "sizes", f"{words}; the status says {status.n_slopes} slopes, {status.n_modes} modes"
         )
     if len(sizes) > 1:
-        return wrong("sizes", f"{words} in turn")
+        return wrong("sizes", f"the sizes alternate: {words}")
     return fine("sizes", words) if sizes else skipped("sizes", "no frame has come")
 
 
-def _numbers(observer: TelemetryObserver, _: About) -> Checked:
+def _numbers(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
     problems = []
     if observer.n_nonfinite:
         problems.append(f"{observer.n_nonfinite} frames with numbers that are not finite")
     if observer.n_frozen:
-        problems.append(
-            f"{observer.n_frozen} frames whose slopes repeat those before to the last bit"
-        )
+        problems.append(f"{observer.n_frozen} frames with exactly the slopes of the frame before")
     if problems:
         return wrong("numbers", "; ".join(problems))
     return fine("numbers", f"all of {sum(a.header.n for a in observer.arrivals)} frames")
 
 
-def _sequence(observer: TelemetryObserver, _: About) -> Checked:
-    counts, over = Counter[str](), ""
+def _sequence(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
+    counts, restart = Counter[str](), ""
     for session in observer.sessions():
-        arrivals = of_session(observer.arrivals, session)
-        over = over or _started_over(arrivals)
+        arrivals = select_session(observer.arrivals, session)
+        restart = restart or _find_restart(arrivals)
         head, known = arrivals[0].header.seq0, set[int]()
         for arrival in arrivals:
             seq0 = arrival.header.seq0
@@ -202,20 +216,23 @@ def _sequence(observer: TelemetryObserver, _: About) -> Checked:
                 counts["overtaken"] += 1
             known.add(seq0)
             head = max(head, arrival.stop_seq)
-        for before, after in pairwise(in_order(arrivals)):
+        for before, after in pairwise(sort_by_frame(arrivals)):
             counts["frames are missing"] += max(after.header.seq0 - before.stop_seq, 0)
     overtaken = counts.pop("overtaken", 0)
-    problems = [f"{n} {what}" for what, n in counts.items() if n] + ([over] if over else [])
+    problems = [f"{n} {what}" for what, n in counts.items() if n] + ([restart] if restart else [])
     if problems:
         return wrong("sequence", "; ".join(problems))
     if overtaken:
-        text = f"none is missing; {overtaken} messages were overtaken on their way"
+        text = f"none is missing; {overtaken} messages came out of order"
         return seen("sequence", text)
     return fine("sequence", "each frame once, none missing")
 
 
-def _started_over(arrivals: list[Arrival]) -> str:
-    """Return where the sequence went back; empty: nowhere."""
+def _find_restart(arrivals: list[Arrival]) -> str:
+    """Return a text on where the sequence numbers start over; empty if they do not.
+
+    A batch that was overtaken on the network also has a lower number, but an older timestamp.
+    """
     head, newest_ns, known = 0, 0, set[int]()
     for arrival in arrivals:
         header = arrival.header
@@ -227,10 +244,14 @@ def _started_over(arrivals: list[Arrival]) -> str:
     return ""
 
 
-def _steps(observer: TelemetryObserver) -> Iterator[tuple[Arrival, Arrival, float, float]]:
-    """Yield neighbours, by how much the clock steps in between, and the time they waited, s."""
+def _clock_steps(observer: TelemetryObserver) -> Iterator[tuple[Arrival, Arrival, float, float]]:
+    """Yield neighbouring batches, the step of the RTC's clock between them, and their delay.
+
+    The step is against a constant frame period, the delay against the same by arrival, both in
+    seconds.
+    """
     for session in observer.sessions():
-        for before, after in pairwise(in_order(of_session(observer.arrivals, session))):
+        for before, after in pairwise(sort_by_frame(select_session(observer.arrivals, session))):
             dt_ns = before.header.dt_ns
             n_frames = after.header.seq0 - before.header.seq0
             step_ns = after.header.t0_ns - before.header.t0_ns - n_frames * dt_ns
@@ -238,48 +259,50 @@ def _steps(observer: TelemetryObserver) -> Iterator[tuple[Arrival, Arrival, floa
             yield before, after, step_ns * 1e-9, since_s
 
 
-def _clock(observer: TelemetryObserver, _: About) -> Checked:
+def _clock(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
     pauses: list[tuple[float, int]] = []
     steps: list[tuple[float, int]] = []
-    for before, after, step_s, since_s in _steps(observer):
+    for before, after, step_s, since_s in _clock_steps(observer):
         if abs(step_s) <= before.header.dt_ns * 0.5e-9:
             continue
-        waited = step_s > 0.0 and abs(since_s - step_s) < max(0.3 * step_s, 0.1)
-        (pauses if waited else steps).append((step_s, after.header.seq0))
+        # In a pause of the loop both clocks advance by the same time; a step of the RTC's clock
+        # does not delay the arrival.
+        is_pause = step_s > 0.0 and abs(since_s - step_s) < max(0.3 * step_s, 0.1)
+        (pauses if is_pause else steps).append((step_s, after.header.seq0))
     if steps:
         step_s, seq = steps[0]
         return wrong(
-            "clock", f"{len(steps)} steps, the first by {step_s:+.4g} s at frame {seq}, no pause"
+            "clock", f"{len(steps)} steps without a pause, the first {step_s:+.4g} s at frame {seq}"
         )
     if pauses:
         step_s, seq = pauses[0]
-        return seen("clock", f"the loop stood still for {step_s:.2f} s before frame {seq}")
+        return seen("clock", f"the loop paused for {step_s:.2f} s before frame {seq}")
     if not observer.arrivals:
         return skipped("clock", "no frame has come")
     away_ns = observer.arrivals[-1].header.t0_ns - time.time_ns()
-    if abs(away_ns) > FAR_NS:
-        return seen("clock", f"it is {away_ns * 1e-9:+.3g} s from the clock here")
-    return fine("clock", f"it goes on evenly, {away_ns * 1e-9:+.2g} s from the clock here")
+    if abs(away_ns) > MAX_CLOCK_OFFSET_NS:
+        return seen("clock", f"{away_ns * 1e-9:+.3g} s from the clock of this machine")
+    return fine("clock", f"even, and {away_ns * 1e-9:+.2g} s from the clock of this machine")
 
 
-def _delivery(observer: TelemetryObserver, _: About) -> Checked:
-    """Judge by neighbours in the order of arrival: how late one is against the one before."""
+def _delivery(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
+    """Check the largest delay of a batch against the one that came before it."""
     late, where = 0.0, 0
     for session in observer.sessions():
-        for before, after in pairwise(of_session(observer.arrivals, session)):
+        for before, after in pairwise(select_session(observer.arrivals, session)):
             dt_s = before.header.dt_ns * 1e-9
             by_seq = (after.stop_seq - before.stop_seq) * dt_s
             by_clock = (after.header.t0_ns - before.header.t0_ns) * 1e-9
             excess = after.at_s - before.at_s - max(by_seq, by_clock, 0.0)
             if excess > late:
                 late, where = excess, after.header.seq0
-    found = f"at most {1e3 * late:.0f} ms later than the one before lets expect, frame {where}"
-    if late > TOO_LATE_S:
+    found = f"at most {1e3 * late:.0f} ms late against the batch before, at frame {where}"
+    if late > MAX_DELAY_S:
         return wrong("delivery", found)
-    return (seen if late > LATE_S else fine)("delivery", found)
+    return (seen if late > NOTABLE_DELAY_S else fine)("delivery", found)
 
 
-def _session(observer: TelemetryObserver, _: About) -> Checked:
+def _session(observer: TelemetryObserver, _: TelemetryContext) -> CheckResult:
     runs = [observer.arrivals[0].header.session] if observer.arrivals else []
     for before, after in pairwise(observer.arrivals):
         if after.header.session != before.header.session:
@@ -287,20 +310,20 @@ def _session(observer: TelemetryObserver, _: About) -> Checked:
     if not runs:
         return skipped("session", "no frame has come")
     names = list(dict.fromkeys(runs))
-    # stragglers of the session before may still come
+    # A change of session has one more run of the same session if a late message follows.
     if len(runs) > len(names) + 1:
         return wrong(
-            "session", f"{len(names)} sessions speak in turn ({', '.join(names[:3])}): two RTCs"
+            "session", f"{len(names)} sessions alternate ({', '.join(names[:3])}): two RTCs"
         )
     if len(names) > 1:
-        return seen("session", f"{names[1]} began where {names[0]} ended: loop or RTC began anew")
+        return seen("session", f"{names[1]} follows {names[0]}: the loop or the RTC was restarted")
     return fine("session", f"{names[0]} throughout")
 
 
-def _status(observer: TelemetryObserver, about: About) -> Checked:
+def _status(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
     status = observer.status
     if status is None:
-        return wrong("status", f"none has come in {about.span_s:.0f} s")
+        return wrong("status", f"none came in {context.span_s:.0f} s")
     times_s = [at_s for at_s, _ in observer.statuses]
     rate_hz = (len(times_s) - 1) / max(times_s[-1] - times_s[0], 1.0)
     found = (
@@ -308,59 +331,60 @@ def _status(observer: TelemetryObserver, about: About) -> Checked:
         f"modes, "
         f"matrix {status.cm_id}"
     )
-    disagrees = _disagreement(observer, status)
-    if disagrees:
-        return wrong("status", f"{found}; {disagrees}")
-    if rate_hz > MAX_STATUSES_HZ or rate_hz < STATUSES_HZ[0]:
+    disagreement = _find_disagreement(observer, status)
+    if disagreement:
+        return wrong("status", f"{found}; {disagreement}")
+    if rate_hz > MAX_STATUSES_HZ or rate_hz < STATUS_RATE_RANGE_HZ[0]:
         return wrong("status", found)
-    if rate_hz > STATUSES_HZ[1] or not status.in_loop or status.cm_id is None:
+    if rate_hz > STATUS_RATE_RANGE_HZ[1] or not status.in_loop or status.cm_id is None:
         return seen("status", found)
     return fine("status", found)
 
 
-def _disagreement(observer: TelemetryObserver, status: Status) -> str:
-    """Return how the last status contradicts the frames, or itself; empty: it does not."""
+def _find_disagreement(observer: TelemetryObserver, status: Status) -> str:
+    """Return a contradiction of the last status with itself or the frames; empty if none."""
     if status.loop == "closed" and not all(status.gains[: status.n_controlled]):
-        return "it says a closed loop, and gains of 0 for modes that are controlled: partial"
+        return "loop is closed, but some controlled modes have a gain of 0: it should be partial"
     if status.loop != "open" and any(status.gains[status.n_controlled :]):
-        return "it has gains for modes that are not controlled"
+        return "some uncontrolled modes have a gain"
     at_s = observer.statuses[-1][0]
-    of_it = [a for a in of_session(observer.arrivals, status.session) if a.at_s <= at_s]
-    if not of_it:
-        return f"no frame is of its session {status.session}" if observer.arrivals else ""
-    latest = max(arrival.stop_seq for arrival in of_it) - 1
-    reach = 2.0 * status.frame_rate_hz
-    if status.seq is None or abs(status.seq - latest) > reach:
+    earlier = [a for a in select_session(observer.arrivals, status.session) if a.at_s <= at_s]
+    if not earlier:
+        return f"no frame has its session {status.session}" if observer.arrivals else ""
+    latest = max(arrival.stop_seq for arrival in earlier) - 1
+    tolerance = 2.0 * status.frame_rate_hz  # two seconds of frames, as a status comes each second
+    if status.seq is None or abs(status.seq - latest) > tolerance:
         return f"it has seq {status.seq}, the frames are at {latest}"
-    if status.cm_id is not None and status.cm_id not in {a.header.cm_id for a in of_it[-20:]}:
-        return f"the frames name matrix {of_it[-1].header.cm_id}"
+    # A swap may have come between the status and the frames next to it.
+    if status.cm_id is not None and status.cm_id not in {a.header.cm_id for a in earlier[-20:]}:
+        return f"the frames name matrix {earlier[-1].header.cm_id}"
     return ""
 
 
-def _images(_: TelemetryObserver, about: About) -> Checked:
-    places = about.images
-    if isinstance(places, str):
-        return skipped("images", places)
-    stated = np.zeros((4, 2)) if places.stated_px is None else places.stated_px
-    beside = places.found_px - stated
-    rms_px, sigma_px = (float(np.sqrt(np.mean(part**2))) for part in (beside, places.sigma_px))
-    where = "the pixel grid" if places.stated_px is None else "wfs.image_offsets_px"
-    found = f"they lie {rms_px:.3f} pixel RMS beside {where}, 1 sigma {sigma_px:.3f}"
-    if rms_px < max(NOTABLE_PX, SURE_SIGMA * sigma_px):
+def _images(_: TelemetryObserver, context: TelemetryContext) -> CheckResult:
+    images = context.images
+    if isinstance(images, str):
+        return skipped("images", images)
+    nominal = np.zeros((4, 2)) if images.nominal_px is None else images.nominal_px
+    error_px = images.measured_px - nominal
+    rms_px, sigma_px = (float(np.sqrt(np.mean(part**2))) for part in (error_px, images.sigma_px))
+    reference = "the pixel grid" if images.nominal_px is None else "wfs.image_offsets_px"
+    found = f"{rms_px:.3f} pixel RMS from {reference}, 1 sigma {sigma_px:.3f}"
+    if rms_px < max(NOTABLE_PX, DETECTION_SIGMA * sigma_px):
         return fine("images", found)
-    offsets = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in places.found_px)
-    return seen("images", f"{found}: the instrument file may say image_offsets_px = [{offsets}]")
+    offsets = ", ".join(f"[{x:.3f}, {y:.3f}]" for x, y in images.measured_px)
+    return seen("images", f"{found}: set image_offsets_px = [{offsets}] in the instrument file")
 
 
-def _ids(observer: TelemetryObserver, about: About) -> Checked:
+def _ids(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
     found = dict.fromkeys((a.header.basis_id, a.header.config_id) for a in observer.arrivals)
     found |= dict.fromkeys((s.basis_id, s.config_id) for _, s in observer.statuses)
-    if about.applied is not None:
-        found |= {(about.applied.basis_id, about.applied.config_id): None}
+    if context.applied is not None:
+        found |= {(context.applied.basis_id, context.applied.config_id): None}
     words = "; then ".join(f"basis {basis}, configuration {config}" for basis, config in found)
     if len(found) > 1:
         return wrong("ids", words)
-    pinned = about.basis_id, about.config_id
+    pinned = context.basis_id, context.config_id
     for pair in found:
         for name, expected in zip(pair, pinned, strict=True):
             if expected not in {None, name}:
@@ -368,98 +392,104 @@ def _ids(observer: TelemetryObserver, about: About) -> Checked:
     return fine("ids", words) if found else skipped("ids", "nothing has come")
 
 
-def _matrix(observer: TelemetryObserver, about: About) -> Checked:
-    manifest, status = about.applied, observer.status
-    if manifest is None and not about.offered:
-        why = "no answer on rtc/cm/applied: optional; without it ids are believed"
-        return skipped("matrix", why)
+def _matrix(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
+    manifest, status = context.applied, observer.status
+    if manifest is None and not context.is_served:
+        reason = "no answer on rtc/cm/applied, which is optional; ids are not verified without it"
+        return skipped("matrix", reason)
     if manifest is None or status is None:
-        return wrong("matrix", about.not_applied or "there is no status to compare it with")
+        return wrong("matrix", context.applied_error or "there is no status to compare it with")
     shape = manifest.layout.shape
-    found = f"{manifest.id}, {list(shape)} in {manifest.layout.n_chunks} parts, its sum is right"
+    found = f"{manifest.id}, {list(shape)} in {manifest.layout.n_chunks} chunks, checksum correct"
     if shape[1] != status.n_slopes or (status.in_loop and shape[0] != status.n_controlled):
-        return wrong("matrix", f"{found}; the status says {[status.n_controlled, status.n_slopes]}")
+        expected = [status.n_controlled, status.n_slopes]
+        return wrong("matrix", f"{found}; by the status it should be {expected}")
     named = {status.cm_id for _, status in observer.statuses}
     if manifest.id not in named and named != {None}:
         return wrong("matrix", f"{found}; the status names {status.cm_id}")
-    if manifest.system != about.keys.system:
+    if manifest.system != context.keys.system:
         return wrong("matrix", f"{found}; its system is {manifest.system}")
     return fine("matrix", found)
 
 
-def _law(observer: TelemetryObserver, about: About) -> Checked:
+def _law(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
     laws, status = observer.loop.laws, observer.status
-    why = _why_unjudged(observer, about)
-    if why or status is None:
-        return skipped("law", why)
+    reason = _explain_no_loop(observer, context)
+    if reason or status is None:
+        return skipped("law", reason)
     if not laws:
-        why = (
-            "the commands do not follow from the slopes to the last digit (a mirror that clips, "
-            "something else played on it), or too few frames in a row have come"
+        reason = (
+            "commands do not follow exactly from slopes (the mirror saturates, or something else "
+            "moves it), or too few consecutive frames came"
         )
-        return skipped("law", why)
+        return skipped("law", reason)
     last = laws[-1]
     found = (
-        f"leak {last.leak:.4f}, gain {last.gain:.3g} of the stated one, delay "
+        f"leak {last.leak:.4f}, gain {last.gain:.3g} times that of the status, delay "
         f"{last.delay_frames:.2f} frames"
     )
+    # One wrong result alone may be a change of the loop that the status has not reported yet.
     if last.wrong and all(law.wrong for law in laws[-2:]):
         return wrong("law", last.wrong)
-    return fine("law", f"{found}; stated {status.leak:.4f} and {status.delay_frames:g} frames")
+    expected = f"leak {status.leak:.4f}, delay {status.delay_frames:g} frames"
+    return fine("law", f"{found}; by the status {expected}")
 
 
-def _obedience(observer: TelemetryObserver, about: About) -> Checked:
-    why = _why_unjudged(observer, about)
-    verdicts = observer.loop.obediences
-    if why or not verdicts:
-        return skipped("obedience", why or "too few frames of one loop have come")
-    if any(not one.holds and not other.holds for one, other in pairwise(verdicts)):
-        worst = max(verdicts, key=lambda verdict: int(verdict.disobeys.sum()))
+def _obedience(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
+    reason = _explain_no_loop(observer, context)
+    results = observer.loop.obediences
+    if reason or not results:
+        return skipped("obedience", reason or "too few frames of one loop came")
+    if any(not one.holds and not other.holds for one, other in pairwise(results)):
+        worst = max(results, key=lambda result: int(result.disobeys.sum()))
         return wrong("obedience", worst.text)
-    share = verdicts[-1].share[np.isfinite(verdicts[-1].share)]
+    share = results[-1].share[np.isfinite(results[-1].share)]
     if not len(share):
-        return skipped("obedience", "no mode was asked to move")
+        return skipped("obedience", "no mode was commanded to move")
     return fine(
-        "obedience", f"{len(share)} modes take {share.min():.2f} to {share.max():.2f} of each step"
+        "obedience",
+        f"{len(share)} modes make {share.min():.2f} to {share.max():.2f} of each commanded step",
     )
 
 
-def _why_unjudged(observer: TelemetryObserver, about: About) -> str:
+def _explain_no_loop(observer: TelemetryObserver, context: TelemetryContext) -> str:
+    """Return the reason for which the loop cannot be judged; empty if it can."""
     status = observer.status
     if status is None:
         return "no status has come"
     if not status.in_loop:
         return "the loop is open"
-    return "" if about.applied is not None else "the matrix in use is not known"
+    return "" if context.applied is not None else "the matrix in use is not known"
 
 
-def _orientation(_: TelemetryObserver, about: About) -> Checked:
-    dialect = about.dialect
-    if isinstance(dialect, str):
-        return skipped("orientation", dialect)
-    if dialect.wrong:
-        return wrong("orientation", dialect.wrong)
-    if dialect.found is None:
-        return skipped("orientation", "the matrix in use does not show it")
-    why = "the instrument file leaves it open" if dialect.adopted else "as in the file"
-    found = f"by the matrix in use {setting_written(dialect.found)}: {why}"
-    return fine("orientation", found)
+def _orientation(_: TelemetryObserver, context: TelemetryContext) -> CheckResult:
+    convention = context.slope_convention
+    if isinstance(convention, str):
+        return skipped("orientation", convention)
+    if convention.wrong:
+        return wrong("orientation", convention.wrong)
+    if convention.found is None:
+        return skipped("orientation", "the matrix in use does not determine it")
+    origin = "not set in the instrument file" if convention.adopted else "as in the instrument file"
+    return fine(
+        "orientation", f"{setting_written(convention.found)} by the matrix in use: {origin}"
+    )
 
 
-def _late_join(observer: TelemetryObserver, about: About) -> Checked:
-    asked = [at_s for at_s, key in observer.asked if key == about.keys.current]
-    if asked:
-        return fine("late-join", f"cm/current was asked {len(asked)} time(s)")
-    why = "not asked meanwhile: once a session is enough; start the RTC after this to see it"
-    return skipped("late-join", why)
+def _late_join(observer: TelemetryObserver, context: TelemetryContext) -> CheckResult:
+    queries = [at_s for at_s, key in observer.queries if key == context.keys.current]
+    if queries:
+        return fine("late-join", f"cm/current was queried {len(queries)} time(s)")
+    reason = "not queried, but once a session is enough: start the RTC after this program"
+    return skipped("late-join", reason)
 
 
-def _chief_session(observer: TelemetryObserver) -> str | None:
-    """Return the session of most batches."""
+def _main_session(observer: TelemetryObserver) -> str | None:
+    """Return the session of most batches; None if no batch came."""
     return next((session for session, _ in observer.sessions().most_common(1)), None)
 
 
-_LOOKS: Final[tuple[Callable[[TelemetryObserver, About], Checked], ...]] = (
+_CHECKS: Final[tuple[Callable[[TelemetryObserver, TelemetryContext], CheckResult], ...]] = (
     _connection,
     _messages,
     _frames,

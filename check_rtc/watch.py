@@ -1,4 +1,7 @@
-"""Sum an RTC's telemetry as it arrives; no clock, no network."""
+"""Observation of an RTC's telemetry: what has come, and whether it follows the loop's law.
+
+No clock and no network are used, so tests can feed messages at any times.
+"""
 
 from __future__ import annotations
 
@@ -29,31 +32,33 @@ from service.wire import (
     decode_frames,
 )
 
-STILL: Final = 5
-"""Frames in a row with the same slopes to the last bit, before they count as frozen."""
+MIN_FROZEN_FRAMES: Final = 5
+"""Number of consecutive frames with identical slopes from which they count as frozen."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arrival:
-    """One readable batch."""
+    """Batch of frames that was readable."""
 
     at_s: float
+    """Time of arrival on a monotonic clock, seconds."""
+
     header: FrameHeader
     recoverable: bool
-    """Whether its publisher keeps what it has sent."""
+    """True if its publisher has a cache from which lost messages can be recovered."""
 
     largest_m: float
-    """Largest command of its first row, metres."""
+    """Largest absolute command in its first row, metres OPD."""
 
     @property
     def stop_seq(self) -> int:
-        """The frame after its last one."""
+        """Sequence number after that of its last frame."""
         return self.header.seq0 + self.header.n
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Refused:
-    """One unreadable message."""
+class RefusedMessage:
+    """Message that broke the contract, with the reason in ``text``."""
 
     at_s: float
     topic: Topic
@@ -61,7 +66,7 @@ class Refused:
 
 
 class TelemetryObserver:
-    """Sums of everything an RTC has sent; the checks read them."""
+    """Record of everything that an RTC has sent, from which the checks judge."""
 
     def __init__(self, endpoint: Endpoint, clock: Callable[[], float]) -> None:
         self.intake = Intake(endpoint, clock)
@@ -69,20 +74,20 @@ class TelemetryObserver:
         self.statuses: list[tuple[float, Status]] = []
         self.acknowledgements: list[tuple[float, Acknowledgement]] = []
         self.measured: list[ReceivedMessage] = []
-        self.refused: list[Refused] = []
-        self.asked: list[tuple[float, str]] = []
-        """Queries of the RTC for matrices: when, and key with part."""
+        self.refused: list[RefusedMessage] = []
+        self.queries: list[tuple[float, str]] = []
+        """Queries of the RTC for matrices: time, and key with chunk."""
 
         self.tokens: list[tuple[float, bool]] = []
         self.n_nonfinite = 0
         self.n_frozen = 0
-        """Frames whose slopes are those of the frame before, in runs of at least ``STILL``."""
+        """Number of frames in runs of at least ``MIN_FROZEN_FRAMES`` with identical slopes."""
 
-        self.block_takers: list[Callable[[FrameBlock], None]] = []
-        """Are shown each block of frames of the session that counts."""
+        self.block_callbacks: list[Callable[[FrameBlock], None]] = []
+        """Callbacks for each block of frames of the current session."""
 
-        self.loop = LoopWatch()
-        self._still = 0
+        self.loop = LoopObserver()
+        self._n_equal = 0
         self._last_slopes: NDArray[np.float32] | None = None
 
     def take(self, messages: list[ReceivedMessage]) -> None:
@@ -91,24 +96,26 @@ class TelemetryObserver:
             try:
                 self._take(item)
             except WireError as error:
-                self.refused.append(Refused(at_s=item.at_s, topic=item.topic, text=str(error)))
+                self.refused.append(
+                    RefusedMessage(at_s=item.at_s, topic=item.topic, text=str(error))
+                )
         for block in self.intake.drain():
             self.loop.observe(block)
-            for take in self.block_takers:
+            for take in self.block_callbacks:
                 take(block)
 
     @property
     def status(self) -> Status | None:
-        """The last one."""
+        """Last status; None before the first."""
         return self.statuses[-1][1] if self.statuses else None
 
     @property
     def session(self) -> str | None:
-        """The session that counts."""
+        """Current session by the rules of the service; None before the first frame."""
         return self.intake.statistics().session
 
     def sessions(self) -> Counter[str]:
-        """Return the batches of each session, the first one first."""
+        """Return the number of batches of each session, in order of appearance."""
         return Counter(arrival.header.session for arrival in self.arrivals)
 
     def _take(self, item: ReceivedMessage) -> None:
@@ -121,7 +128,7 @@ class TelemetryObserver:
                 status = decode(Status, item.data)
                 self.statuses.append((item.at_s, status))
                 self.intake.status(item.data)
-                self.loop.follow_status(status)
+                self.loop.take_status(status)
             case Topic.ACK:
                 self.acknowledgements.append((item.at_s, decode(Acknowledgement, item.data)))
             case Topic.MEASURED:
@@ -129,8 +136,8 @@ class TelemetryObserver:
             case Topic.ALIVE:
                 self.tokens.append((item.at_s, item.alive))
                 self.intake.liveliness(alive=item.alive)
-            case Topic.ASKED:
-                self.asked.append((item.at_s, item.key))
+            case Topic.QUERY:
+                self.queries.append((item.at_s, item.key))
 
     def _frames(self, item: ReceivedMessage, batch: FrameBatch) -> None:
         self.arrivals.append(
@@ -153,35 +160,35 @@ class TelemetryObserver:
         same = np.all(slopes == np.concatenate([before[None], slopes[:-1]]), axis=1)
         self._last_slopes = slopes[-1].copy()
         for still in same:
-            self._still = self._still + 1 if still else 0
-            if self._still == STILL:
-                self.n_frozen += STILL
-            elif self._still > STILL:
+            self._n_equal = self._n_equal + 1 if still else 0
+            if self._n_equal == MIN_FROZEN_FRAMES:
+                self.n_frozen += MIN_FROZEN_FRAMES
+            elif self._n_equal > MIN_FROZEN_FRAMES:
                 self.n_frozen += 1
 
 
-class LoopWatch:
-    """Compares commands with the loop law that the status states."""
+class LoopObserver:
+    """Comparison of the commands with the control law that the status reports."""
 
     def __init__(self) -> None:
         self.matrix: NDArray[np.float32] | None = None
         self.cm_id: str | None = None
         self.laws: list[IdentifiedLaw] = []
-        """Verdicts on leak, gain and delay, oldest first."""
+        """Results for leak, gain and delay, oldest first."""
 
         self.obediences: list[CommandResidual] = []
-        """Verdicts on every mode, oldest first."""
+        """Results for the residual of each mode, oldest first."""
 
         self._status: Status | None = None
         self._check = LoopCheck()
         self._law = ControlLawCheck()
 
     def use(self, cm_id: str, matrix: NDArray[np.float32]) -> None:
-        """Take over the numbers of the matrix in use."""
+        """Set id and numbers of the matrix in use."""
         self.cm_id, self.matrix = cm_id, matrix
 
-    def follow_status(self, status: Status) -> None:
-        """Take a status; another loop than before begins anew."""
+    def take_status(self, status: Status) -> None:
+        """Add a status; a change of the loop or its matrix resets the comparison."""
         before, self._status = self._status, status
         if before is None or not same_loop(before, status) or before.cm_id != status.cm_id:
             self._check = LoopCheck(from_seq=last_seq(status) + 1)
@@ -192,7 +199,7 @@ class LoopWatch:
             self._judge(terms, last_seq(status))
 
     def observe(self, block: FrameBlock) -> None:
-        """Take frames."""
+        """Add a block of frames."""
         status, terms = self._status, self._terms(block.cm_id)
         if status is None or terms is None or block.session != status.session:
             return
@@ -222,12 +229,12 @@ class LoopWatch:
             self.laws.append(found)
 
 
-def of_session(arrivals: list[Arrival], session: str | None) -> list[Arrival]:
-    """Return the batches of one session, in the order in which they came."""
+def select_session(arrivals: list[Arrival], session: str | None) -> list[Arrival]:
+    """Return the batches of one session in order of arrival."""
     return [arrival for arrival in arrivals if arrival.header.session == session]
 
 
-def in_order(arrivals: list[Arrival]) -> list[Arrival]:
-    """Return batches in the order of their frames, the first of each number."""
+def sort_by_frame(arrivals: list[Arrival]) -> list[Arrival]:
+    """Return batches in the order of their frames, without repetitions."""
     by_seq = {arrival.header.seq0: arrival for arrival in reversed(arrivals)}
     return [by_seq[seq0] for seq0 in sorted(by_seq)]

@@ -108,7 +108,7 @@ class Pretend:
             raise LinkError("no answer from the RTC")
         return decode(Reply, answer)
 
-    signs = False
+    has_secret = False
 
     def ask(self, kind, payload):
         if kind in self.twists.get("no_command", ()):
@@ -120,7 +120,7 @@ class Pretend:
         reply = self.twists.get("reply", lambda _, reply: reply)(kind, reply)
         return encode(reply), self.twists.get("reply_s", 0.01)
 
-    def applied(self):
+    def fetch_applied(self):
         if "applied" in self.twists:
             raise self.twists["applied"]
         return self.manifest, self.matrix
@@ -308,7 +308,7 @@ class Pretend:
         start_seq = self.twists.get("stands", lambda seq: seq + 500)(self.seq)
         return Reply(id=command.id, accepted=True, reason="", start_seq=start_seq)
 
-    def registered(self, _window, _loop):
+    def fit_registration(self, _window, _loop):
         """What somebody who knows the optics makes of a window; a window is of some second."""
         return SimpleNamespace(
             alpha=Misregistration(shift_x_subap=self.image), covariance=1e-6 * np.eye(4)
@@ -368,7 +368,7 @@ class Pretend:
             self.due.append((due_s, lambda staged=staged: self._swap(staged)))
         for matrix_id, missing in outcome.missing:
             for index in missing:
-                self._hear(Topic.ASKED, key=f"{self.keys.matrix(matrix_id)}?chunk={index}")
+                self._hear(Topic.QUERY, key=f"{self.keys.matrix(matrix_id)}?chunk={index}")
                 self.put_chunk(matrix_id, index, self.offers[matrix_id][index])
 
     def _swap(self, staged):

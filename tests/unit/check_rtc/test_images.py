@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from check_rtc.check import found_images
+from check_rtc.check import measure_image_offsets
 from check_rtc.examine import Examination, examine
 from check_rtc.requirements import Outcome
-from check_rtc.telemetry_checks import ImagePlaces
+from check_rtc.telemetry_checks import ImageOffsets
 from service.config import load_instrument
 from service.model.kinds import KarhunenLoeve
 from service.model.misregistration import Misregistration
@@ -47,26 +47,28 @@ def seen(rms_px, imperfections="realistic"):
 @pytest.mark.parametrize("rms_px", [0.05, 0.1, 0.3])
 def test_images_are_found_to_a_hundredth_of_a_pixel(rms_px, imperfections):
     flux, true = seen(rms_px, imperfections)
-    places = found_images(instrument(), flux)
-    error = places.found_px - true
+    places = measure_image_offsets(instrument(), flux)
+    error = places.measured_px - true
     assert np.sqrt(np.mean(error**2)) < 0.01
     assert np.all(np.abs(error) < 3.0 * places.sigma_px)
-    assert places.stated_px is None
+    assert places.nominal_px is None
 
 
 def test_places_are_those_of_the_rtcs_axes_whatever_its_orientation():
     flux, _ = seen(0.1)
     turned = replace(instrument().slopes, orientation=Orientation(swap_xy=True, flip_x=True))
-    places = found_images(replace(instrument(), slopes=turned), flux)
-    np.testing.assert_allclose(places.found_px, found_images(instrument(), flux).found_px)
+    places = measure_image_offsets(replace(instrument(), slopes=turned), flux)
+    np.testing.assert_allclose(
+        places.measured_px, measure_image_offsets(instrument(), flux).measured_px
+    )
 
 
 def test_images_where_the_instrument_file_has_them_are_as_they_should_be():
     flux, true = seen(0.1)
     told = replace(instrument().wfs, image_offsets_subap=tuple(map(tuple, true + 0.05)))
     about = replace(instrument(), wfs=told)
-    places = found_images(about, flux)
-    np.testing.assert_allclose(places.stated_px, true, atol=1e-12)  # less the mean
+    places = measure_image_offsets(about, flux)
+    np.testing.assert_allclose(places.nominal_px, true, atol=1e-12)  # less the mean
     assert outcome(flux, about).outcome is Outcome.OK
     assert outcome(flux, instrument()).outcome is Outcome.SEEN
     assert outcome(seen(0.0)[0], instrument()).outcome is Outcome.OK
@@ -80,7 +82,7 @@ def outcome(flux, about):
         passive=True,
         listen_s=1.0,
         only=frozenset({"images"}),
-        images=lambda seen_flux: found_images(about, seen_flux),
+        find_images=lambda seen_flux: measure_image_offsets(about, seen_flux),
     )
     (one,) = examine(rtc.talk(), examination)
     return one
@@ -91,5 +93,5 @@ def test_what_is_needed_and_not_there_is_named():
     assert (no_flux.outcome, "flux" in no_flux.found) == (Outcome.SKIPPED, True)
     other = outcome(np.ones((4, 5, 5), "<f4").tobytes(), instrument())
     assert (other.outcome, "(4, 12, 12)" in other.found) == (Outcome.SKIPPED, True)
-    lenslets = found_images(load_instrument("canary"), b"")
-    assert not isinstance(lenslets, ImagePlaces)
+    lenslets = measure_image_offsets(load_instrument("canary"), b"")
+    assert not isinstance(lenslets, ImageOffsets)

@@ -45,7 +45,8 @@ class SystemReport:
         ):
             if np.isfinite(misfit).all():
                 used |= set(system.names(pair))
-        return frozenset({one.name for one in (*system.sensors, *system.mirrors)} - used)
+        names = {one.name for one in system.sensors} | {one.name for one in system.mirrors}
+        return frozenset(names - used)
 
     @property
     def refused(self) -> tuple[str, ...]:

@@ -131,7 +131,7 @@ export function showProvenance(service, orders) {
   const { state, now, fresh } = service;
   const record = orders.inUse;
   $("#provenance").classList.toggle("old", !fresh);
-  if (!state?.in_use) return put($("#provenance"), `in use: ${DASH} (nobody has told which matrix the RTC multiplies with)`);
+  if (!state?.in_use) return put($("#provenance"), `in use: ${DASH} (the RTC has not reported its matrix)`);
   if (!record) return put($("#provenance"), `in use: ${state.in_use}, of which nothing is known`);
   if (!record.alpha) return put($("#provenance"), `in use: ${record.id}, ${record.n_modes} modes; the RTC's own, for an unknown registration`);
   const frame = present(record.applied_frame_seq) ? `, applied at frame ${record.applied_frame_seq}` : "";

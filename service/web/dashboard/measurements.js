@@ -227,21 +227,23 @@ export class Measurements {
   // A registration of another instrument is not held against that of now.
   #tell(root, found, own) {
     const known = own ? this.#service.state?.registration : null;
+    const { sigma_statistical: statistical, sigma_systematic: systematic } = found.registration ?? {};
+    const parts = (p) => (statistical ? [statistical, systematic].map((s) => rounded(0, s[p.key], p).sigma).join(", ") : DASH);
     fill(root.querySelector("tbody"), PARAMETERS.map((p) => {
       const here = rounded(found[p.key], found.sigma[p.key], p);
       const now = rounded(known?.alpha[p.key], known?.sigma[p.key], p);
       const sigma = Math.hypot(found.sigma[p.key] ?? NaN, known?.sigma[p.key] ?? NaN);
       const apart = (found[p.key] - known?.alpha[p.key]) / sigma;
       return make("tr", {}, make("th", { scope: "row", text: `${p.label}${p.short && `, ${p.short}`}` }),
-        make("td", { text: `${here.value} ± ${here.sigma}` }), make("td", { text: known ? `${now.value} ± ${now.sigma}` : DASH }),
+        make("td", { text: `${here.value} ± ${here.sigma}` }), make("td", { text: parts(p) }), make("td", { text: known ? `${now.value} ± ${now.sigma}` : DASH }),
         make("td", { text: present(apart) ? `${Math.abs(apart) > 3 ? "▲ " : ""}${number(apart, 1)} σ` : DASH }));
     }));
     const { orientation: o } = found;
     const facts = [
       ...(found.recommendation ? [found.recommendation] : []),
-      ...(found.registration ? [`Registration ${found.registration.determined ? "" : "not "}determined`] : []),
-      ...(found.reconstructor ? [`Reconstructor ${found.reconstructor.reason}`] : []),
-      `${found.n_modes_used} modes, ${number(100 * found.residual_fraction, 1)} % left over, condition ${number(found.condition_number, 1)}, ${number(found.seconds, 1)} s`,
+      ...(found.registration ? [`Registration ${found.registration.determined ? "" : "not "}determined: ${found.registration.reason}.`] : []),
+      ...(found.reconstructor ? [`Reconstructor: ${found.reconstructor.reason}.`] : []),
+      `${found.n_modes_used} modes, residual ${number(100 * found.residual_fraction, 1)} %, condition ${number(found.condition_number, 1)}, ${number(found.seconds, 1)} s`,
       `slopes ${o.order}${o.swap_xy ? ", x and y swapped" : ""}${o.flip_x ? ", x flipped" : ""}${o.flip_y ? ", y flipped" : ""}, sign ${o.sign}`,
       ...found.notes,
     ];

@@ -62,7 +62,7 @@ export class MirrorOnSensor {
   }
 
   #tell(alpha) {
-    let text = "where the mirror is, is not known";
+    let text = "the registration is not known";
     if (alpha) {
       const far = this.#places.map(({ from, to }) => Math.hypot(to[0] - from[0], to[1] - from[1]));
       const most = far.length ? `farthest actuator ${(100 * Math.max(...far)).toFixed(1)} % of a subaperture from its place` : "no actuators are known: modes were measured";

@@ -151,7 +151,7 @@ export class Against {
     const key = this.choice.value;
     const seen = samples.filter((s) => s.alpha && s.telemetry_ns_utc && present(s[key])).sort((a, b) => a[key] - b[key]);
     const word = this.choice.selectedOptions[0].text;
-    put(this.said, seen.length ? `${seen.length} samples, ${word} ${number(seen[0][key], 1)} to ${number(seen.at(-1)[key], 1)} deg` : `nobody has told the ${word} in this time`);
+    put(this.said, seen.length ? `${seen.length} samples, ${word} ${number(seen[0][key], 1)} to ${number(seen.at(-1)[key], 1)} deg` : `no ${word} was reported in this time`);
     this.root.querySelector(".plots").hidden = !seen.length;
     if (!seen.length) return;
     this.plots.forEach((plot, k) => {

@@ -18,7 +18,7 @@ from pyrcal.offline.instrument_checks import MIN_EXPLAINED, FileValuesFit, Found
 from pyrcal.offline.methods import Settled
 from pyrcal.offline.models import BETTER, FAR_BETTER, Optic
 from pyrcal.offline.pupil_checks import Few, Lead, TriedPupil, gain_maps
-from pyrcal.offline.uncertainty import OTHER_SHARE
+from pyrcal.offline.uncertainty import OTHER_SHARE, Uncertainty
 from service.model.kinds import SignalKind, Stop
 from service.model.misregistration import BOUNDARY_SCALE
 
@@ -175,6 +175,38 @@ def alternatives(
     ]
     sure = [one for one in found if np.all(np.isfinite(one.moved))]
     return tuple(sorted(sure, key=lambda one: (not one.preferred, not one.undecided, _share(one))))
+
+
+def with_alternatives(
+    before: Uncertainty,
+    tried: Sequence[Alternative],
+    residual_fraction: float,
+    *,
+    width: Array,
+    without: FileValuesFit | None,
+) -> Uncertainty:
+    """Return the uncertainty with the moves of all alternatives that the data do not exclude.
+
+    Parameters
+    ----------
+    before
+        Without them.
+    tried
+        Every alternative.
+    residual_fraction
+        RMS of what the fit leaves over the RMS of the measurement.
+    width
+        ``(4,)`` move by a width of the influence functions that cannot be fitted.
+    without
+        The fit with coupling and modulation as in the file; None where they are as fitted.
+    """
+    open_share = OTHER_SHARE * min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
+    moves = [width, *(one.moved for one in tried)]
+    shares = [open_share, *(one.weight(residual_fraction) for one in tried)]
+    if without is not None and without.is_undecided:
+        moves.append(without.moved)
+        shares.append(open_share)
+    return before.with_moves(np.array(moves), np.array(shares))
 
 
 def off_centre(few: Few, others: tuple[Rival, ...]) -> Alternative | None:

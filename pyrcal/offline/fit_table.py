@@ -155,6 +155,10 @@ NOTABLE_DISPLACEMENT_PX = 0.03
 """Displacement of a pupil image from which on it is mentioned; less is found on exact matrices."""
 
 
+NOTABLE_DISTORTION_SUBAP = 0.03
+"""Distortion of the mirror, RMS over the pupil, from which on it is mentioned."""
+
+
 PLAUSIBLE_DISPLACEMENT_PX = 0.5
 """Displacement of a pupil image beyond which it stands for something else: real pyramids have up to
 0.3 pixel, and images whose response the model explains to 70 % only were fitted 1.7 pixels off."""
@@ -190,6 +194,13 @@ def _extras(fit: Fit) -> Iterator[str]:
         plausible = np.abs(places).max() < PLAUSIBLE_DISPLACEMENT_PX
         why = "the file does not say" if plausible else "larger than pyramids have: model errors"
         yield f"{'pupil images':20s}{displacement_words(places)} (fitted; {why})"
+    distortion = None if fit.registration is None else fit.registration.distortion
+    if distortion is not None and distortion.rms_subap > NOTABLE_DISTORTION_SUBAP:
+        yield (
+            f"{'distortion':20s}a mirror distorted by {distortion.rms_subap:.2f} subapertures RMS "
+            f"would leave {distortion.share:.1%} of the misfit (not fitted; differences of sets "
+            "allow for it)"
+        )
     if fit.gain_map is not None:
         gains = fit.gain_map[fit.valid]
         yield f"{'gain over the pupil':20s}{gains.min():.2f} to {gains.max():.2f}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.alternatives import Alternative
 from pyrcal.offline.control_check import ReconstructorVerdict
-from pyrcal.offline.disjoint_sets import DisjointSets
+from pyrcal.offline.disjoint_sets import DisjointSets, Distortion
 from pyrcal.offline.instrument_checks import FoundOptic
 from pyrcal.offline.left_over import LeftOver
 from pyrcal.offline.methods import ScanStep
@@ -48,6 +48,9 @@ class Registration:
 
     sets: tuple[DisjointSets, ...] = ()
     """Disjoint sets of modes, actuators and subapertures, each fitted alone."""
+
+    distortion: Distortion | None = None
+    """The smooth distortion of the mirror that explains most; None of a fit made by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

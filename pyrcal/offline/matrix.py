@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.advice import Advice, Grounds, explained, recommendation, with_displaced
-from pyrcal.offline.alternatives import alternatives, off_centre
+from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
+from pyrcal.offline.alternatives import alternatives, off_centre, with_alternatives
 from pyrcal.offline.columns import (
     MAX_SMEAR,
     Smear,
@@ -26,7 +26,6 @@ from pyrcal.offline.disjoint_sets import mode_partitions, pupil_partitions
 from pyrcal.offline.fitted import Fit, Registration
 from pyrcal.offline.gain_causes import gain_causes
 from pyrcal.offline.instrument_checks import (
-    MIN_EXPLAINED,
     doubt_of_width,
     fit_file_values,
     found_optics,
@@ -54,7 +53,6 @@ from pyrcal.offline.solver import Nuisances, Solution, image_patterns, nuisances
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
-    OTHER_SHARE,
     pupil_places,
     pupil_regions,
     uncertainty,
@@ -508,17 +506,13 @@ def _answer(
     left_map = _residual_map(found)
     arms_deg = tuple(arm.angle_deg for arm in arms_of(left_map))
     tried = alternatives(settled, few, others, pupils, optics, without, arms_deg)
-    floor = min(1.0, residual_fraction / MIN_EXPLAINED) ** 2
-    moves = [doubt_of_width(settled, few), *(one.moved for one in tried)]
-    shares = [OTHER_SHARE * floor, *(one.weight(residual_fraction) for one in tried)]
-    if without is not None and without.is_undecided:
-        moves.append(without.moved)
-        shares.append(OTHER_SHARE * floor)
+    sure = with_alternatives(
+        before, tried, residual_fraction, width=doubt_of_width(settled, few), without=without
+    )
     if found.smear is not None and found.before is not None:
         by_smear = solution.vector - found.before.vector
-        moves.append(by_smear * found.smear.sigma / found.smear.share)
-        shares.append(1.0)
-    sure = before.with_moves(np.array(moves), np.array(shares))
+        error = by_smear * found.smear.sigma / found.smear.share
+        sure = sure.with_moves(error[np.newaxis], np.ones(1))
     findings = FitFindings(
         solution=solution,
         residual_fraction=residual_fraction,
@@ -584,6 +578,7 @@ def _answer(
             sigma_statistical=sure.sigma_statistical,
             sigma_systematic=sure.sigma_systematic,
             sets=sure.sets,
+            distortion=sure.distortion,
         ),
         reconstructor=check_control(
             target.matrix,

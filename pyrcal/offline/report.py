@@ -128,10 +128,16 @@ def _registration(found: Registration) -> dict[str, Any]:
                 "steps": [_parameters(step) for step in one.steps],
                 "sigma": [_parameters(sigma) for sigma in one.sigma],
                 "tension": dict(zip(PARAMETERS, _plain(one.tension), strict=True)),
+                "tension_without_distortion": dict(
+                    zip(PARAMETERS, _plain(one.straight_tension), strict=True)
+                ),
                 "in_sigma": one.even,
             }
             for one in found.sets
         ],
+        "distortion_rms_subap": None
+        if found.distortion is None
+        else _plain(found.distortion.rms_subap),
     }
 
 

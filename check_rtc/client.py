@@ -39,7 +39,7 @@ MAX_REPLY_DELAY_S: Final = 1.0
 DITHER_RMS_M: Final = 7e-9
 """RMS of all lines of the dither together, metres OPD; less than the service's default budget."""
 
-LINE_RATIOS: Final = (0.08, 0.211, 0.239)
+DITHER_LINE_RATIOS: Final = (0.08, 0.211, 0.239)
 """Frequencies of the dither over the frame rate.
 
 At the slow one a lag of a few frames is a small phase, so that it differs from a reversed sign.
@@ -298,7 +298,9 @@ def check_dither(
         kind=DitherKind.SINE,
         modes=modes,
         amplitude_m=(float(amplitude),) * len(modes),
-        frequency_hz=tuple(line * status.frame_rate_hz for line in LINE_RATIOS[: len(modes)]),
+        frequency_hz=tuple(
+            line * status.frame_rate_hz for line in DITHER_LINE_RATIOS[: len(modes)]
+        ),
         duration_s=DITHER_DURATION_S,
     )
     try:
@@ -425,7 +427,9 @@ def _check_columns(
         return skipped("columns", "needs the matrix in use and a dither on two controlled modes")
     seq = np.concatenate(recorder.seq)
     turns = (
-        2 * np.pi * np.array(LINE_RATIOS[: len(modes)])[[mode in status.in_loop for mode in modes]]
+        2
+        * np.pi
+        * np.array(DITHER_LINE_RATIOS[: len(modes)])[[mode in status.in_loop for mode in modes]]
     )
     answer, noise = _measure_transfer(
         seq, np.concatenate(recorder.seen_m), np.concatenate(recorder.moved_m), turns

@@ -51,7 +51,7 @@ MOVE_RATIO_RANGE: Final = (0.67, 1.33)
 MAX_SIDE_MOTION: Final = 0.05
 """Largest change of the other parameters, in units of ``_SIDE_MOTION_SCALE``."""
 
-LINE_RATIOS: Final = (0.21, 0.24, 0.27, 0.3)
+ALPHA_LINE_RATIOS: Final = (0.21, 0.24, 0.27, 0.3)
 """Frequencies of the dither over the frame rate."""
 
 _DRAIN_S: Final = 0.1
@@ -185,13 +185,15 @@ def _format_move(change: NDArray[np.float64]) -> str:
 def _dither(client: RtcClient, status: Status) -> DitherRequest:
     """Return sines on four uncontrolled modes, or on the highest modes if there are fewer."""
     n_outside = status.n_modes - status.n_controlled
-    if n_outside >= len(LINE_RATIOS):
-        modes = status.n_controlled + np.arange(len(LINE_RATIOS)) * n_outside // len(LINE_RATIOS)
+    if n_outside >= len(ALPHA_LINE_RATIOS):
+        modes = status.n_controlled + np.arange(len(ALPHA_LINE_RATIOS)) * n_outside // len(
+            ALPHA_LINE_RATIOS
+        )
     else:
-        modes = np.arange(status.n_modes)[-len(LINE_RATIOS) :]
+        modes = np.arange(status.n_modes)[-len(ALPHA_LINE_RATIOS) :]
     modes = modes[: max(status.max_dither_modes, 1)]
     each_m = min(DITHER_RMS_M / np.sqrt(len(modes)), status.max_dither_m)
-    lines = [round(line * status.frame_rate_hz * WINDOW_S) / WINDOW_S for line in LINE_RATIOS]
+    lines = [round(line * status.frame_rate_hz * WINDOW_S) / WINDOW_S for line in ALPHA_LINE_RATIOS]
     return DitherRequest(
         id=client.connection.new_id("dither"),
         kind=DitherKind.SINE,

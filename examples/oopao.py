@@ -1,8 +1,8 @@
-"""From OOPAO's objects to α, and OOPAO's loop closed with pyrcal's matrix.
+"""Fit α from objects of OOPAO, and close OOPAO's loop with pyrcal's reconstructor.
 
-Needs OOPAO and pyrcal in one environment: ``python -m examples.oopao var/oopao``. A pyramid and a
-mirror are calibrated where they belong, the mirror is moved by 0.3 of a subaperture, and the loop
-is closed on the moved mirror with three matrices: of before, OOPAO's own measured again, pyrcal's.
+Needs OOPAO and pyrcal in one environment: ``python -m examples.oopao var/oopao``. A pyramid is
+calibrated, the mirror is moved by 0.3 subaperture, and the loop is closed with three
+reconstructors: the one from before the move, OOPAO's own measured again, and pyrcal's.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def build():
 
 
 def alpha_of(tel, dm, wfs, calib, modes_to_commands, folder):
-    """Return the fit of a calibration: this is all that an OOPAO user writes."""
+    """Return the fit of an interaction matrix of OOPAO. A user of OOPAO needs no more than this."""
     saved = pyrcal.from_oopao(tel, dm, wfs, calib, modes_to_commands).save(folder)
     instrument = pyrcal.load_instrument(saved.instrument)
     return pyrcal.fit_file(instrument, saved.matrix, pyrcal.FitOptions()).fit
@@ -69,7 +69,7 @@ def reconstructor(folder):
 
 
 def residual_nm(tel, ngs, atm, dm, wfs, modal_reconstructor, modes_to_commands, n_frames):
-    """Return the wavefront that a loop with this reconstructor leaves, RMS over its last half."""
+    """Return the residual wavefront of a loop, nm RMS over the second half of the frames."""
     rng = np.random.default_rng(1)
     atm.generateNewPhaseScreen(seed=int(rng.integers(1 << 30)))
     dm.coefs = 0.0
@@ -79,7 +79,7 @@ def residual_nm(tel, ngs, atm, dm, wfs, modal_reconstructor, modes_to_commands, 
         atm.update()
         ngs**atm * tel * dm * wfs
         left.append(np.std(ngs.OPD[tel.pupil == 1]) * 1e9)
-        # a frame of delay: the command of the frame before
+        # one frame of delay: the command uses the slopes of the frame before
         dm.coefs = dm.coefs - GAIN * modes_to_commands @ modal_reconstructor @ signal
         signal = wfs.signal
     return float(np.sqrt(np.mean(np.square(left[n_frames // 2 :]))))

@@ -1,6 +1,7 @@
-"""Takes every reconstructor that the service publishes, checks it, and prints what it is for.
+"""Receive every reconstructor that the service publishes, check it, and print its registration.
 
-Run: ``python examples/subscribe.py [ENDPOINT] [SYSTEM]``. It acknowledges nothing: it is no RTC.
+Run: ``python examples/subscribe.py [ENDPOINT] [SYSTEM]``. It only listens and sends no
+acknowledgement, which is left to the RTC.
 """
 
 import hashlib
@@ -20,19 +21,19 @@ parts, manifests = {}, {}
 
 
 def take(sample):
-    """Collect chunks and manifests, in whatever order they come."""
+    """Collect chunks and manifests in any order; print a matrix when it is complete."""
     _, _, _, _, matrix_id, kind, *index = str(sample.key_expr).split("/")
     mine = parts.setdefault(matrix_id, {})
     if kind == "chunk":
         mine[int(index[0])] = sample.payload.to_bytes()
     else:
         manifests[matrix_id] = msgpack.unpackb(sample.payload.to_bytes())
-    told = manifests.get(matrix_id)
-    if told is not None and len(mine) == told["n_chunks"]:
-        data = b"".join(mine[k] for k in range(told["n_chunks"]))
-        right = hashlib.sha256(data).hexdigest() == told["sha256"]
-        matrix = np.frombuffer(data, "<f4").reshape(told["shape"])
-        print(matrix_id, matrix.shape, told["alpha"], "right" if right else "WRONG", flush=True)
+    manifest = manifests.get(matrix_id)
+    if manifest is not None and len(mine) == manifest["n_chunks"]:
+        data = b"".join(mine[k] for k in range(manifest["n_chunks"]))
+        right = hashlib.sha256(data).hexdigest() == manifest["sha256"]
+        matrix = np.frombuffer(data, "<f4").reshape(manifest["shape"])
+        print(matrix_id, matrix.shape, manifest["alpha"], "right" if right else "WRONG", flush=True)
 
 
 with zenoh.open(config) as session:

@@ -1,4 +1,4 @@
-"""The REST application: read snapshots, hand commands on."""
+"""REST application of the service: its routers, middleware and server."""
 
 from __future__ import annotations
 
@@ -30,17 +30,16 @@ from service.web.authentication import Authentication, Hosts
 from service.web.connections import Idempotency, RequestId, SecurityHeaders, Server, Unchanged
 from service.web.keys import KeyFile
 
-REQUESTS_WITHIN_S = 2
-"""Requests under way when the service is asked to stop may take this long: an upload would take
-longer."""
+SHUTDOWN_TIMEOUT_S = 2
+"""Time that running requests have to finish when the service stops; uploads take longer."""
 
 _DESCRIPTION = """
 Calibration service of an adaptive telescope.
 
 Shifts are in subapertures, angles in degrees, magnification is a ratio; every number has its unit
 in its name. Times are nanoseconds since the Unix epoch, UTC. A number that is not known or not
-finite is `null`. Errors are `application/problem+json` (RFC 9457). `X-Request-ID` of an answer, the
-one that was sent or a new one, is in every line of the log that the request has led to.
+finite is `null`. Errors are `application/problem+json` (RFC 9457). Each response has an
+`X-Request-ID`, that of the request or a new one, which is in every log line of the request.
 """
 
 
@@ -52,11 +51,11 @@ async def answer(
     keys: KeyFile,
     over: asyncio.Event,
 ) -> None:
-    """Answer requests as the ``settings`` say, until it is ``over``."""
+    """Serve HTTP requests on ``listener`` until the event ``over`` is set."""
     host, port = listener.getsockname()[:2]
     hosts = Hosts(bound=host, allowed=(settings.host, *settings.allowed_hosts))
     app = create_app(service, desk, hosts=hosts, keys=keys, over=over)
-    server = Server(app, over, within_s=REQUESTS_WITHIN_S, proxies=settings.trusted_proxies)
+    server = Server(app, over, within_s=SHUTDOWN_TIMEOUT_S, proxies=settings.trusted_proxies)
     structlog.get_logger().info("api.listening", url=f"http://{host}:{port}")
     await server.serve(sockets=[listener])
 
@@ -69,14 +68,26 @@ def create_app(
     keys: KeyFile | None = None,
     over: asyncio.Event | None = None,
 ) -> FastAPI:
-    """Return the REST application of a service, and of a desk for fits where there is one.
+    """Return the REST application of a service.
 
-    It answers to ``hosts``, loopback alone where they are not given, and to no other name; who asks
-    needs one of the ``keys``, if there are any. Streams end when it is ``over``.
+    Parameters
+    ----------
+    service
+        Supervisor that has the state and takes commands.
+    desk
+        Queue for fits of uploaded matrices; None leaves out their routes.
+    hosts
+        Host names that requests may name; None for loopback only.
+    keys
+        API keys, one of which a request must have; None to require none.
+    over
+        Event at which streams end; None if they never do.
 
-    FastAPI's own pages are left out: they load their scripts from the internet, and its own
-    document tells less than the records do. ``/docs`` and ``/openapi.json`` are files of the
-    package.
+    Notes
+    -----
+    FastAPI's own documentation pages are not served: they load scripts from the internet, which an
+    observatory's network may not reach. ``/docs`` and ``/openapi.json`` are files of the package,
+    and the latter describes more than FastAPI could derive.
     """
     app = FastAPI(
         title="pyrcal",
@@ -105,7 +116,7 @@ def create_app(
 
 @cache
 def _routes(*, with_fits: bool) -> list[BaseRoute]:
-    """Return what is answered where; FastAPI takes a tenth of a second to work that out."""
+    """Return all routes; cached, because FastAPI takes a tenth of a second to build them."""
     shared = APIRouter(generate_unique_id_function=_operation_id, responses=problems.EVERYWHERE)
     routers = [
         state.router,

@@ -1,4 +1,4 @@
-"""The exception tree of pyrcal.
+"""Exceptions of pyrcal, and texts that are safe to print on a terminal.
 
 ::
 
@@ -10,51 +10,52 @@
     ├── LinkError            the zenoh session cannot be opened or an RTC does not answer
     ├── CommandError         an operator's request that cannot be carried out now
     │   ├── UnknownIdError   an unknown reconstructor, session or product
-    │   ├── StaleError       what it was decided on has changed since
-    │   ├── UntaggedError    strictness was asked for, and not what it was decided on
+    │   ├── StaleError       the subject of the request has changed since it was read
+    │   ├── UntaggedError    a conditional request without the ETag of its subject
     │   ├── TooLargeError    a request or an upload beyond the limit
     │   ├── TooSlowError     a request or an upload that does not come in time
-    │   └── BusyError        too much under way already: try again later
+    │   └── BusyError        too many requests of the same kind: try again later
     ├── WorkerError          the worker process died; the job is lost, the service is not
-    ├── ClusterError         the Dask cluster is not there, is gone, or runs another version
+    ├── ClusterError         the Dask cluster is missing, lost, or runs another version
     └── ArchiveError         a product that cannot be written, read, or fails its checksum
-        └── StorageError     the disk refuses: full, gone, or not to be written
+        └── StorageError     the disk is full, missing, or not writable
 
 Expected outcomes (a rejected fit, a refused reconstructor, too few frames) are values, not
-exceptions: their text tells the operator what to do.
+exceptions; their text says what the operator should do.
 
-Such texts quote what strangers have written, so they reach a terminal as :func:`shown` has it.
+Texts may quote names from files and messages of other programs. :func:`shown` escapes control
+characters in them before they are printed.
 """
 
 import sys
 import unicodedata
 
-_UNSEEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
-"""Categories of characters that move a cursor, turn the writing round, or have no shape."""
+_UNSAFE_CATEGORIES = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
+"""Unicode categories of characters that move the cursor, reverse the text, or are invisible."""
 
 
 def shown(text: str, keep: str = "") -> str:
-    """Return a text as a terminal may have it: control characters are written out.
+    """Return a text that is safe to print, with control characters written as escapes.
 
-    Characters in ``keep`` stay: the ends of a program's own lines.
+    Characters in ``keep`` are not escaped, such as the newlines of a program's own text.
     """
     if text.isprintable():
         return text
     return "".join(
         character
-        if character in keep or unicodedata.category(character) not in _UNSEEN
+        if character in keep or unicodedata.category(character) not in _UNSAFE_CATEGORIES
         else character.encode("unicode_escape").decode("ascii")
         for character in text
     )
 
 
 def say(line: str) -> None:
-    """Write a line to standard error, beside the answer."""
+    """Write a line to standard error, which keeps standard output free for results."""
     sys.stderr.write(f"{shown(line)}\n")
 
 
 class PyrcalError(Exception):
-    """Anything pyrcal raises on purpose; the message says what was found and what was expected."""
+    """Base of all exceptions of pyrcal; the message says what was found and what was expected."""
 
 
 class ConfigurationError(PyrcalError):
@@ -63,11 +64,11 @@ class ConfigurationError(PyrcalError):
     def __init__(self, message: str, problems: tuple[str, ...] = ()) -> None:
         super().__init__(message)
         self.problems = problems or (message,)
-        """Everything that is wrong, one line each."""
+        """All problems found, one line each."""
 
 
 class ModelError(PyrcalError):
-    """The optical model was given numbers it cannot work with."""
+    """The optical model received numbers for which it is not defined."""
 
 
 class MatrixError(PyrcalError):
@@ -87,19 +88,19 @@ class CommandError(PyrcalError):
 
 
 class UnknownIdError(CommandError):
-    """The id names nothing this service knows."""
+    """No reconstructor, session or product has this id."""
 
 
 class StaleError(CommandError):
-    """The subject of the order has changed since it was shown."""
+    """The subject of a request has changed since the client read it."""
 
 
 class UntaggedError(CommandError):
-    """An order asks for strictness without an ETag of its subject."""
+    """A conditional request has no ETag of its subject."""
 
 
 class TooLargeError(CommandError):
-    """A request or an upload is larger than this service takes."""
+    """A request or an upload is larger than the limit."""
 
 
 class TooSlowError(CommandError):
@@ -107,15 +108,15 @@ class TooSlowError(CommandError):
 
 
 class BusyError(CommandError):
-    """Too much of the same kind is under way; the same request may be granted later."""
+    """Too many requests of the same kind are running; the same request may succeed later."""
 
 
 class WorkerError(PyrcalError):
-    """The worker process died with a job in its hands."""
+    """The worker process died during a job."""
 
 
 class ClusterError(PyrcalError):
-    """The Dask cluster is not there, is gone, or runs another version; work can be done here."""
+    """The Dask cluster is missing, lost, or runs another version; jobs can run locally."""
 
 
 class ArchiveError(PyrcalError):
@@ -123,4 +124,4 @@ class ArchiveError(PyrcalError):
 
 
 class StorageError(ArchiveError):
-    """The disk refuses to be written; the message names the path and what the system says."""
+    """The disk cannot be written; the message has the path and the error of the system."""

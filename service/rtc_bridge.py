@@ -1,8 +1,8 @@
-"""The link to the RTC over zenoh: telemetry in, commands and matrices out.
+"""Link of the service to the RTC over zenoh: telemetry in, commands and matrices out.
 
-Frames walk one way: zenoh's thread checks them into a bounded ring, ``drain`` hands out copies.
-Everything else that happens waits as an event. Nothing here decides anything: what an event means
-is the tracker's business.
+zenoh's threads put frames into a bounded ring, from which :meth:`Bridge.drain` returns copies. All
+other messages are queued as events. The bridge makes no decisions: the tracker does, from these
+events.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ _T = TypeVar("_T")
 
 
 class Bridge:
-    """One system's link; ``open`` and ``close`` it, or use it as a context manager.
+    """Link of one system; a context manager, or opened and closed by ``open`` and ``close``.
 
-    Every method may be called from any thread. The asynchronous ones wait off the event loop.
+    Every method may be called from any thread. The asynchronous ones do their blocking work in a
+    thread of their own, not on the event loop.
     """
 
     def __init__(self, endpoint: Endpoint, last: LastTelemetry | None = None) -> None:
@@ -59,7 +60,7 @@ class Bridge:
         self._outbox = Outbox(endpoint.offer_s)
         self._signatures = Signatures(endpoint.security.secret, wire.Role.SERVICE)
         self.guard = LinkGuard(endpoint.security)
-        """Who comes onto a secured link, and what was refused to whom."""
+        """Record of the programs on a secured link, and of what they were refused."""
         self._session: zenoh.Session | None = None
         self._closed = False
         self._recorder: RecordingWriter | None = None
@@ -77,9 +78,10 @@ class Bridge:
         self.close()
 
     def open(self) -> None:
-        """Open the zenoh session and say that the service is there.
+        """Open the zenoh session and declare the service's liveliness token.
 
-        The queryables come before the liveliness token: an RTC that sees the token can ask.
+        The queryables are declared before the token, so that an RTC that sees the token can send
+        its queries.
 
         Raises
         ------
@@ -101,14 +103,14 @@ class Bridge:
         self._log.info("link.opened", listen=self._endpoint.listen, connect=self._endpoint.connect)
 
     def close(self) -> None:
-        """Leave the network; the process can exit. Closing twice does nothing."""
+        """Close the zenoh session, after which the process can exit; closing twice does nothing."""
         self._closed = True
         self._intake.set_wakeup(None)
         if self._leave():
             self._log.info("link.closed")
 
     def _leave(self) -> bool:
-        """Give up what is declared, and the session; return whether there was one."""
+        """Undeclare everything and close the session; return True if there was one."""
         session, self._session = self._session, None
         self._standby.leave()
         self._publishers.clear()
@@ -118,50 +120,54 @@ class Bridge:
         return session is not None
 
     def reopen(self) -> None:
-        """Close the session and open another, unless the link is closed: every RTC connects anew.
+        """Close the session and open another, so that RTCs have to connect again.
+
+        Does nothing if the link is closed.
 
         Raises
         ------
         LinkError
-            If the port has been taken meanwhile, or no router answers: then it is closed.
+            If the port has been taken meanwhile, or no router answers; the link is then closed.
         """
         self._leave()
         self._intake.liveliness(alive=False)
         if not self._closed:
             self._open()
-        if self._closed:  # meanwhile, in another thread
+        # close() in another thread may have come between the two tests; the new session would
+        # otherwise stay open.
+        if self._closed:
             self.close()
 
     def expect(
         self, basis_id: str | None, config_id: str | None, modes: Collection[str] = ()
     ) -> None:
-        """Refuse frames of any other basis or sensor configuration; None: adopt the first seen.
+        """Refuse frames of another basis or sensor configuration; None adopts the first received.
 
-        ``modes`` are the configurations that the RTC may change between.
+        ``modes`` are the configurations between which the RTC may change.
         """
         self._intake.expect(basis_id, config_id, modes)
 
     def set_wakeup(self, callback: Callable[[], object] | None, *, for_frames: bool = True) -> None:
-        """Call ``callback`` from zenoh's threads when something new has come.
+        """Set the function that zenoh's threads call when something new has come; None for none.
 
-        It rings once until the next :meth:`drain` or :meth:`events`, so look at both; give it
-        something like ``lambda: loop.call_soon_threadsafe(event.set)``. Whoever looks at intervals
-        needs no bell ``for_frames``. Frames held back for the sake of a hole ring none when their
-        time is up: look at least a few times a second.
+        It is called once until the next :meth:`drain` or :meth:`events`, so a consumer must call
+        both. A typical callback is ``lambda: loop.call_soon_threadsafe(event.set)``. A consumer
+        that polls sets ``for_frames`` to False. Frames that waited in vain for missing ones are
+        released without a call, so a consumer must also poll a few times a second.
         """
         self._intake.set_wakeup(callback, for_frames=for_frames)
 
     def drain(self, *, before_events: bool = False) -> list[FrameBlock]:
-        """Return the frames that have come since the last call, as copies, in order.
+        """Return copies of the frames since the last call, in order.
 
-        Each block is contiguous and of one reconstructor. Frames behind a hole are held back for
-        as long as the hole may still be filled. ``before_events``: those that came before the
-        oldest event which nobody has fetched; the others wait.
+        Each block is contiguous and has one reconstructor. Frames after missing ones are held back
+        as long as these may still be recovered. With ``before_events`` only frames that came before
+        the oldest event in the queue are returned.
         """
         return self._intake.drain(before_events=before_events)
 
     def events(self) -> list[LinkEvent]:
-        """Return what else has happened since the last call, oldest first."""
+        """Return the events since the last call, oldest first."""
         self._standby.look_again()
         return self._intake.events()
 
@@ -175,10 +181,10 @@ class Bridge:
         )
 
     def keep(self, recorder: RecordingWriter | None, before_s: float = 0.0) -> float:
-        """Have all that the RTC sends put into a recorder from now on; None: no more.
+        """Record all messages of the RTC from now on; None ends the recording.
 
-        It begins with the reconstructor in use, as far as this service has it, and with what came
-        in the last seconds, as far as that is held; returns how many of them are.
+        The recording begins with the reconstructor in use, if this service has it, and with up to
+        ``before_s`` seconds of earlier telemetry. Returns the number of seconds that were held.
         """
         offer, alive = self._outbox.current, self._intake.statistics().rtc_alive
         with self._handing_over:
@@ -209,106 +215,114 @@ class Bridge:
                 self._recorder.put(kind, payload, attachment)
 
     def offer(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
-        """Let an RTC ask for a reconstructor without sending it.
+        """Answer an RTC's queries for a reconstructor, without sending it.
 
         Raises
         ------
         WireError
-            If the manifest does not describe the matrix, or its id names another one.
+            If the manifest does not describe the matrix, or its id belongs to another one.
         """
         self._prepare(manifest, matrix)
 
     def set_current(self, matrix_id: str | None) -> None:
-        """Say which offer a late RTC should use; None: none.
+        """Set the reconstructor that an RTC without one should use; None for none.
 
-        An acknowledgement that one was applied does the same.
+        An acknowledgement of an applied reconstructor does the same.
 
         Raises
         ------
         UnknownIdError
-            If it is not on offer.
+            If no reconstructor with this id was offered or published.
         """
         self._outbox.set_current(matrix_id)
         self._record_matrix()
 
     async def publish(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
-        """Send a reconstructor: its parts, then the commit that orders staging and swap.
+        """Send a reconstructor: its chunks, then the commit on which the RTC stages and swaps.
 
         Parameters
         ----------
         manifest
-            With the layout of the matrix in parts.
+            Manifest with the layout of the matrix in chunks.
         matrix
-            ``(n_controlled, n_slopes)``, metres per slope; the loop gain is not in it.
+            ``(n_controlled, n_slopes)``, metres per slope, without the loop gain.
 
         Raises
         ------
         WireError
-            If the manifest does not describe the matrix, or its id names another one.
+            If the manifest does not describe the matrix, or its id belongs to another one.
         LinkError
-            If the link is not open, or another session of the RTC's than the one that counts was
-            the last to speak: no commit goes out then.
+            If the link is not open, or the last message came from another session than the current
+            one; no commit is sent then.
         """
         await asyncio.to_thread(self._publish, manifest, matrix)
 
     async def command(self, command: wire.Command) -> wire.Reply:
-        """Send a command and return the RTC's answer, accepted or not.
+        """Send a command and return the RTC's reply, accepted or not.
 
         Raises
         ------
         WireError
             If the command breaks the contract.
         LinkError
-            If the RTC does not answer, even when asked again with the same id: whether it has
-            carried the command out is unknown.
+            If the RTC does not reply, not even to a repetition with the same id. It is then unknown
+            whether it has carried out the command.
         """
         return await asyncio.to_thread(self._command, command)
 
     async def fetch_applied(self) -> tuple[wire.Manifest, NDArray[np.float32]]:
-        """Return the reconstructor the RTC uses, as :func:`service.link.session.fetch_applied`."""
+        """Return the reconstructor in use; see :func:`service.link.session.fetch_applied`."""
         read_back = link.fetch_applied
-        return await asyncio.to_thread(read_back, self._opened(), self._keys, self._signatures)
+        return await asyncio.to_thread(
+            read_back, self._require_session(), self._keys, self._signatures
+        )
 
     def publish_state(self, message: wire.StateMessage) -> None:
-        """Publish the service's state; dropped while the network is slow."""
-        self._tell(self._keys.state, wire.encode(message), wire.Encodings.STATE)
+        """Publish the service's state; it is dropped if the network is congested."""
+        self._publish_last(self._keys.state, wire.encode(message), wire.Encodings.STATE)
 
     def publish_alarm(self, message: wire.AlarmMessage) -> None:
-        """Publish an alarm that began or ended; dropped while the network is slow."""
-        self._tell(self._keys.alarm, wire.encode(message), wire.Encodings.ALARM)
+        """Publish an alarm that began or ended; it is dropped if the network is congested."""
+        self._publish_last(self._keys.alarm, wire.encode(message), wire.Encodings.ALARM)
 
     def _declare(self, session: zenoh.Session) -> None:
         keys = self._keys
         for key in (keys.state, keys.alarm):
             self._publishers[key] = link.last_value(session, key)
-        self._held += self._standby.join(session, self._guarded, wait=bool(self._endpoint.connect))
+        self._held += self._standby.join(
+            session, self._catch_errors, wait=bool(self._endpoint.connect)
+        )
         if self._endpoint.security.zenoh:
             self._held.append(link.watch_links(session, self.guard.on_link))
-        # zenoh takes back what nobody holds: a token within microseconds
+        # zenoh undeclares objects when Python collects them, so all must be kept in a list.
         self._held += [
-            link.subscribe(session, keys.acknowledgement, self._guarded("ack", self._on_ack)),
-            link.subscribe(session, keys.status, self._guarded("status", self._on_status)),
-            link.subscribe(session, keys.all_measured, self._guarded("im", self._on_measured)),
-            link.watch(session, keys.alive(wire.Role.RTC), self._guarded("alive", self._on_alive)),
-            link.subscribe_frames(session, keys.frames, self._guarded("frames", self._on_frames)),
+            link.subscribe(session, keys.acknowledgement, self._catch_errors("ack", self._on_ack)),
+            link.subscribe(session, keys.status, self._catch_errors("status", self._on_status)),
+            link.subscribe(session, keys.all_measured, self._catch_errors("im", self._on_measured)),
+            link.watch(
+                session, keys.alive(wire.Role.RTC), self._catch_errors("alive", self._on_alive)
+            ),
+            link.subscribe_frames(
+                session, keys.frames, self._catch_errors("frames", self._on_frames)
+            ),
         ]
 
     def _drive(self, session: zenoh.Session) -> list[object]:
-        """Be the service of this system: the RTC may ask from now on."""
+        """Declare the queryable and token of the service that drives this system."""
         return [
             link.serve(session, self._keys.all_matrices, self._answer),
             link.announce(session, self._keys.alive(wire.Role.SERVICE)),
         ]
 
-    def _guarded(self, kind: str, take: Callable[[_T], None]) -> Callable[[_T], None]:
-        """Return a callback that lets nothing escape into zenoh's thread unseen."""
+    def _catch_errors(self, kind: str, take: Callable[[_T], None]) -> Callable[[_T], None]:
+        """Return a callback that counts and logs all errors instead of raising them."""
 
         def callback(item: _T) -> None:
             try:
                 take(item)
             except WireError as error:
                 self._intake.malformed(kind, error)
-            except Exception:  # noqa: BLE001  zenoh would swallow it: counted and logged here
+            except Exception:  # noqa: BLE001 - zenoh's thread would discard it without a trace
                 if self._intake.failed(kind):
                     self._log.exception("link.callback_failed", kind=kind)
 
@@ -361,7 +375,7 @@ class Bridge:
         self._intake.liveliness(alive=token[1])
 
     def _answer(self, query: zenoh.Query) -> None:
-        """Answer a query for a reconstructor; a text says why there is none."""
+        """Answer a query for a reconstructor, with an error text if there is none."""
         with query:
             key, part = str(query.key_expr), query.parameters.get("chunk")
             try:
@@ -372,7 +386,7 @@ class Bridge:
                 if part is None:
                     signed = self._signatures.sign(key, data)
                     query.reply(key, signed, encoding=wire.Encodings.COMMIT)
-                else:  # what the signed manifest has the sum of
+                else:  # not signed: the signed manifest has the checksum of all chunks
                     query.reply(key, data, encoding=wire.Encodings.BYTES)
 
     def _prepare(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> Offer:
@@ -389,20 +403,21 @@ class Bridge:
         return offer
 
     def _publish(self, manifest: wire.Manifest, matrix: NDArray[np.float32]) -> None:
-        session = self._driven()
+        session = self._require_lead()
         offer = self._prepare(manifest, matrix)
         keys, name = self._keys, manifest.id
         for index, part in enumerate(offer.parts):
             link.put(session, keys.chunk(name, index), part, wire.Encodings.BYTES, urgent=False)
         other = self._intake.other_session
-        if other is not None:  # it may list its slopes otherwise
+        # An RTC in another session may use another slope order or configuration.
+        if other is not None:
             raise LinkError(f"{name} was not sent: the RTC may have begun session {other}")
         signed = self._signatures.sign(keys.commit(name), offer.commit)
         link.put(session, keys.commit(name), signed, wire.Encodings.COMMIT, urgent=True)
         self._log.info("reconstructor.sent", id=manifest.id, n_chunks=len(offer.parts))
 
     def _command(self, command: wire.Command) -> wire.Reply:
-        answer = link.send_command(self._driven(), self._endpoint, command, self._signatures)
+        answer = link.send_command(self._require_lead(), self._endpoint, command, self._signatures)
         try:
             reply = wire.decode(wire.Reply, answer)
         except WireError as error:
@@ -412,7 +427,7 @@ class Bridge:
             raise LinkError(f"the RTC answered command {command.id} with a reply to {reply.id}")
         return reply
 
-    def _tell(self, key: str, data: bytes, encoding: str) -> None:
+    def _publish_last(self, key: str, data: bytes, encoding: str) -> None:
         publisher = self._publishers.get(key)
         if publisher is None:
             raise LinkError(f"cannot send on {key}: the link is not open")
@@ -420,14 +435,17 @@ class Bridge:
             return
         publisher.put(data, encoding=encoding)
 
-    def _driven(self) -> zenoh.Session:
-        """Return the session of a service that may command and publish: the last guard."""
-        session = self._opened()
+    def _require_lead(self) -> zenoh.Session:
+        """Return the session if this service may send commands and matrices.
+
+        This is the last of several checks that two services never command one RTC.
+        """
+        session = self._require_session()
         if not self._standby.drives:
-            raise LinkError("another service drives the RTC: this one stands by")
+            raise LinkError("another service drives the RTC, and this one is in standby")
         return session
 
-    def _opened(self) -> zenoh.Session:
+    def _require_session(self) -> zenoh.Session:
         if self._session is None:
             raise LinkError(f"the link of {self._endpoint.system} is not open")
         return self._session

@@ -1,7 +1,7 @@
-"""``step``: how one event changes the state, and which effects follow.
+"""The pure function ``step``: how one event changes the state, and which effects follow.
 
-``step`` is a function of state, event and time alone: no clock, no files, no link. A recorded
-night therefore replays exactly, and every reaction of the service can be tested as a value.
+``step`` depends on state, event, policy and time only; it uses no clock, file or network. A
+recorded night therefore replays exactly, and tests compare the returned state and effects.
 """
 
 from __future__ import annotations
@@ -55,36 +55,38 @@ __all__ = ["Command", "Event", "Policy", "step"]
 def step(
     state: TrackerState, event: Event, policy: Policy, now_ns: int, cause: str = ""
 ) -> tuple[TrackerState, tuple[Effect, ...]]:
-    """Return the next state and what is to be done.
+    """Return the next state and the effects to carry out.
 
     Parameters
     ----------
     state
-        What is known.
+        Present state; it is not changed.
     event
-        What has happened, or a command.
+        Event from the RTC, the worker or the clock, or a command of an operator.
     policy
-        The user's numbers.
+        Thresholds and limits from the settings.
     now_ns
-        The service's clock, nanoseconds.
+        Time of the service, nanoseconds since the Unix epoch, UTC.
     cause
-        Id of the command or event that has led to this one; empty: it stands for itself, and what
-        it leads to has its own.
+        Id of the command or event that led to this one; if empty, a new id is made. Effects and
+        log lines carry it.
 
     Raises
     ------
     CommandError
-        If an operator's command cannot be carried out in this state; the state stands.
+        If a command cannot be carried out in this state, which then remains as it is.
     UnknownIdError
-        If it names an unknown reconstructor.
+        If a command names an unknown reconstructor.
     """
     if isinstance(event, Command):
         interlocks.require(state, event, policy, now_ns)
     cause = cause or ev.new_id(ev.kebab(type(event)), now_ns)
     context = StepContext(state, policy, now_ns, cause)
     event = pointing_law.event_of_now(context, event)
+    # Alarms are derived before and after each part: time alone can raise one, and the second part
+    # must see those that the event has raised, because they forbid operations.
     derive_alarms(context)
-    for part in (_react, _go_on):
+    for part in (_react, _advance):
         part(context, event)
         derive_alarms(context)
     ordered = isinstance(event, Command)
@@ -93,7 +95,7 @@ def step(
 
 
 def _react(context: StepContext, event: Event) -> None:
-    """Take the event in."""
+    """Update the state with the event; see :data:`REACTIONS`."""
     measurement.give_up_lost(context, event)
     reaction = REACTIONS.get(type(event))
     if reaction is not None:
@@ -104,8 +106,9 @@ def _react(context: StepContext, event: Event) -> None:
     note_declined(context, rejected=isinstance(event, cmd.Reject))
 
 
-def _go_on(context: StepContext, event: Event) -> None:
-    """Let what runs go on, and decide what else is wanted: what has the mirror comes first."""
+def _advance(context: StepContext, event: Event) -> None:
+    """Advance the operation that is running, and decide on updates if none needs the mirror."""
+    # The RTC measures an interaction matrix with the loop open and must not be disturbed.
     if context.state.measuring is not None:
         return
     fetch_in_use(context)
@@ -122,19 +125,19 @@ def _go_on(context: StepContext, event: Event) -> None:
 
 
 def _on_tick(context: StepContext, _: ev.Tick) -> None:
-    """Let what depends on the time alone age: the RTC's silence, α, alarms."""
+    """Update what depends on time alone: silence of the RTC, age of α, alarms."""
     rtc.on_tick(context)
     validity.age_registration(context)
     operator.close_again(context)
 
 
 def _on_log_event(context: StepContext, event: ev.LogEvent) -> None:
-    """Put it on record."""
+    """Record the event in the log."""
     context.log(event.name, event.text, event.level)
 
 
 def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
-    """Raise or end its alarm; stop a dither that the mirror does not follow."""
+    """Raise or end the alarm of a condition; stop a dither that the mirror does not follow."""
     if event.over:
         validity.end_alarm(context, event.name, event.t_ns_utc)
     elif event.name == alarms.MIRROR_SILENT:
@@ -144,7 +147,7 @@ def _on_condition(context: StepContext, event: ev.ConditionChanged) -> None:
 
 
 def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
-    """Take α and what the dithered modes have shown from a window."""
+    """Update α, the verified modes and the precision of the dither from a window."""
     if context.state.measuring is not None:
         window_processing.reject_window(context, measurement.MEASURING)
         return
@@ -154,7 +157,7 @@ def _on_window(context: StepContext, event: ev.WindowFitted) -> None:
 
 
 def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
-    """Propose a reconstructor that was made, or send it where that is what it was made for."""
+    """Propose a new reconstructor, or send it if it was made for a rollback."""
     if context.acquisition.under_way:
         reconstructors.propose(context, made.record)
     elif probation.is_way_back(context.state, made):
@@ -164,22 +167,22 @@ def _on_made(context: StepContext, made: ev.MatrixMade) -> None:
 
 
 def _on_dither_measured(context: StepContext, event: ev.DitherMeasured) -> None:
-    """Stop a dither that is stronger in the light than was asked for."""
-    loud = dither.why_too_strong(context, event)
-    if loud is not None:
+    """Stop a dither that is measured to be stronger than requested."""
+    reason = dither.why_too_strong(context, event)
+    if reason is not None:
         noisy_measurement.fail_noisy_measurement(
             context, f"its dither was too strong: {event.text}"
         )
-        dither.stop_too_strong(context, event.id, loud)
+        dither.stop_too_strong(context, event.id, reason)
 
 
 def _on_unusable(context: StepContext, event: ev.DitherUnusable) -> None:
-    """Put on record that windows of this dither cannot be cut."""
+    """Log that no windows can be cut from this dither."""
     context.warn("dither.unusable", event.text)
 
 
 def _on_answer(context: StepContext, answered: ev.Answered) -> None:
-    """Note what the RTC says to a request, where the request came from."""
+    """Pass the RTC's reply to the part of the tracker that sent the request."""
     reply = answered.reply
     match answered.request:
         case DitherRequest() as request:
@@ -196,7 +199,7 @@ def _on_answer(context: StepContext, answered: ev.Answered) -> None:
 
 
 def _on_failure(context: StepContext, failed: ev.JobFailed) -> None:
-    """Note that something could not be done, where it was asked for."""
+    """Pass the failure of an effect to the part of the tracker that requested it."""
     match failed.effect:
         case ev.Ask(request=MeasureRequest(id=name)):
             measurement.fail_measurement(context, context.state.measurement(name), failed.text)
@@ -260,10 +263,11 @@ REACTIONS: Final[dict[type, Callable[[StepContext, Any], object]]] = {
     cmd.Publish: operator.publish,
     cmd.Rollback: operator.roll_back,
 }
-"""What takes in each event and each command, before the operation that runs is given it.
+"""Function that updates the state for each kind of event and command.
 
-One entry for every kind of either but what an operation alone can use: ``TAKEN_BY_OPERATIONS``.
+It is called before the operation that is running receives the event. Events in
+``TAKEN_BY_OPERATIONS`` have no entry.
 """
 
 TAKEN_BY_OPERATIONS: Final = frozenset({ev.WideCaptureFitted})
-"""Nothing of the state depends on these but an operation; without one they mean nothing."""
+"""Events that only an operation uses; they are ignored if none is running."""

@@ -1,6 +1,7 @@
-"""A telescope of OOPAO's in a loop of pyRTC's, both as they are shipped, stepped frame by frame.
+"""Bench with a simulated telescope of OOPAO in a loop of pyRTC, run frame by frame.
 
-``pip install pyrtcao==2.1.0 oopao==1.0.0``. Both are GPL-3.0-or-later: imported here, never copied.
+Needs ``pip install pyrtcao==2.1.0 oopao==1.0.0``. Both packages are GPL-3.0-or-later; they are
+imported here and never copied.
 """
 
 import contextlib
@@ -8,13 +9,13 @@ import io
 import os
 from collections import deque
 
-os.environ.update(OOPAO_BACKEND="cpu", OOPAO_PRECISION="32")  # read when it is imported
+os.environ.update(OOPAO_BACKEND="cpu", OOPAO_PRECISION="32")  # read at import
 os.environ.setdefault("PYRTC_LOG_LEVEL", "WARNING")
 
 import h5py
 import numpy as np
 
-with contextlib.redirect_stdout(io.StringIO()):  # it greets
+with contextlib.redirect_stdout(io.StringIO()):  # OOPAO prints a banner
     from OOPAO.Atmosphere import Atmosphere
     from OOPAO.calibration.compute_KL_modal_basis import compute_KL_basis
     from OOPAO.calibration.InteractionMatrix import InteractionMatrix
@@ -30,18 +31,21 @@ from pyrtc.streams import clear_shms
 from pyrtc.utils import generate_circular_aperture_mask
 
 N, SAMPLING, SEPARATION = 12, 4, 4
-"""Subapertures across, points of the pupil in each, pixels between two images of the pupil."""
+"""Subapertures across the pupil, pupil samples across each, pixels between two pupil images."""
 
 DIAMETER_M, MODULATION, COUPLING, R0_M, OUTER_SCALE_M, MAGNITUDE = 3.6, 2.0, 0.35, 0.15, 25.0, 4.0
 RATE_HZ, GAIN, LEAK, DELAY = 500.0, 0.5, 0.99, 2
 STROKE_M = 1e-9
 MASK = generate_circular_aperture_mask(N, N / 2, 0.0)
-"""pyRTC's valid pixels; OOPAO is told to take the same."""
+"""Valid pixels of pyRTC; OOPAO's pyramid is configured with the same."""
 
 POINTS = N * SAMPLING
 GRID = (POINTS - 1) / POINTS
-"""OOPAO counts a pupil of ``POINTS`` pixels as ``POINTS - 1`` steps: its mirror is so much smaller,
-its modulation so much wider."""
+"""Ratio of lengths in OOPAO to real ones.
+
+OOPAO counts a pupil of ``POINTS`` pixels as ``POINTS - 1`` steps, which makes its mirror smaller
+and its modulation wider by this ratio.
+"""
 
 INSTRUMENT = f"""
 [instrument]
@@ -75,7 +79,7 @@ orientation = "auto"
 
 
 class Bench:
-    """Telescope, mirror and loop; where the mirror lies is what pyrcal has to find."""
+    """Telescope, mirror and loop, with a misregistration that pyrcal has to estimate."""
 
     def __init__(self, shift_subap=(0.0, 0.0), rotation_deg=0.0):
         with contextlib.redirect_stdout(io.StringIO()):
@@ -106,7 +110,7 @@ class Bench:
         self.pyramid.compute_focal_plane, self.pyramid.nJobs = False, 1
 
     def _build_loop(self):
-        """Make pyRTC's components in the order of its streams; nothing runs by itself."""
+        """Make pyRTC's components in the order of its streams, without starting their threads."""
         self.streams = {
             name: f"pyrcal-{os.getpid()}-{name}"
             for name in ("wfs_raw", "wfs", "signal", "signal_2d", "wfc", "wfc_2d")
@@ -134,7 +138,7 @@ class Bench:
         self.context = context
 
     def write_instrument(self, folder):
-        """Write ``oopao.toml`` for pyrcal, and what it refers to: the mirror as it was drawn."""
+        """Write the instrument file ``oopao.toml`` with the nominal geometry of the mirror."""
         with h5py.File(folder / "oopao.h5", "w") as file:
             file["positions"] = self.aligned.coordinates * GRID
             file["modes"] = self.modes
@@ -144,7 +148,7 @@ class Bench:
         return path
 
     def take_reference(self):
-        """Take the slopes of a flat wavefront for reference, without noise."""
+        """Set the reference slopes to those of a flat wavefront, without noise."""
         self.context.remove_atmosphere()
         self.camera.expose()
         self.slopes.compute_signal()
@@ -156,22 +160,22 @@ class Bench:
         flat = np.zeros(self.slopes.ref_slopes.shape, np.float32)
         self.slopes.set_ref_slopes(self.slopes.compute_signal_2d(signal, out=flat))
 
-    def measured_by_oopao(self, mirror):
-        """Return OOPAO's own interaction matrix of a mirror ``(n_slopes, n_modes)``, noise-free."""
+    def measure_with_oopao(self, mirror):
+        """Return OOPAO's interaction matrix of a mirror ``(n_slopes, n_modes)``, without noise."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.context.remove_atmosphere()
-            told = (self.star, self.telescope, mirror, self.pyramid, self.modes, STROKE_M)
-            return InteractionMatrix(*told, invert=False, single_pass=False).D
+            parts = (self.star, self.telescope, mirror, self.pyramid, self.modes, STROKE_M)
+            return InteractionMatrix(*parts, invert=False, single_pass=False).D
 
     def use(self, matrix, gain=GAIN):
-        """Let the loop multiply with ``matrix`` ``(n_controlled, n_slopes)`` from now on."""
+        """Set the reconstructor of the loop, ``matrix`` ``(n_controlled, n_slopes)``."""
         self.loop.cm[:] = 0.0
         self.loop.cm[: len(matrix)] = matrix
         self.loop.num_active_modes = len(matrix)
-        self.loop.set_gain(gain)  # rebuilds what it multiplies with
+        self.loop.set_gain(gain)  # pyRTC multiplies gain and matrix only here
 
     def begin(self, seed):
-        """Begin again under a sky of its own, the mirror flat and the loop closed."""
+        """Start a new realisation of turbulence with a flat mirror and the loop closed."""
         self.context.add_atmosphere()
         self.air.generateNewPhaseScreen(seed)
         self.pyramid.cam.photonNoise = True
@@ -180,7 +184,7 @@ class Bench:
         self.loop.start()
 
     def flatten(self):
-        """Take everything off the mirror, and out of the integrator."""
+        """Set the mirror flat and the integrator to zero."""
         self.corrector.flat[:] = 0.0
         self.played = deque([np.zeros(self.n_modes)] * DELAY, DELAY)
         for _ in range(DELAY):
@@ -188,9 +192,10 @@ class Bench:
             self.corrector.send_to_hardware()
 
     def frame(self, dither_m):
-        """Return slopes, commands and dither of one frame, the latter as they were on the mirror.
+        """Run one frame; return its slopes, and commands and dither as they were on the mirror.
 
-        ``dither_m`` ``(n_modes,)`` is on it ``DELAY`` frames later, beside the loop's answer.
+        ``dither_m`` ``(n_modes,)`` is added to the command that reaches the mirror ``DELAY`` frames
+        later.
         """
         self.camera.expose()
         self.slopes.compute_signal()
@@ -204,18 +209,19 @@ class Bench:
             self.loop.leaky_integrator()
         else:
             self.loop.send_to_wfc(self.loop.flat)
-        self.corrector.flat[:] = self.modes @ dither_m  # added behind the integrator
+        # The flat of the corrector is added after the integrator, which must not hold the dither.
+        self.corrector.flat[:] = self.modes @ dither_m
         self.corrector.send_to_hardware()
         self.played.append(dither_m)
         return row
 
     @property
     def residual_m(self):
-        """RMS over the pupil of the wavefront that the last frame has seen, metres."""
+        """Residual wavefront of the last frame, metres RMS over the pupil."""
         return float(np.std(self.star.OPD[self.telescope.pupil > 0]))
 
     def close(self):
-        """End pyRTC's components and remove their streams."""
+        """Close pyRTC's components and remove their shared memory."""
         for part in (self.loop, self.corrector, self.slopes, self.camera):
             part.close()
         clear_shms(self.streams.values())

@@ -1,4 +1,4 @@
-"""The bench as an RTC of pyrcal's contract: telemetry out, dithers and matrices in."""
+"""Bridge from the pyRTC bench to pyrcal: telemetry out, commands and matrices in."""
 
 import math
 import threading
@@ -25,26 +25,27 @@ from service.wire import (
 
 from .bench import DELAY, RATE_HZ
 
-MOST_DITHER_M, MOST_DITHER_MODES = 60e-9, 8
+MAX_DITHER_M, MAX_DITHER_MODES = 60e-9, 8
 BATCH, DT_NS = 10, round(1e9 / RATE_HZ)
 
 
 class Bridge:
-    """What pyrcal asks of an RTC (``pyrcal.rtc.Computer``), of a bench of pyRTC's.
+    """RTC for pyrcal (``pyrcal.rtc.Computer``) on a bench of pyRTC.
 
-    One thread makes frames; the others ask and command, and are heard between two frames.
+    One thread runs frames. Commands and matrices come in other threads and take effect between two
+    batches of frames.
     """
 
     def __init__(self, bench, system, matrix):
         self.bench, self.lock = bench, threading.Lock()
-        basis = checksum(bench.modes.astype(np.float32))[:8]  # OOPAO's differ from run to run
+        basis = checksum(bench.modes.astype(np.float32))[:8]  # OOPAO's modes differ from run to run
         names = {"basis_id": f"kl-{bench.n_modes}-{basis}", "config_id": "pyramid"}
         self.identity, now_ns = Identity(system=system, **names), time.time_ns()
         name = f"own-{checksum(matrix)[:12]}"
         self.reconstructor = Reconstructor.own(name, matrix, self.identity, created_ns=now_ns)
         self.staged, self.swaps, self.dither, self.n_next = None, [], None, len(matrix)
         self.modal_gains, self.reference = np.ones(bench.n_modes), bench.reference
-        self.before, self.wanted = None, None
+        self.before, self.scheduled = None, None
         self.session, self.seq, self.start_ns = new_session(), 0, time.time_ns()
         bench.use(matrix)
 
@@ -76,11 +77,11 @@ class Bridge:
 
     def execute(self, command):
         with self.lock:
-            reason, start_seq = self._obey(command)
+            reason, start_seq = self._execute(command)
         return Reply(id=command.id, accepted=not reason, reason=reason, start_seq=start_seq)
 
-    def _obey(self, command):
-        """Return why not, and from which frame on."""
+    def _execute(self, command):
+        """Execute a command; return the reason of a refusal, and the first frame of its effect."""
         if isinstance(command, DitherStop):
             self.dither = None
         elif isinstance(command, DitherRequest):
@@ -97,34 +98,35 @@ class Bridge:
             return "unsupported: pyRTC measures and tunes by its own means", None
         return "", None
 
-    def _refusal(self, asked):
+    def _refusal(self, request):
         if self.dither is not None:
             return f"busy: {self.dither.request.id} plays"
-        if asked.frequency_hz is None:
+        if request.frequency_hz is None:
             return "unsupported: random signs"
         return check_dither(
-            asked,
+            request,
             n_modes=self.bench.n_modes,
             frame_rate_hz=RATE_HZ,
-            max_amplitude_m=MOST_DITHER_M,
+            max_amplitude_m=MAX_DITHER_M,
             max_duration_s=math.inf,
-            max_modes=MOST_DITHER_MODES,
+            max_modes=MAX_DITHER_MODES,
         )
 
-    def _change_loop(self, asked):
+    def _change_loop(self, request):
         loop = self.bench.loop
-        if asked.leak is not None:
-            loop.leaky_gain = 1.0 - asked.leak
-        if asked.gains is not None:
-            if len(asked.gains) != self.bench.n_modes:
-                return f"range: {len(asked.gains)} gains, expected {self.bench.n_modes}"
-            self._set_gains(np.array(asked.gains) / loop.gain)
-        self.n_next = asked.n_controlled or self.n_next
-        if asked.loop is Loop.OPEN and loop.running:  # that begins a session
+        if request.leak is not None:
+            loop.leaky_gain = 1.0 - request.leak
+        if request.gains is not None:
+            if len(request.gains) != self.bench.n_modes:
+                return f"range: {len(request.gains)} gains, expected {self.bench.n_modes}"
+            self._set_gains(np.array(request.gains) / loop.gain)
+        self.n_next = request.n_controlled or self.n_next
+        # Opening the loop zeroes the integrator, which begins a session by the contract.
+        if request.loop is Loop.OPEN and loop.running:
             loop.stop()
             self.bench.flatten()
             self.session, self.dither = new_session(), None
-        elif asked.loop is Loop.CLOSED:
+        elif request.loop is Loop.CLOSED:
             loop.start()
         return ""
 
@@ -133,7 +135,7 @@ class Bridge:
         self.bench.loop.set_modal_gains(modal_gains)
 
     def apply(self, path):
-        """Have a bundle applied between two frames, all of it or nothing; return its id."""
+        """Schedule a bundle for the next batch of frames, all of it or nothing; return its id."""
         bundle, takes = read_bundle(path), frozenset({"gain_factor", "reference_slopes"})
         place = Place(
             system=self.identity.system,
@@ -142,15 +144,15 @@ class Bridge:
             modes=self.bench.modes.T,
             takes=takes,
         )
-        why = why_not(bundle, place)
-        if why:
-            raise ConfigurationError(f"{path}: {why}; nothing was changed")
+        reason = why_not(bundle, place)
+        if reason:
+            raise ConfigurationError(f"{path}: {reason}; nothing was changed")
         matrix, now_ns = bundle.arrays["reconstructor"].astype(np.float32), time.time_ns()
         own = Reconstructor.own(bundle.id, matrix, self.identity, created_ns=now_ns)
         gains = np.ones(self.bench.n_modes)
         if "gain_factor" in bundle.arrays:
             gains[: len(matrix)] = bundle.arrays["gain_factor"][: len(matrix)]
-        self.wanted = {
+        self.scheduled = {
             "reconstructor": own,
             "modal_gains": gains,
             "reference": bundle.arrays.get("reference_slopes", self.reference),
@@ -158,19 +160,19 @@ class Bridge:
         return bundle.id
 
     def roll_back(self):
-        """Have what ran before a bundle back between two frames, all of it; return its id."""
+        """Schedule the calibration before the last bundle for the next batch; return its id."""
         if self.before is None:
-            raise ConfigurationError("found no calibration before the one in use")
-        self.wanted = self.before
-        return self.wanted["reconstructor"].manifest.id
+            raise ConfigurationError("there is no earlier calibration to return to")
+        self.scheduled = self.before
+        return self.scheduled["reconstructor"].manifest.id
 
-    def _calibrate(self, wanted):
-        """Run with matrix, gains and reference of one calibration; that of before is kept."""
+    def _calibrate(self, scheduled):
+        """Use matrix, gains and reference slopes of a calibration, and keep the previous ones."""
         parts = ("reconstructor", "modal_gains", "reference")
         self.before = {name: getattr(self, name) for name in parts}
-        self.reconstructor, self.reference = wanted["reconstructor"], wanted["reference"]
+        self.reconstructor, self.reference = scheduled["reconstructor"], scheduled["reference"]
         self.bench.use(self.reconstructor.matrix)
-        self._set_gains(wanted["modal_gains"])
+        self._set_gains(scheduled["modal_gains"])
         if self.reference is not self.before["reference"]:
             self.bench.set_reference(self.reference)
         self.n_next = len(self.reconstructor.matrix)
@@ -194,13 +196,13 @@ class Bridge:
             basis_id=self.identity.basis_id,
             config_id=self.identity.config_id,
             dither=None if self.dither is None else self.dither.status,
-            max_dither_m=MOST_DITHER_M,
-            max_dither_modes=MOST_DITHER_MODES,
+            max_dither_m=MAX_DITHER_M,
+            max_dither_modes=MAX_DITHER_MODES,
             magnitude=None,
         )
 
     def time_ns(self, seq):
-        """Return the end of a frame's exposure: of the simulated sky, however long it takes."""
+        """Return the end of a frame's exposure in simulated time, which runs slower than real."""
         return self.start_ns + seq * DT_NS
 
     def _dither_m(self, first):
@@ -211,15 +213,15 @@ class Bridge:
         return np.zeros((BATCH, self.bench.n_modes)) if commands is None else commands
 
     def batch(self):
-        """Return header and rows of the next frames; a new matrix multiplies from the first on."""
+        """Run a batch of frames; return its header and rows. A staged matrix is used from it on."""
         with self.lock:
             if self.staged is not None:
                 self.reconstructor, self.staged = self.staged, None
                 self.bench.use(self.reconstructor.matrix)
                 self.swaps.append((self.reconstructor.manifest.id, self.seq))
-            if self.wanted is not None:
-                wanted, self.wanted = self.wanted, None
-                self._calibrate(wanted)
+            if self.scheduled is not None:
+                scheduled, self.scheduled = self.scheduled, None
+                self._calibrate(scheduled)
             header = FrameHeader(
                 session=self.session,
                 seq0=self.seq,
@@ -237,8 +239,8 @@ class Bridge:
             self.seq += BATCH
         return header, np.array(rows, dtype=np.float32)
 
-    def hear(self, folder):
-        """Do what lies in a folder: ``bundle.h5`` or ``bundle.fits``, or ``rollback``."""
+    def apply_files(self, folder):
+        """Apply ``bundle.h5`` or ``bundle.fits`` in a folder, or roll back for a ``rollback``."""
         for path in (folder / name for name in ("bundle.h5", "bundle.fits", "rollback")):
             if path.exists():
                 try:
@@ -255,7 +257,7 @@ class Bridge:
         with connection.open() as link:
             next_status_s, last_session = 0.0, None
             while self.seq < n_frames:
-                self.hear(folder)
+                self.apply_files(folder)
                 link.publish_frames(*self.batch())
                 if self.swaps:
                     link.report_matrices()

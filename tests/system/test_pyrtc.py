@@ -70,13 +70,13 @@ def test_a_bundle_is_applied_between_two_frames_and_rolled_back_as_one_piece(
     facts = {"instrument": "oopao"}
     turned = Bundle(id="cm-2", arrays=arrays | {"mode_to_actuator": -bench.modes}, facts=facts)
     write_bundle(tmp_path / f"bundle.{ending}", turned)
-    bridge.hear(tmp_path)
+    bridge.apply_files(tmp_path)
     bridge.batch()
     assert "found another basis" in capsys.readouterr().out
     assert all(map(np.array_equal, runs_with(bench), before))
 
     write_bundle(tmp_path / f"bundle.{ending}", Bundle(id="cm-2", arrays=arrays, facts=facts))
-    bridge.hear(tmp_path)
+    bridge.apply_files(tmp_path)
     assert all(map(np.array_equal, runs_with(bench), before)), "not in the midst of a frame"
     header, _ = bridge.batch()
     g_cm, gains, reference = runs_with(bench)
@@ -86,7 +86,7 @@ def test_a_bundle_is_applied_between_two_frames_and_rolled_back_as_one_piece(
     assert (header.cm_id, bridge.take_swaps()) == ("cm-2", [("cm-2", header.seq0)])
 
     (tmp_path / "rollback").touch()
-    bridge.hear(tmp_path)
+    bridge.apply_files(tmp_path)
     bridge.batch()
     assert all(map(np.array_equal, runs_with(bench), before))
     with pytest.raises(PyrcalError):

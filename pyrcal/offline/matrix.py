@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.advice import Grounds, explained, recommendation, with_displaced
+from pyrcal.offline.advice import Advice, Grounds, explained, recommendation, with_displaced
 from pyrcal.offline.alternatives import alternatives, off_centre, with_alternatives
 from pyrcal.offline.columns import (
     MAX_SMEAR,

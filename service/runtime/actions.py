@@ -33,10 +33,12 @@ from service.tracking.registration import Registration
 from service.tracking.state import TrackerState
 
 UNKNOWN_PARENT = "unknown"
-"""Stands for the matrix in use while nobody knows it: only the RTC's own have no parent."""
+"""Parent id of a matrix made while the matrix in use is unknown: only the RTC's own have no parent.
+"""
 
 MATRICES_KEPT = 3
-"""In memory, those asked for last: in use, the one before, a new one. Others are read again."""
+"""Matrices kept in memory, the most recently used: in use, the previous one, a new one. Others are
+read from the archive."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -396,7 +398,7 @@ class Actions:
 
 
 GAIN_SAFETY = 1.1
-"""Above a mean optical gain that nobody says which modes it is of."""
+"""Margin on a mean optical gain whose modes are unknown."""
 
 
 def loop_to_judge(state: TrackerState, gains: tuple[float, ...]) -> ControlLoop:
@@ -424,7 +426,7 @@ def expected_gains(registration: Registration, n_modes: int) -> NDArray[np.float
 
 
 def judged_now(state: TrackerState, gains: tuple[float, ...]) -> products.Judged:
-    """Return what a verdict that is asked for now will be of."""
+    """Return the conditions of a verdict requested now."""
     rtc, registration = _there(state), _registered(state)
     return products.Judged(
         session=rtc.session,

@@ -1,7 +1,7 @@
 """Keep the archive in step with the state, and its disk in order.
 
-What counts is written before it does, and waits until it is; what is old goes, a little at a time,
-and a disk that is almost full is told.
+What must survive is written before it takes effect. Old products are removed a little at a time,
+and a disk that is almost full raises an alarm.
 """
 
 from __future__ import annotations
@@ -36,29 +36,31 @@ from service.tracking.step_context import logged
 from service.wire import DitherRequest, MeasureRequest, OffloadRequest, RampRequest
 
 RETRY_S = 2.0
-"""Between two attempts while the disk refuses."""
+"""Interval between two attempts while the disk refuses."""
 
 SAVE_INTERVAL_S = 5.0
-"""Between two writes of what the next service needs; an α that old is as good as a new one."""
+"""Interval between two writes of the state for the next service; an α of that age is as good as a
+new one."""
 
 LOOK_S = 30.0
-"""Between two looks at the free space."""
+"""Interval between two checks of the free space."""
 
 PRUNE_S = 3600.0
-"""Between two looks for what is old."""
+"""Interval between two searches for old products."""
 
 REST_S = 0.5
-"""Between two products that are removed: others want the disk, too."""
+"""Pause between the removal of two products, which leaves the disk to others."""
 
 MAX_WAITING = 10_000
 """Lines of the audit trail, and estimates, that wait for a disk; newer ones are counted and
 dropped."""
 
 BEGINNINGS = (DitherRequest, MeasureRequest, RampRequest)
-"""What is not done unless why it is done is on the disk. What ends something never waits."""
+"""Effects that are executed only after their cause is on the disk. What ends something never waits.
+"""
 
 _LOGGED = ("who", "text", "address", "channel", "why", "answer")
-"""What the log tells of an order."""
+"""Fields of an order that the log contains."""
 
 
 class ArchiveWriter:
@@ -143,7 +145,7 @@ class ArchiveWriter:
         self._order(order, actor, ".answered", answer)
 
     def refused(self, order: GivenCommand, actor: Actor, error: Exception) -> None:
-        """Take down why an operator does not get what was asked for."""
+        """Record why an order was refused."""
         self._order(order, actor, ".refused", str(error))
 
     def _order(self, order: GivenCommand, actor: Actor, end: str = "", answer: str = "") -> None:
@@ -353,9 +355,9 @@ def ids_of(text: str, state: TrackerState) -> dict[str, object]:
 
 
 def asked_for(command: Command, actor: Actor) -> str:
-    """Return the fields of a command that say more than who and why, as JSON.
+    """Return the fields of a command other than name and reason, as JSON.
 
-    Beside a key the name in the command is what somebody has called themselves.
+    With a key, the name in the command is only what its sender calls himself.
     """
     told = {"reason"} | ({"by"} if command.by == actor.key or not actor.key else set())
     said = {
@@ -372,9 +374,9 @@ def _loss_text(lost: int) -> tuple[AuditEntry]:
 
 
 def taken_up(archive: Archive, state: TrackerState, policy: Policy, now_ns: int) -> TrackerState:
-    """Return the state with the registration that was saved, if there is one and it fits.
+    """Return the state with the saved registration, if there is one and it fits.
 
-    A damaged file costs the α in it and nothing else. What else is wrong in the archive is told.
+    A damaged file costs only the α in it. Other problems of the archive are logged.
     """
     for text in archive.wrong:
         state = logged(state, "archive.damaged", text, now_ns, Level.WARNING)
@@ -413,11 +415,11 @@ def is_unsaved(before: TrackerState, after: TrackerState) -> bool:
 
 
 def is_urgent(before: TrackerState, after: TrackerState) -> bool:
-    """Return whether unsaved state cannot wait: an opened loop, an order.
+    """Return True if unsaved state must be written at once: an opened loop, an order.
 
-    A service killed a second later would leave its own loop open to one that cannot know, or one
-    that undoes what an operator has ordered; or would not know where the mirror's image was moved,
-    or which modes have answered otherwise than they should.
+    If the service were killed a second later, its successor would not know that the loop was
+    opened, or would undo an operator's order, or would not know where the mirror's image was moved,
+    or which modes have a wrong response.
     """
     if before.alpha.offload is not after.alpha.offload:
         return True
@@ -435,7 +437,7 @@ def _course(state: TrackerState) -> tuple[object, ...]:
 
 
 def needed(state: TrackerState) -> frozenset[str]:
-    """Return the ids of matrices that may be asked for at any moment."""
+    """Return the ids of matrices that may be needed at any moment."""
     ids = (
         state.matrices.in_use,
         state.previous,

@@ -1,6 +1,6 @@
 """Tasks on a running Dask cluster whose workers run this very version of pyrcal.
 
-Quick to import: ``distributed`` (the extra ``cluster``) is imported where a cluster is asked for.
+Quick to import: ``distributed`` (the extra ``cluster``) is imported when a cluster is used.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ CONNECT_S = 5.0
 """A scheduler that does not answer within so long is not there."""
 
 FETCH_S = 30.0
-"""A result that has not come within so long is asked for anew."""
+"""Time after which a missing result is requested again."""
 
 LOOK_S = 1.0
-"""Between two looks whether scheduler and workers are still there."""
+"""Interval between two checks of scheduler and workers."""
 
 EMPTY_S = 20.0
 """A cluster that has had no worker for so long has lost them: a nanny restarts one in less."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Of mallopt(3)."""
+"""Parameters of mallopt(3)."""
 
 PACKAGES = ("service", "sim_rtc", "pyrcal_studies")
-"""Whose code a task may run."""
+"""Packages whose code a task may run."""
 
 
 class Cluster:
@@ -68,7 +68,7 @@ class Cluster:
         self._seen_s = time.monotonic()
         self._submitting = threading.Lock()
         self._parts: list[tuple[object, Future]] = []
-        """What is with the workers already, of the last functions."""
+        """Functions and data that the workers already have."""
 
         self._checked: set[str] = set()
         """Workers that are of this version."""
@@ -258,9 +258,9 @@ class Cluster:
             raise ClusterError(f"{self.address}: found a scheduler without workers; {self._start}")
 
     def _check_workers(self) -> None:
-        """Refuse workers of another version: those that have come since the last time are asked.
+        """Reject workers of another version; only new workers are asked.
 
-        One without pyrcal ends by itself when it is given a task, and nobody would know why.
+        A worker without pyrcal ends when it is given a task, without any explanation.
         """
         came = sorted(set(self._workers()) - self._checked)
         if came:

@@ -1,4 +1,4 @@
-"""What came of an order, in one sentence; what came of a refit, by its id."""
+"""Results of orders in one sentence, and of refits by their id."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class CommandResult:
 
     text: str
     final: bool = True
-    """Whether waiting for the RTC, or for a verdict, could not tell more."""
+    """True if waiting for the RTC or for a verdict would not change the result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +194,8 @@ _TOLD_LATER: Final[dict[type, Callable[[Any, str, TrackerState], CommandResult]]
     cmd.MeasureNoisy: _measurement,
     cmd.StopEverything: _stopped,
 }
-"""What the RTC, or a verdict, has a say in; the others are done when they are answered."""
+"""Orders whose result depends on the RTC or on a verdict; the others are done when they are
+answered."""
 
 
 def _done(  # noqa: C901 - one line for each command
@@ -271,14 +272,14 @@ class RefitJob:
     id: str
     state: RefitState
     n_modes: int
-    """Modes asked for."""
+    """Number of modes requested."""
 
     asked_ns_utc: int
     reconstructor: str | None = None
     """Id of the one that was made; None: there is none, or not yet."""
 
     reason: str = ""
-    """What came of it, in words."""
+    """Result in words."""
 
 
 class Refits:

@@ -37,26 +37,26 @@ from service.tracking.state import TrackerState
 from service.wire import Status
 
 TOLD_S = 8.0
-"""A window that was accepted since then has told where the mirror is."""
+"""A window accepted within this time determines the registration."""
 
 STEADY_GATHER_S = 0.55
-"""Of frames, while nothing happens: windows last four times as long, and alarms have a second. Most
-often a status, which is heard at once, ends the wait before."""
+"""Duration of frames gathered while nothing happens: windows are four times as long, and alarms
+have a second. Usually a status, which is processed at once, ends the wait earlier."""
 
 Step = Callable[[TrackerState, Event, Policy, int, str], tuple[TrackerState, tuple[Effect, ...]]]
 
 
 class Driver(Protocol):
-    """What takes time, and is left to the engine's driver."""
+    """Executes what takes time on behalf of the engine."""
 
     def now_ns(self) -> int:
         """Return the time, nanoseconds UTC."""
 
     def stepped(self, before: TrackerState, event: Event) -> None:
-        """Hear that an event has led from this state to another."""
+        """Process that an event has led from one state to another."""
 
     def perform(self, effect: Effect) -> None:
-        """Begin what the tracker wants done; what comes of it is posted as an event."""
+        """Begin an effect; its result is posted as an event."""
 
     def fit(self, window: EndedWindow) -> None:
         """Take a window of telemetry that is to be fitted."""
@@ -104,9 +104,9 @@ class Engine:
         self._weigh_modes()
 
     def begin_anew(self) -> None:
-        """Give up what the estimators have gathered; they listen from here on.
+        """Reset all estimators.
 
-        The matrices stay: nobody hands them in again before the next swap.
+        The matrices are kept, because nobody passes them again before the next swap.
         """
         self._checked_out = None
         if self.bank is not None:
@@ -176,16 +176,16 @@ class Engine:
             self.checkin(bank, windows)
 
     def checkout(self) -> EstimatorBank | None:
-        """Return the estimators for another thread; None: the model is being prepared.
+        """Return the estimators for another thread; None while the model is being prepared.
 
-        Until they are given back they follow nothing, and nobody may have sums of them, or teach
-        them a matrix. A look that fails gives them back as they were.
+        Until they are returned they follow no change, have no sums, and learn no matrix. If the
+        other thread fails, it returns them unchanged.
         """
         self._checked_out = None if self.bank is None else (self.bank, self.state)
         return self.bank
 
     def checkin(self, bank: EstimatorBank, windows: Iterable[Window]) -> None:
-        """Take the estimators as they are after frames, unless they have begun anew meanwhile."""
+        """Take the estimators back after frames, unless they were reset meanwhile."""
         if self._checked_out is None:
             return
         (before, state), self._checked_out = self._checked_out, None
@@ -216,7 +216,7 @@ class Engine:
     def take_sums(self) -> list[PassiveSums | str | None]:
         """Return the sums of ordinary telemetry and begin new ones, or why there are none yet.
 
-        One entry per estimator; None: some is left out beside a dither. Ask every
+        One entry per estimator; None if telemetry is skipped next to a dither. To be called every
         ``PASSIVE_INTERVAL_S``.
         """
         if self.bank is None:
@@ -249,7 +249,7 @@ def follow_state(
 ) -> tuple[EstimatorBank, ev.DitherUnusable | None]:
     """Keep the streaming estimators in step with the RTC and the dither.
 
-    Returns them, and what to tell the tracker when the dither cannot be read.
+    Returns them, with a message for the tracker when the dither cannot be demodulated.
     """
     if blocking_alarm(state.alarms.active, Interlock.ASK) is not None:
         return with_rtc(bank, None), None

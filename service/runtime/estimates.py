@@ -41,7 +41,7 @@ from service.tracking.state import Level, TrackerState
 from service.wire import checksum
 
 MatrixOf = Callable[[str], NDArray[np.float32]]
-"""Returns a reconstructor ``(n_modes, n_slopes)`` by id; UnknownIdError if nobody has it."""
+"""Returns a reconstructor ``(n_modes, n_slopes)`` by id; UnknownIdError if it is not archived."""
 
 LONGEST_S = 30.0
 """Later ones are not joined to a window: α moves meanwhile."""
@@ -60,7 +60,7 @@ class PendingWindow:
 
     @property
     def waits(self) -> bool:
-        """Whether a window waits."""
+        """Return True if a window waits."""
         return self._window is not None
 
     def put(self, window: EndedWindow) -> WindowRefused | None:
@@ -170,9 +170,9 @@ def _reconstructor(
 async def fit_passive(
     every: Sequence[PassiveSums | str | None], state: TrackerState, workers: WorkerPort
 ) -> list[Event]:
-    """Return what estimators make of ordinary telemetry, or why none can make anything of it.
+    """Return the passive estimates, or the reason why there are none.
 
-    Empty: there is no more to tell than before.
+    Empty if nothing is new.
     """
     reasons = [sums for sums in every if isinstance(sums, str)]
     if len(reasons) == len(every):
@@ -325,7 +325,7 @@ class NoisySums:
         self._total: Correlated | None = None
 
     def take(self, window: Correlated, state: TrackerState) -> None:
-        """Add a window, if it is of the matrix under way and its telemetry can be believed."""
+        """Add a window if it belongs to the matrix under way and its telemetry is valid."""
         record, dither = state.noisy_measurement, state.dithers.dither
         if record is None or (dither is not None and dither.id != record.id):
             return

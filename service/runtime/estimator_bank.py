@@ -123,7 +123,7 @@ def _of_modes(loop: LoopContext, rtc: Status) -> LoopContext:
 
 
 def _changed(bank: EstimatorBank, loop: LoopContext, changes: Change) -> EstimatorBank:
-    """Return the bank of another loop: those begin anew that declare to."""
+    """Return the bank for a changed loop: members that declare one of the changes are reset."""
     members = tuple(
         member.begun_anew(loop, why) if (why := changes & member.resets) else member
         for member in bank.members
@@ -139,10 +139,10 @@ def with_matrix(bank: EstimatorBank, cm_id: str, matrix: NDArray[np.float32]) ->
 
 
 def with_dither(bank: EstimatorBank, dither: Dither | None, window_s: float) -> EstimatorBank:
-    """Follow the dither: a new one that has begun starts a new series of windows.
+    """Follow the dither: a new one begins a new series of windows.
 
-    One whose lines, or modes, cannot be told apart in a window of ``window_s`` gives none, and says
-    why.
+    A dither whose lines or modes cannot be separated in a window of ``window_s`` gives no windows,
+    with the reason.
     """
     rtc, played = bank.loop.rtc, None
     if dither is None or dither.start_seq is None or rtc is None:
@@ -206,7 +206,7 @@ def process_block(bank: EstimatorBank, block: FrameBlock) -> Fed:
 
 
 def _marked(frames: FrameContext, marks: Mark) -> FrameContext:
-    """Return a block with what one has said; where slopes stand, measurements begin after that."""
+    """Return a block with the marks of a member; after frozen slopes measurements begin again."""
     loop = frames.loop
     if Mark.STANDS in marks:
         seq = frames.block.next_seq + round(SETTLING_S * frames.rtc.frame_rate_hz)
@@ -243,7 +243,7 @@ def close_sums(
 ) -> tuple[EstimatorBank, dict[type[Streaming], PassiveSums | str | None]]:
     """Return the bank with new sums of ordinary telemetry, and the old ones of each estimator.
 
-    A text says why there are none, None that some telemetry is left out beside a dither.
+    A text is the reason why there are none; None means that telemetry is skipped next to a dither.
     """
     marks, members = bank.marks, list(bank.members)
     found: dict[type[Streaming], PassiveSums | str | None] = {}

@@ -1,4 +1,4 @@
-"""Whether the service still moves: a process that lives may stand still all the same."""
+"""Detect that a part of the service has stopped although its process lives."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Heartbeat:
 
     @property
     def stalled(self) -> str:
-        """Which part stands still, and for how long; empty: all go on."""
+        """Return the part that has stopped, and for how long; empty if all are running."""
         ages_s = {part: self._now_s() - beat_s for part, beat_s in self._beats_s.items()}
         return "; ".join(
             f"{part} has stood still for {age_s:.0f} s, expected a round within {STALLED_S:g} s: "

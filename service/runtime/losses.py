@@ -13,13 +13,14 @@ LOST_S: Final = 5.0
 """Losses are summed over so long."""
 
 LOST_SHARE: Final = 0.01
-"""Of the frames: more of them lost are an alarm, which half as many do not end."""
+"""Fraction of lost frames that raises an alarm; half of it does not end the alarm."""
 
 SLOW_S: Final = 2.0
 """Frames that come are counted over so long."""
 
 SLOW_SHARE: Final = 0.25
-"""Of the rate before: fewer are an alarm, which twice as many do not end."""
+"""Fraction of the previous frame rate below which an alarm is raised; twice as much does not end
+it."""
 
 NO_FRAMES_S: Final = 2.0
 """Frames, of which tens come a second, are missed after so long."""
@@ -27,7 +28,7 @@ NO_FRAMES_S: Final = 2.0
 WHAT_TO_DO: Final = "check the network, the RTC's publisher, and what else this machine does"
 
 Counts = deque[tuple[float, LinkStatistics]]
-"""Moments, and the counters of then."""
+"""Times with the counters at each."""
 
 
 def silence(rtc: Status | None, frame_age_s: float | None) -> dict[str, str]:

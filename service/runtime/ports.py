@@ -44,7 +44,7 @@ class WorkerPort(Protocol):
     """Interface of the worker; :class:`service.runtime.workers.WorkerPool` is the real one."""
 
     first: Callable[[], Done[None]] | None
-    """What every new worker does before anything else; None: nothing."""
+    """First job of every new worker; None if there is none."""
 
     found_slopes: SlopeRecipe | None
     """Order and signs of the slopes that were found on the sky, for every new worker, whatever the
@@ -89,7 +89,7 @@ class StorePort(Protocol):
 
     @property
     def measured(self) -> MeasuredPort[NDArray[np.float32]]:
-        """Those the RTC has measured, ``(n_slopes, n_modes)``."""
+        """Return matrices measured by the RTC, ``(n_slopes, n_modes)``."""
 
     @property
     def noisy(self) -> MeasuredPort[NoisyNumbers]:

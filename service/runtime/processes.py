@@ -1,11 +1,11 @@
-"""A job in a process of its own, killed at any moment.
+"""Run a job in a separate process that can be killed at any moment.
 
-Whoever waits for one waits in a thread, on a pipe: a process that is killed, even one that is
-stopped, closes the pipe, and the wait is over. An executor of the standard library waits for its
-process to finish instead, and the service with it.
+The caller waits in a thread, on a pipe. A process that is killed, even a suspended one, closes the
+pipe, and the wait ends. An executor of the standard library would wait for its process to finish
+instead.
 
-Nothing here takes long to import: a process can be begun at once, and imports :data:`ITS_WORK`
-while its parent does.
+This module is quick to import: a process can be started at once, and imports :data:`ITS_WORK` while
+its parent does.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from threadpoolctl import threadpool_limits
 from service.errors import PyrcalError, WorkerError
 
 ITS_WORK = "service.runtime.worker"
-"""What every process imports before its first work."""
+"""Module that every process imports before its first job."""
 
 APART_BYTES = 1 << 16
 """An array that is larger is not copied to be sent: windows of many modes are 45 MB."""
@@ -56,9 +56,10 @@ class JobProcess:
         return None if self._process is None else self._process.pid
 
     def cpu_s(self) -> float:
-        """Return the processor time it has taken, as the kernel counts it; the clock elsewhere.
+        """Return the processor time used, as the kernel counts it.
 
-        Where there is no such file a process cannot be told to stand still: it never seems to.
+        On a system without such a file it is the wall clock: the process then never appears to be
+        stopped.
         """
         if self.pid is None:
             return 0.0
@@ -94,7 +95,7 @@ class JobProcess:
         return cast(R, answer)
 
     def kill(self) -> None:
-        """Kill the process at once; whoever waits for it goes on."""
+        """Kill the process at once; the caller's wait ends."""
         self._ended.set()
         process = self._process
         if process is not None:
@@ -164,7 +165,7 @@ def _work(line: Connection, nice: int, imports: str) -> None:
 
 
 def _send(line: Connection, what: object) -> None:
-    """Send an object: its arrays as they lie in memory, the rest pickled."""
+    """Send an object: its arrays as raw memory, the rest pickled."""
     buffers: list[memoryview] = []
 
     def is_small(buffer: pickle.PickleBuffer) -> bool:

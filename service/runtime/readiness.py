@@ -31,7 +31,8 @@ SILENT_S: Final = 3.0
 """A status that has not come for so long is waited for."""
 
 REVIVED_AFTER_S: Final = 10.0
-"""With the RTC's token there and no message, until the link is opened anew for the first time."""
+"""Time with the RTC's token and no message after which the link is opened again for the first time.
+"""
 
 REVIVED_AT_MOST_S: Final = 300.0
 """Longest time between two such attempts."""
@@ -40,7 +41,7 @@ FAULT_S: Final = 10.0
 """A message that broke the contract is complained of for so long."""
 
 UNUSED_SHARE: Final = 0.1
-"""Of the frames that come: more of them lost to their own faults are an alarm."""
+"""Fraction of frames lost by faults of their own that raises an alarm."""
 
 MAX_STATUSES_HZ: Final = 25.0
 """More than twice what the contract allows is a flood."""
@@ -49,13 +50,13 @@ OVER_NS: Final = 3 * SECOND_NS
 """A complaint that has not been made for so long is over."""
 
 FAULTS: Final = ("leap", "sequence", "shape", MALFORMED)
-"""What becomes of frames only where the RTC breaks the contract, be it once."""
+"""Outcomes of frames that always mean a violation of the contract."""
 
 NAMED_ELSEWHERE: Final = ("basis", "config")
-"""What becomes of frames under an alarm of its own."""
+"""Outcomes of frames that have an alarm of their own."""
 
 LOG_AFTER_NS: Final = 2 * SECOND_NS
-"""What is waited for no longer than this need not be put on record."""
+"""Conditions that last no longer than this are not logged."""
 
 LOG_EVERY_NS: Final = 60 * SECOND_NS
 """Least time between two records of the same."""
@@ -144,10 +145,10 @@ def _flood(link: LinkStatistics) -> str:
 def detect_link_changes(
     link: LinkStatistics, state: TrackerState, now_ns: int, also: Mapping[str, str] = NOTHING_ELSE
 ) -> list[ev.Event]:
-    """Return which complaints are made, again or anew, and which are over.
+    """Return the alarms of the link that begin, continue or end.
 
-    ``also`` are those of others, by name; empty: none.
-    One that differs in its numbers alone keeps its text: that is no news.
+    ``also`` are alarms of other sources by name; empty text for none. A text that differs in its
+    numbers only is kept, because it is no news.
     """
     made, found = complaints(link), []
     if not any(f.outcome in NAMED_ELSEWHERE and f.age_s < RECENT_S for f in link.dispositions):
@@ -176,19 +177,19 @@ class ReadinessInputs:
     """The worker prepares the optical model."""
 
     worker_problem: str = ""
-    """What is wrong with the worker; empty: nothing."""
+    """Problem of the worker; empty if there is none."""
 
     reading: bool = False
     """The RTC's own reconstructor is being read, and windows wait for that."""
 
     @property
     def frames_come(self) -> bool:
-        """Whether frames, used or not, came of late."""
+        """Return True if frames, used or not, have arrived recently."""
         return any(f.kind == "frames" and f.age_s < 1.0 for f in self.link.dispositions)
 
     @property
     def status_silent_s(self) -> float:
-        """For how long no status has been taken in."""
+        """Return the time since the last accepted status, seconds."""
         age_s = self.link.status_age_s
         return self.link.session_age_s if age_s is None else age_s
 
@@ -377,11 +378,11 @@ _LOOKS: Final[tuple[Callable[[ReadinessInputs], Iterator[Prerequisite]], ...]] =
 
 
 class Revival:
-    """Opens the link anew when the RTC's token is there and nothing arrives.
+    """Opens the link again when the RTC's token exists and no message arrives.
 
-    After a standstill of both ends zenoh can leave a connection over under the RTC's name. It
-    carries the token and nothing else, and the router lets no second one of that name in: the RTC
-    runs, and nothing of it arrives until one of the ends begins anew.
+    After both ends were suspended, zenoh may keep a dead connection under the RTC's name. It
+    carries the token and nothing else, and the router accepts no second connection of that name:
+    the RTC runs, and nothing of it arrives until one of the ends opens a new session.
     """
 
     __slots__ = ("_since_s", "_wait_s")
@@ -407,7 +408,7 @@ class Revival:
 
 
 class ReadinessLog:
-    """Which waits are on record: each once it has lasted, and no more often than now and then."""
+    """Logs conditions that the service waits for, once they have lasted, and not too often."""
 
     __slots__ = ("_logged_ns", "_since_ns")
 

@@ -25,13 +25,13 @@ from service.tracking.events import Event
 from service.tracking.state import TrackerState
 
 Changes = Callable[[Any, Any, LoopContext, TrackerState], list[Event]]
-"""What the tracker should hear of a detector: as it was before these blocks, as it is now."""
+"""Returns the tracker's events of a detector, from its state before these blocks and after."""
 
 
 def _dither(
     before: DitherWatch, watch: DitherWatch, loop: LoopContext, state: TrackerState
 ) -> list[Event]:
-    """Return that a dither is missed, twice a second, or is otherwise than it was asked for."""
+    """Return the event that a dither is missing, twice a second, or differs from its request."""
     found: list[Event] = []
     if loop.dither is None:
         return found
@@ -108,10 +108,10 @@ class Entry:
 
     kind: type[Streaming]
     alarms: Mapping[str, str] = field(default_factory=dict)
-    """Of its conditions, in their order, and what is said when each is over."""
+    """Alarms of its conditions, in their order, with the text for the end of each."""
 
     events: Changes | None = None
-    """What else the tracker hears of it."""
+    """Returns its other events."""
 
     def conditions(self, member: Streaming) -> list[tuple[str, str | None, str]]:
         """Return name, text (None: all is well) and what is said when it is over, of each alarm."""

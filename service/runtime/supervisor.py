@@ -49,7 +49,7 @@ GATHER_S = 0.16
 """Between two visits to the link at the least: each costs two milliseconds, whatever there is."""
 
 ANSWERED_WITHIN_S = 3.0
-"""For the RTC, or the gate, to answer while whoever gave an order waits."""
+"""Time for the RTC or the gate to answer before the response to an order is sent."""
 
 NOT_READ = "the RTC's own reconstructor had not been read yet: the window was given up"
 
@@ -109,11 +109,11 @@ class Supervisor:
         )
         self._telemetry_executor = ThreadPoolExecutor(1, "telemetry")
         self._telemetry_lock = asyncio.Lock()
-        """Held by whoever has, or changes, the estimators."""
+        """Held while estimators are used or changed."""
         self._running: set[asyncio.Task[None]] = set()
         self._heartbeat = Heartbeat()
         self._broken = ""
-        """The last fault that nobody foresaw."""
+        """Last unforeseen error."""
         self._started_ns = self._clock.now_ns()
         self._log = structlog.get_logger().bind(system=state.system)
 
@@ -316,9 +316,9 @@ class Supervisor:
 
     @contextlib.contextmanager
     def _surviving(self, what: str) -> Iterator[None]:
-        """Go on after an unforeseen fault: log it, begin the estimators anew.
+        """Continue after an unforeseen error: log it and reset the estimators.
 
-        The estimators begin anew before anything is posted: each event leads them on.
+        The estimators are reset before anything is posted, because each event advances them.
         """
         try:
             yield
@@ -374,7 +374,7 @@ class Supervisor:
             await asyncio.sleep(1.0)
 
     async def _reopen_link(self) -> None:
-        """Open the link anew, for as long as that takes."""
+        """Open the link again."""
         while True:
             self._heartbeat.beat("the tick")
             try:
@@ -424,13 +424,14 @@ class Supervisor:
         self._tell(before)
 
     def perform(self, effect: Effect) -> None:
-        """Begin what the tracker wants done, as a task."""
+        """Begin an effect as a task."""
         self._start(type(effect).__name__, self._do(effect, self._engine.state))
 
     def swapped(self, in_use: str | None) -> None:
-        """Offer the matrix in use, and watch what it does.
+        """Offer the matrix in use to the RTC, and watch its effect.
 
-        While α is unknown, windows wait until the matrix has been read: it tells where fits begin.
+        While α is unknown, windows wait until the matrix has been read, because it determines where
+        fits begin.
         """
         if in_use is not None and self._engine.state.alpha.registration is None:
             self._own_matrix_read.clear()

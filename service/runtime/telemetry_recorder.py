@@ -36,22 +36,22 @@ from service.tracking.state import TrackerState
 LONGEST_S = 3600.0
 
 LARGEST_GB = 20.0
-"""Of one recording, in units of 1e9 bytes: half an hour of 1400 slopes and 600 modes at 1 kHz."""
+"""Largest recording in units of 1e9 bytes: half an hour of 1400 slopes and 600 modes at 1 kHz."""
 
 LOOK_S = 0.5
-"""Between two looks at how far it is."""
+"""Interval between two checks of its progress."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingChoice(Instruction):
-    """For how long telemetry is to be kept."""
+    """Duration of a recording of telemetry."""
 
     duration_s: Annotated[float, Ge(0.0), Le(LONGEST_S)] = 60.0
     """From now on; 0: nothing of what comes."""
 
     before_s: Annotated[float, Ge(0.0), Le(LONGEST_S)] = 0.0
-    """Of what came before, as far as the service still holds it: 60 s, unless the settings say
-    otherwise."""
+    """Duration of earlier telemetry to include, as far as the service holds it: 60 s unless the
+    settings say otherwise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,10 +59,10 @@ class AnnotationChoice(Instruction):
     """An operator's note about a moment."""
 
     note: Annotated[str, MinLen(1), MaxLen(2000)]
-    """What is to be kept."""
+    """Reason of the recording."""
 
     t_ns_utc: Annotated[int, Ge(0), Le((1 << 63) - 1)] | None = None
-    """Of what time it is, nanoseconds since the Unix epoch; None: of now."""
+    """Time that it concerns, nanoseconds since the Unix epoch; None for now."""
 
 
 class TelemetryRecorder:

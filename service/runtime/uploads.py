@@ -28,10 +28,10 @@ FITS_KEPT = 50
 """Finished fits that are remembered."""
 
 STALL_S = 30.0
-"""Longest time an upload may stand still."""
+"""Longest time without progress of an upload."""
 
 PATIENCE_S = 30.0
-"""How far an upload may lag behind the slowest pace, seconds."""
+"""Tolerated delay of an upload relative to the slowest permitted rate, seconds."""
 
 SLOWEST_BYTES_S = 200_000
 """Least pace of an upload, bytes a second: one that trickles would hold a place for ever."""
@@ -50,7 +50,7 @@ class FitState(StrEnum):
     """The upload is on its way."""
 
     WAITING = "waiting"
-    """It stands in the queue."""
+    """It is in the queue."""
 
     RUNNING = "running"
     DONE = "done"
@@ -68,7 +68,7 @@ UNFINISHED = frozenset({FitState.RECEIVING, FitState.WAITING, FitState.RUNNING})
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FitJob:
-    """One fit the service was asked for."""
+    """One requested fit."""
 
     id: str
     """Never reused while the service runs."""
@@ -77,28 +77,28 @@ class FitJob:
     """How far it is."""
 
     asked_ns_utc: int
-    """When it was asked for, the service's clock."""
+    """Time of the request, by the service's clock."""
 
     name: str = ""
-    """Of the measured matrix, or the file, as whoever asked calls it."""
+    """Name of the matrix or file given with the request."""
 
     n_bytes: int = 0
-    """Of the upload so far."""
+    """Bytes received so far."""
 
     sha256: str = ""
-    """Of the upload; empty until it is whole."""
+    """Checksum of the upload; empty until it is complete."""
 
     reason: str = ""
     """Why it failed."""
 
     stage: str = ""
-    """What it is at while it runs: reading, modes, orientation, fit, verdict, figures."""
+    """Stage while it runs: reading, modes, orientation, fit, verdict, figures."""
 
     document: Mapping[str, Any] | None = None
-    """What was found, what ``pyrcal fit --json`` prints."""
+    """Result: the document that ``pyrcal fit --json`` prints."""
 
     figures: bytes | None = None
-    """What its figures are drawn from, JSON."""
+    """Data of its figures, JSON."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,13 +106,13 @@ class FitLimits:
     """Limits of fits of uploads."""
 
     max_bytes: int
-    """Of one upload."""
+    """Largest upload."""
 
     waiting: int
     """Fits that may be unfinished at once, uploads under way included."""
 
     seconds: float
-    """Of one fit."""
+    """Longest fit."""
 
 
 class FitQueue:

@@ -43,7 +43,7 @@ ATTEMPTS = 3
 """Workers that may die while the model is prepared before the service gives up."""
 
 LOOK_S = 0.5
-"""Between two looks at what a worker takes."""
+"""Interval between two checks of a worker's processor time."""
 
 
 class WorkerPool:
@@ -57,7 +57,7 @@ class WorkerPool:
         self._start = start
         self._worker = early
         self.first: Callable[[], Done[None]] | None = None
-        """What every new worker does before anything else; None: nothing."""
+        """First job of every new worker; None if there is none."""
 
         self.found_slopes: SlopeRecipe | None = None
 
@@ -72,10 +72,10 @@ class WorkerPool:
         self._busy_since_s: float | None = None
         self.n_lost = 0
         self.problem = ""
-        """What is wrong with the worker, until one has done a job again; empty: nothing."""
+        """Problem of the worker until it has completed a job again; empty if there is none."""
 
         self.cluster_problem = ""
-        """What is wrong with the cluster that is to help it, by its last job; empty: nothing."""
+        """Problem of the cluster in its last job; empty if there is none."""
 
         self._cpu_s: defaultdict[str, float] = defaultdict(float)
         self._under_way: tuple[str, float] | None = None
@@ -239,10 +239,10 @@ def _run(
 
 
 MEMORY_S = 60.0
-"""What is told is of the last minute."""
+"""Duration of the load average."""
 
 ENOUGH_S = 20.0
-"""Before so much of it has passed nobody is said to be behind: a matrix is made meanwhile."""
+"""Time before which the worker is not reported as late: a matrix is being made meanwhile."""
 
 LATE_WINDOWS = 3
 """Windows that came before the worker had a hand free for the one before them, to be behind;"""
@@ -256,7 +256,7 @@ STARVED = 0.6
 
 
 JOB = "job "
-"""Before the name of a job, among what is counted."""
+"""Prefix of a job's name in the counters."""
 
 
 class WorkerLoadMeter:
@@ -282,7 +282,7 @@ class WorkerLoadMeter:
         self._counted["fitted_s"] += window_s
 
     def look(self) -> WorkerLoad:
-        """Take note of where everything stands, and return how it goes."""
+        """Record the present load and return the average."""
         now = self._mark()
         self._marks.append(now)
         while len(self._marks) > 2 and now["clock_s"] - self._marks[1]["clock_s"] >= MEMORY_S:

@@ -1,7 +1,7 @@
 """The worker process: fits, reconstructors, verdicts.
 
-A compute thread beside the ingest raises its latency thirty-fold; a nice'd process leaves it
-alone.
+A compute thread in the process that receives telemetry raises its latency thirty-fold; a process
+with lower priority does not.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 _open_worker: Callable[[], OpticsWorker] | None = None
-"""Of the worker process: it outlives a job."""
+"""Worker of this process; it is kept between jobs."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -40,14 +40,14 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Done(Generic[R]):
-    """What came of a job, and what it cost."""
+    """Result of a job, and its cost."""
 
     result: R
     cpu_s: float
     """Processor time of the whole worker process, all its threads, seconds."""
 
     cluster_problem: str = ""
-    """What is wrong with the cluster that is to help it; empty: nothing."""
+    """Problem of the cluster; empty if there is none."""
 
 
 def start_worker(instrument: Instrument, compute: Compute, early: Worker | None = None) -> Worker:

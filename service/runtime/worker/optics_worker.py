@@ -76,8 +76,8 @@ FAR_SAMPLING = 1
 """The same of the model that leads from afar: biased by some per cent of a subaperture."""
 
 AS_DRAWN = 0.15
-"""A mode's response that differs by less, of the drawing's, is the drawing's: noise and the model's
-own error come to as much."""
+"""Relative difference of a mode's response from the model's below which it counts as equal: noise
+and the model's own error are of this size."""
 
 COARSE_SAMPLING = 2
 """Pupil points per subaperture and nodes of the coarse model: biased by 0.05 % of a subaperture,

@@ -30,10 +30,10 @@ _Job = TypeVar("_Job", bound=Callable[..., Any])
 
 
 def waits(at_most_s: float) -> Callable[[_Job], _Job]:
-    """Return what marks a job of the worker that may wait for those that are asked for later.
+    """Return a decorator for jobs of the worker that may wait for later requests.
 
-    All others go first. What has waited for so long has its turn before anything new, so that
-    nothing waits for ever.
+    All others are executed first. A job that has waited for this time is executed before anything
+    new, so that it does not wait for ever.
     """
 
     def marked(job: _Job) -> _Job:
@@ -44,7 +44,7 @@ def waits(at_most_s: float) -> Callable[[_Job], _Job]:
 
 
 def patience_s(job: Callable[..., Any]) -> float:
-    """Return for how long a job may wait for those that are asked for later."""
+    """Return the time for which a job may wait for later requests."""
     return getattr(job, "patience_s", 0.0)
 
 
@@ -70,22 +70,22 @@ class Compute:
     """Threads that share the rows of a product; BLAS itself keeps to one."""
 
     cluster: str | None = None
-    """Address of a Dask scheduler whose workers help with rows; None: nobody does."""
+    """Address of a Dask scheduler whose workers help with rows; None if there is none."""
 
     array: ArrayLibrary = ArrayLibrary.NUMPY
-    """What computes rows of D."""
+    """Array library for rows of D."""
 
     nice: int = 10
     memory_gb: float = 6.0
-    """That modes, D and its derivatives may take; a quarter of it for what a sensor keeps."""
+    """Memory for modes, D and its derivatives; a quarter of it for a sensor's cache."""
 
     sampling: Sampling = field(default_factory=Sampling)
 
     method: InversionMethod = InversionMethod.SVD
-    """How interaction matrices are inverted."""
+    """Method by which interaction matrices are inverted."""
 
     max_condition: float = MAX_CONDITION
-    """Of a truncated SVD."""
+    """Largest condition number of a truncated SVD."""
 
     slope_noise: float = 0.05
     """1 σ of one slope in one frame: of a MAP inversion, and of a star of unknown magnitude. Of a
@@ -95,7 +95,7 @@ class Compute:
     """At which the expected loss of a reconstructor is computed."""
 
     anamorphosis: bool = False
-    """Whether dithered windows are asked for the anamorphosis, too."""
+    """True if dithered windows also measure the anamorphosis."""
 
     cache: Path | None = None
     """Folder of what is prepared once; None: it is computed every time."""
@@ -113,7 +113,7 @@ class Compute:
 
     @property
     def kept_bytes(self) -> float:
-        """What a sensor may keep for the next matrix; the worker has up to four of them."""
+        """Return the memory of a sensor's cache; the worker has up to four."""
         return self.memory_gb * GB / 4
 
 
@@ -125,7 +125,7 @@ class Conditions(Determination):
     """
 
     loop: ControlLoop
-    """As the gate is to see it."""
+    """Loop as the gate evaluates it."""
 
     bound: float
     """Largest pole radius that is accepted."""
@@ -141,7 +141,7 @@ class Made:
     condition_number: float
     gate: GateVerdict
     why_fewer: str = ""
-    """What the gate said of more modes, where it has fewer than were asked for."""
+    """Reason of the gate against more modes, if it has fewer than requested."""
 
 
 def actuators_of(model: RtcInteractionModel) -> Actuators | None:

@@ -1,6 +1,7 @@
-"""Rows that a Dask worker computes of what it has made by itself: few kilobytes are sent to it.
+"""Rows of D(α) computed by a Dask worker with a model of its own; only kilobytes are sent to it.
 
-Instrument and modes come once and stay; of each matrix it is told α, and the rows it is to answer.
+Instrument and modes are sent once and kept. Of each matrix it receives α and the numbers of its
+rows.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ class RemoteRows:
     """A function of rows, and of the parts that it is made of."""
 
     described: bytes
-    """What makes it of them, pickled: by this it is known again."""
+    """Pickled instrument and modes, which identify the model."""
 
     @classmethod
     def of(cls, rows: RowsElsewhere) -> RemoteRows:

@@ -28,7 +28,7 @@ PAYS_S = 4.0
 """nor is work that takes the threads here less: to send the shapes takes tenths of a second."""
 
 LOOK_S = 10.0
-"""Between two looks for the cluster, whether it is there or not."""
+"""Interval between two checks for the cluster."""
 
 HELP = "help of the cluster"
 """Name of the thread that takes in what the cluster answers."""
@@ -44,7 +44,7 @@ class SharedRows:
         self._n_threads = n_threads
         self._cluster: Cluster | None = None
         self.problem = ""
-        """What is wrong with the cluster; empty: nothing, or there is to be none."""
+        """Problem of the cluster; empty if there is none, or no cluster is used."""
 
         if address is not None:
             threading.Thread(target=self._watch, args=(address,), daemon=True).start()
@@ -114,7 +114,7 @@ class SharedRows:
 
 
 _TAKEN: Future[Any] = Future()
-"""In the place of an answer that is not needed any more."""
+"""Placeholder of a result that is not needed any more."""
 _TAKEN.set_result(None)
 
 

@@ -23,12 +23,13 @@ from service.model.sensors.registry import kind_of
 Array = NDArray[np.float64]
 
 SETTLED = np.array([0.03, 0.03, 1.5e-3, 3e-3])
-"""A step shorter than this (numeric units) leaves a linearisation error below ``FLAW``: D is all
-but straight, and another linearisation would cost more than it tells."""
+"""A step shorter than this (numeric units) has a linearisation error below ``FLAW``: D is almost
+linear, and another linearisation would cost more than it gains."""
 
 FLAW = np.array([2.5e-4, 2.5e-4, 1.5e-5, 3e-5])
-"""What such a step of all four leaves at most, on FLAO with any set of modes (numeric units); it
-grows as the square of the step. A fifteenth of the floor of a flat model."""
+"""Largest linearisation error of such a step of all four parameters, on FLAO with any set of modes
+(numeric units); it grows with the square of the step. It is a fifteenth of the floor of a flat
+model."""
 
 STRETCHED = float(SETTLED[3])
 """The same of an anamorphosis: it is a length as a magnification is."""
@@ -37,11 +38,12 @@ REACH = 4.0
 """A step this long, in units of ``SETTLED``, ends well within one of them."""
 
 UNSEEN = 0.1
-"""Of an estimate's σ: a linearisation's error up to this is not worth another linearisation."""
+"""Linearisation error, as a fraction of an estimate's σ, below which no further linearisation is
+made."""
 
 FOLLOWED = 0.04
-"""Gains that differ from the model's by more than this, as a logarithm, move the working point:
-0.02 % in magnification. Less is not worth another linearisation."""
+"""Logarithmic difference of gains from the model's that moves the working point: 0.02 % in
+magnification. Less needs no further linearisation."""
 
 STRENGTHS = (0.05, 4.0)
 """Variance of the residual over that at the instrument's r0. Of the first a wavefront is all but
@@ -72,7 +74,7 @@ class SensorAtWork:
 
     @property
     def is_flat(self) -> bool:
-        """Whether it is the response to a flat wavefront."""
+        """Return True if it is the response to a flat wavefront."""
         return self._n_controlled is None
 
     @property

@@ -44,15 +44,15 @@ class Archive:
     def __init__(self, directory: Path, noon_utc_h: int = 12) -> None:
         self.directory = directory
         self.index = Index(directory / "index.sqlite")
-        """Where each product is on its way, and who did what."""
+        """Index: state of each product, and the audit trail."""
         self.reconstructors = ReconstructorArchive(directory / "reconstructors", self.index)
-        """Those that were made here or read back from the RTC, and what became of each."""
+        """Reconstructors made here or read from the RTC, and the fate of each."""
         self.measured = MeasuredArchive(directory / "interaction_matrices", self.index)
         """Interaction matrices the RTC has measured."""
         self.noisy = NoisyArchive(directory / "noisy_matrices", self.index)
         """Noisy interaction matrices of random dithers."""
         self.recordings = Recordings(directory / "recordings")
-        """Telemetry that somebody has asked for."""
+        """Recordings of telemetry that somebody requested."""
         self.stores: tuple[Store[Any] | Recordings, ...] = (
             self.reconstructors,
             self.measured,
@@ -60,13 +60,13 @@ class Archive:
             self.recordings,
         )
         self.tracking = TrackingFile(directory / "tracking.json")
-        """What is known of the registration, for the service after this one."""
+        """Saved registration, for the next service."""
         self.nights = Nights(self.index.asked, self.index.add_row, noon_utc_h)
-        """How the nights went: estimates of α, what happened beside them, trends, notes."""
+        """Nights: estimates of α, events, trends, notes."""
         self._lock: IO[str] | None = None
         self._on_disk = False
         self.wrong: tuple[str, ...] = ()
-        """What :meth:`open` has found wrong, a line for each."""
+        """Problems that :meth:`open` has found, one line each."""
 
     def __enter__(self) -> Self:
         """Use an archive that is open; it is closed at the end."""

@@ -69,20 +69,20 @@ class AuditEntry:
     """One line of the audit trail."""
 
     t_ns_utc: int
-    """When, nanoseconds since the Unix epoch."""
+    """Time, nanoseconds since the Unix epoch."""
 
     who: str
-    """Who gave the order: a name, else the address; "service" for what it does by itself."""
+    """Name of whoever gave the order, else the address; "service" for its own actions."""
 
     name: str
     """Machine-readable, like ``reconstructor.applied``; an order has two lines: ``Approve`` when
     it came, ``Approve.answered`` or ``Approve.refused`` when that was known."""
 
     text: str
-    """What happened, or what was asked for."""
+    """What happened, or what was ordered."""
 
     address: str = ""
-    """Of the client that gave the order."""
+    """Address of the client that gave the order."""
 
     channel: str = ""
     """"page", "rest" or "cli"; empty: no order."""
@@ -91,7 +91,7 @@ class AuditEntry:
     """The reason given with the order."""
 
     answer: str = ""
-    """What the order was answered."""
+    """Response to the order."""
 
     cause: str = ""
     """Id of the order or event that has led to it, the order's own for its two lines; empty: it was
@@ -102,7 +102,7 @@ class AuditEntry:
 
 
 class Channel(StrEnum):
-    """What an order came through."""
+    """Channel by which an order arrived."""
 
     PAGE = "page"
     """A browser."""
@@ -116,7 +116,7 @@ class Channel(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Actor:
-    """Whoever gives an order, besides the name in it."""
+    """Sender of an order, apart from the name in it."""
 
     address: str = ""
     key: str = ""
@@ -414,7 +414,7 @@ class Index:
 
 
 def begun_ns_utc(record: Product) -> int:
-    """Return when a product was made or, where that is not known, asked for."""
+    """Return the time when a product was made or, if unknown, requested."""
     asked_ns = record.asked_ns_utc if isinstance(record, MeasurementRecord) else None
     return record.created_ns_utc or asked_ns or 0
 
@@ -425,7 +425,7 @@ _N_COLUMNS = len(fields(AuditEntry)) - 1
 _COLUMNS = ", ".join(
     {"channel": "whence"}.get(field.name, field.name) for field in fields(AuditEntry)[:_N_COLUMNS]
 )
-"""Of the file; it is older than some of our words."""
+"""Columns of the file, whose names are older than the fields'."""
 
 
 def _storable(value: str | int) -> str | int:

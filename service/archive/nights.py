@@ -19,7 +19,7 @@ from service.tracking.alarms import ALARMS
 from service.tracking.registration import HistoryEntry, Source
 
 Values = Sequence[object] | Mapping[str, object]
-"""What stands for the marks in a question."""
+"""Values of a query's placeholders."""
 
 _FOURS = ("measured", "measured_sigma", "filtered", "filtered_sigma")
 _FILTERED = tuple(f"filtered_{parameter}" for parameter in PARAMETERS)
@@ -35,7 +35,7 @@ class TrendSample:
     """The service's state at one moment; without a sample no service ran."""
 
     t_ns_utc: int
-    """When, the service's clock."""
+    """Time by the service's clock."""
 
     telemetry_ns_utc: int | None = None
     """End of the telemetry that had come since the sample before, the RTC's clock; None: none."""
@@ -50,8 +50,8 @@ class TrendSample:
     """Wavefront error with the reconstructor in use, by the linear model, metres RMS."""
 
     residual_m: float | None = None
-    """What the reconstructor in use reads in the residual slopes, all its modes together, metres
-    RMS: turbulence left over and noise, optical gain not undone."""
+    """Residual slopes as the reconstructor in use measures them, all its modes together, metres
+    RMS: remaining turbulence and noise, not corrected for optical gain."""
 
     margin: float | None = None
     """Largest closed-loop pole radius within α ± 3 σ over its bound: beyond 1 nothing is sent."""
@@ -63,7 +63,7 @@ class TrendSample:
     """Modes that the RTC controls."""
 
     magnitude: float | None = None
-    """Of the guide star, as the RTC tells."""
+    """Magnitude of the guide star, as the RTC reports it."""
 
     flux: float | None = None
     """Mean of the flux map, in the RTC's unit."""
@@ -106,7 +106,7 @@ HOUR_NS = 3_600_000_000_000
 DAY_NS = 24 * HOUR_NS
 
 FOREVER_NS = (1 << 63) - 1
-"""After all that can be recorded: SQLite's largest integer."""
+"""Time after everything that can be recorded: SQLite's largest integer."""
 
 MAX_DOWNSAMPLED = 300_000
 """Estimates that are looked through at once: a week of telemetry."""
@@ -154,7 +154,7 @@ class Mark:
     t_ns_utc: int
     kind: MarkKind
     name: str
-    """As in the audit trail: of an alarm its name."""
+    """Name as in the audit trail; for an alarm its name."""
 
     text: str
 
@@ -167,7 +167,7 @@ class Night:
     """UTC, of the noon at which it begins, such as 2026-03-01."""
 
     since_ns_utc: int
-    """That noon."""
+    """Noon at which the night begins."""
 
     until_ns_utc: int
     """The last nanosecond before the next one."""
@@ -189,7 +189,7 @@ class Annotation:
     """Of what time it is."""
 
     written_ns_utc: int
-    """When it was written."""
+    """Time of writing."""
 
     who: str
     note: str
@@ -294,7 +294,7 @@ class Nights:
         )
 
     def between(self, first_ns: int, last_ns: int) -> tuple[Night, ...]:
-        """Return the nights of which something is there, as far as they lie in a time."""
+        """Return the nights with any content that overlap an interval."""
         night = f"(t_ns_utc - {self._noon_ns}) / {DAY_NS}"
         time = (first_ns, last_ns)
         measured = self._asked(

@@ -41,7 +41,7 @@ _ALIVE = {
 
 
 class ReconstructorArchive(Store[ReconstructorRecord]):
-    """Reconstructors, and beside each what has become of it, for the day when the index is lost."""
+    """Reconstructors, each with a file of its fate, from which a lost index is rebuilt."""
 
     kind = ReconstructorRecord
     noun = dataset = "reconstructor"
@@ -49,7 +49,7 @@ class ReconstructorArchive(Store[ReconstructorRecord]):
     lost_with_it = "it cannot be sent, nor gone back to; what is known of it is in the index"
 
     largest_bytes = PROBE_BYTES
-    """Of all matrices so far: what must fit on the disk."""
+    """Size of the largest matrix so far: this much must fit on the disk."""
 
     @override
     def kept(self, records: Iterable[ReconstructorRecord]) -> dict[str, str]:
@@ -271,15 +271,15 @@ class RecordingRecord:
     """"running" or "stored"."""
 
     created_ns_utc: int
-    """When it began, the service's clock."""
+    """Time of its start, by the service's clock."""
 
     duration_s: float
-    """How long it was to take."""
+    """Requested duration, seconds."""
 
     who: str
     why: str
     before_s: float = 0.0
-    """Of what had come before it began that is in it, seconds."""
+    """Duration of included telemetry from before the start, seconds."""
 
     reason: str = ""
     """Why it ended before its time; empty: it did not."""
@@ -300,7 +300,7 @@ class Recordings(Folder):
     lost_with_it = "it cannot be replayed, nor exported"
 
     def stored(self) -> frozenset[str]:
-        """Return the ids of those that lie here."""
+        """Return the ids of those stored here."""
         return frozenset(path.stem for path in self.directory.glob("*.h5"))
 
     def adopt(self, *, anew: bool) -> list[str]:
@@ -343,7 +343,7 @@ class Recordings(Folder):
 
     @override
     def kept(self, records: Iterable[RecordingRecord]) -> dict[str, str]:
-        """Return who has asked for each."""
+        """Return who has requested each."""
         return {one.id: f"asked for by {one.who}: {one.why}" for one in records}
 
     def matrix(self, recording_id: str) -> None:
@@ -418,7 +418,7 @@ def _fill(
 
 
 def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:
-    """Return what a person wants to see in the file, each with its unit in its name."""
+    """Return the attributes of the file, each with its unit in its name."""
     values: dict[str, Provenance] = {
         "n_modes": record.n_modes,
         "created_ns_utc": record.created_ns_utc,
@@ -437,7 +437,7 @@ def _attributes(record: ReconstructorRecord) -> dict[str, Provenance]:
 
 
 def _add_gains(file: h5py.File, record: ReconstructorRecord) -> None:
-    """Put the table of loop gains beside the matrix, which knows nothing of it."""
+    """Store the table of loop gains next to the matrix, which does not contain them."""
     table = gain_table(record.optical_gains, record.n_modes)
     group = file.create_group("gains")
     group.attrs["description"] = "optical gain of every mode; not part of the reconstructor"

@@ -15,7 +15,7 @@ from service.archive.nights import DAY_NS
 from service.archive.store import Folder
 
 NEWEST_KEPT = 10
-"""Of each kind, whatever their age: those to go back to."""
+"""Newest products of each kind that are kept for a rollback, whatever their age."""
 
 GIGABYTE = 1_000_000_000
 
@@ -26,10 +26,10 @@ class RetentionPolicy:
 
     keep_days: float = 0.0
     keep_gb: float = 0.0
-    """Of all products together, in units of 1e9 bytes."""
+    """Limit of all products together, in units of 1e9 bytes."""
 
     reserve_gb: float = 0.0
-    """Free space below which somebody is told."""
+    """Free space below which an alarm is raised."""
 
 
 EVERYTHING = RetentionPolicy()

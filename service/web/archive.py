@@ -54,7 +54,7 @@ class Kept:
     """Oldest first."""
 
     n_bytes: int
-    """Of all of them."""
+    """Total size of all of them, bytes."""
 
     n_bytes_free: int
     """On their disk."""
@@ -120,7 +120,7 @@ class AuditFormat(StrEnum):
 
 
 class AuditParameters(TimeParameters):
-    """Which part of the audit trail to return, and how."""
+    """Query parameters that select a part of the audit trail and its format."""
 
     limit: Annotated[int, Field(ge=1, le=5000)] = 200
     """At most so many entries; an export has all of them."""
@@ -133,7 +133,7 @@ class AuditParameters(TimeParameters):
 
     @property
     def part(self) -> Range:
-        """The part that is asked for."""
+        """Return the requested part."""
         first_ns, last_ns = self.between
         return Range(since_ns=first_ns, until_ns=last_ns, after=self.after, limit=self.limit)
 
@@ -241,7 +241,7 @@ class RecordingAcceptedView(AcceptedView):
     """A recording that has begun."""
 
     id: str
-    """Of the recording."""
+    """Id of the recording."""
 
 
 async def _tried(client: Client, name: str, instruction: Instruction, order: Awaitable[T]) -> T:

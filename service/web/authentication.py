@@ -31,7 +31,7 @@ from service.web.problems import INVALID, UNKNOWN, problem
 from service.web.views import answer, define_view, held, shows
 
 COOKIE = "pyrcal_key"
-"""Under which a browser keeps the key."""
+"""Name of the cookie in which a browser keeps the key."""
 
 MAX_AUDITED_REFUSALS, AUDIT_PERIOD_S = 20, 60.0
 """Refusals that are written to the audit trail within so many seconds, which only grows; the
@@ -49,7 +49,7 @@ _OWN_SITES = {"same-origin", "none"}
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:\d{1,5})?", re.IGNORECASE)
 
 _PORTS = {"http": ":80", "https": ":443"}
-"""What need not be written in an origin."""
+"""Default ports, which an origin may omit."""
 
 Security = dict[str, list[dict[str, list[str]]]]
 
@@ -71,7 +71,7 @@ SCHEMES: dict[str, dict[str, str]] = {
         "description": "The same, kept by a browser that logged in; orders need its Origin, too",
     },
 }
-"""How a key is shown, as the OpenAPI has it. None is needed while there are none, on loopback."""
+"""Ways to send a key, as in OpenAPI. None is needed on loopback while there are no keys."""
 
 
 def scope_of(route: RouteContext, method: str) -> KeyScope | None:
@@ -90,7 +90,7 @@ def scope_of(route: RouteContext, method: str) -> KeyScope | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hosts:
-    """Names and addresses under which this service is asked for; loopback is always one."""
+    """Names and addresses of this service; loopback is always one."""
 
     bound: str = "127.0.0.1"
     """Address it listens on. With that of all interfaces any address will do, for a page that was
@@ -101,7 +101,7 @@ class Hosts:
 
     @property
     def local(self) -> bool:
-        """Whether only this machine can ask."""
+        """Return True if only this machine can connect."""
         return is_loopback(self.bound)
 
     def know(self, host: str) -> bool:
@@ -124,7 +124,7 @@ class Refusal:
 
     status: HTTPStatus
     kind: str
-    """Of the problem that it is answered with."""
+    """Type of the problem in the response."""
 
     detail: str
     headers: Mapping[str, str] = field(default_factory=dict)
@@ -341,7 +341,7 @@ class Authentication(Middleware):
 
 
 def _misshapen(request: Request) -> Refusal | None:
-    """Return why nobody honest sends such a head; None: they may."""
+    """Return why no honest client sends such a header, or None."""
     n_headers = len(request.headers)
     if n_headers > MAX_HEADERS:
         detail = f"found {n_headers} headers, expected at most {MAX_HEADERS}"
@@ -397,10 +397,10 @@ class Session:
     """The key of a request and its scope."""
 
     name: str | None
-    """Of the key that was shown; null: there are no keys, and none is needed."""
+    """Name of the key that was sent; null if there are no keys and none is needed."""
 
     scope: KeyScope
-    """What may be asked with it; "admin" where none is needed."""
+    """Scope of the key; "admin" if none is needed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

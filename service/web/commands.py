@@ -172,7 +172,7 @@ class OrderRoute:
 
     @property
     def kinds(self) -> tuple[type[Instruction], ...]:
-        """Commands of the route, told apart by ``action``."""
+        """Return the commands of the route, distinguished by ``action``."""
         names = [self.command] if isinstance(self.command, str) else self.command.values()
         return tuple(getattr(instructions, name) for name in names)
 
@@ -210,7 +210,7 @@ class OrderRoute:
 ORDERS: Final = TypeAdapter(dict[str, OrderRoute]).validate_python(
     tomllib.loads(files("service").joinpath("commands.toml").read_text("utf-8"))
 )
-"""By the name of the operation."""
+"""Orders by the name of the operation."""
 
 
 # --- who asks, and for what
@@ -222,24 +222,24 @@ class AcceptedView(BaseModel):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     text: str
-    """What was done, and what the RTC has said to it within some seconds."""
+    """What was done, and what the RTC has answered within some seconds."""
 
     links: dict[str, str]
-    """Where to look for what becomes of it."""
+    """Paths where the consequences appear."""
 
 
 class MatrixAcceptedView(AcceptedView):
     """A matrix that is being measured."""
 
     id: str
-    """Of the matrix to come."""
+    """Id of the future matrix."""
 
 
 class RefitAcceptedView(AcceptedView):
     """A reconstructor that is being computed."""
 
     id: str
-    """Of the job: ``GET /v1/refits/{id}`` says what came of it."""
+    """Id of the job: ``GET /v1/refits/{id}`` has its result."""
 
 
 _ALWAYS = {"state": "/v1/state", "events": "/v1/events"}
@@ -250,17 +250,17 @@ class Client:
     """The giver of orders in a request."""
 
     service: Supervisor
-    """That is to obey."""
+    """Service that executes the order."""
 
     actor: Actor
     seen: str | None
-    """ETags of what the order was decided on; None: not told."""
+    """ETags of what the order was decided on; None if not sent."""
 
     strict: bool
-    """Whether an order that decides about something is refused without them."""
+    """True if an order that decides on something is refused without them."""
 
     headers: MutableHeaders
-    """Of the answer."""
+    """Headers of the response."""
 
     async def gives(self, order: OrderRoute, said: Any, name: str) -> AcceptedView:  # noqa: ANN401
         """Hand an order on; return what was done, and where its work can be followed.
@@ -306,7 +306,7 @@ async def _client_of(request: Request, response: Response, service: views.Servic
 
 
 ClientDep = Annotated[Client, Depends(_client_of)]
-"""Whoever gives the order."""
+"""Sender of the order."""
 
 
 def _one(state: TrackerState, name: str) -> Response:
@@ -333,7 +333,7 @@ _SHOWN: Mapping[str, Callable[[TrackerState, str], Response]] = {
     "/v1/reconstructors": _all,
     "/v1/reconstructors/previous": _before,
 }
-"""What an order may be decided on."""
+"""Resources that an order may be decided on."""
 
 # --- the routes
 

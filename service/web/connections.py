@@ -124,7 +124,7 @@ class Server(uvicorn.Server):
 
 
 ONCE = "idempotency-key"
-"""Header of whoever may send a request again."""
+"""Header of a request that may be sent again."""
 
 MAX_KEY_LENGTH = 200
 """Longest idempotency key, characters."""
@@ -139,7 +139,7 @@ _NOT_DONE = {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.INSUFFICIENT_STORAGE}
 """Answers that say that nothing was done: the next time may do it."""
 
 _Name = tuple[object, str]
-"""Who may act, and the key of that one."""
+"""Sender of a request, and its key."""
 
 
 @dataclass(eq=False, slots=True)
@@ -147,7 +147,7 @@ class _StoredAnswer:
     """A request with a key, and its answer once there is one."""
 
     print: bytes
-    """Of method, path and body."""
+    """Digest of method, path and body."""
 
     answer: list[Message] = field(default_factory=list)
     done: asyncio.Event = field(default_factory=asyncio.Event)
@@ -285,7 +285,7 @@ NOT_MODIFIED: dict[str, Any] = {
 """The OpenAPI description of an answer without a body."""
 
 _KEPT = "private, no-cache"
-"""A browser keeps an answer and asks each time whether it still holds; nobody between does."""
+"""A browser keeps a response and revalidates it each time; no proxy stores it."""
 
 
 def tag_of(*parts: object) -> str:

@@ -150,7 +150,7 @@ def _older(archive: Archive, first_ns: int, last_ns: int, asked: RangeParameters
 
 
 def _cut(found: History, asked: RangeParameters) -> History:
-    """Return as much of what was found as was asked for."""
+    """Return the requested part of what was found."""
     if asked.points is not None:
         return downsample(found, asked.points)
     if asked.after is None:
@@ -279,7 +279,7 @@ class AnnotationAcceptedView(commands.AcceptedView):
     """A note that is kept."""
 
     id: int
-    """Of the note."""
+    """Id of the note."""
 
 
 @notes.get("/annotations", responses={200: shows(ANNOTATIONS)})

@@ -26,18 +26,18 @@ from service.errors import ConfigurationError, UnknownIdError
 from service.files.durable import lock_file, replace_file
 
 PREFIX = "pyrcal_"
-"""Of every key: whoever finds one lying about can tell what it is."""
+"""Prefix of every key, so that a lost one is recognised."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 _TAKEN = {"service", "operator"}
-"""Who else the audit trail speaks of."""
+"""Names that the audit trail uses for others."""
 
 
 class KeyScope(StrEnum):
     """Scopes of a key; each includes those before it."""
 
     READ = "read"
-    """Look at everything, and order nothing."""
+    """Read everything, order nothing."""
 
     OPERATE = "operate"
     """Give orders, and upload what is to be fitted."""
@@ -56,14 +56,14 @@ class Key:
     """Record of a key."""
 
     name: str
-    """Of the person, program or place that has it."""
+    """Name of the person, program or place that has the key."""
 
     scope: KeyScope
     created_ns_utc: int
-    """When it was made, nanoseconds since the Unix epoch."""
+    """Time of creation, nanoseconds since the Unix epoch."""
 
     sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-    """Of the whole key as text."""
+    """Checksum of the whole key as text."""
 
 
 class KeyFile:

@@ -59,7 +59,7 @@ async def _named(
 
 
 MatrixId = Annotated[str, Depends(_named)]
-"""Of a reconstructor that a path names."""
+"""Reconstructor named in a path."""
 
 
 async def _other(
@@ -70,7 +70,7 @@ async def _other(
 
 
 OtherId = Annotated[str, Depends(_other)]
-"""Of another one in the same path."""
+"""Second reconstructor named in the same path."""
 
 
 _SLOPES_PER_PRODUCT = 1024
@@ -151,7 +151,7 @@ async def numbers_of(
 
 
 def _parts(head: bytes, numbers: Numbers) -> Iterator[bytes]:
-    """Yield a file's head, and its numbers as they lie in memory."""
+    """Yield a file's header, and its numbers as raw memory."""
     yield head
     lying = numbers.reshape(-1).view(np.uint8)
     for first in range(0, len(lying), RESPONSE_PART_BYTES):
@@ -287,15 +287,15 @@ class SingularValues:
     """Singular values of a reconstructor's modes: weak ones amplify noise."""
 
     id: str
-    """Of the reconstructor."""
+    """Id of the reconstructor."""
 
     values: list[float]
     """One over each singular value of the reconstructor, largest first, slope per metre OPD: those
     of the interaction matrix it inverts, where none were left out."""
 
     nominal: list[float] | None
-    """Of the model's interaction matrix of as many modes, the mirror where the instrument file has
-    it; null: the model is being prepared."""
+    """Singular values of the model's interaction matrix with as many modes, at nominal
+    registration; null while the model is being prepared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -308,10 +308,11 @@ class MatrixComparison:
     """Basis indices."""
 
     gain: list[float]
-    """By how much stronger the first one answers: norm of its row over that of the other's."""
+    """Norm of the first matrix' row divided by that of the other's."""
 
     cosine: list[float]
-    """Of the angle between both rows: 1: they answer to the same slopes, -1: of opposite sign."""
+    """Cosine of the angle between both rows: 1 if they measure the same slopes, -1 with opposite
+    sign."""
 
     difference: float
     """Norm of what they differ by over that of the other, all of these modes together."""

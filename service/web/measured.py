@@ -200,10 +200,10 @@ class FitParameters(Parameters):
     """X,Y,ROT,MAG: subapertures, degrees, ratio."""
 
     gain_map: bool = False
-    """Whether a gain over the pupil, common to all modes, is unknown too."""
+    """True to fit a gain over the pupil, common to all modes."""
 
     anamorphosis: bool = True
-    """Whether the stretch of the mirror's image is unknown, too."""
+    """True to fit the anamorphosis of the mirror's image."""
 
     instrument: (
         Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,64}$"), _understood(_packaged)] | None
@@ -214,7 +214,7 @@ class FitParameters(Parameters):
     """Name of the measured file in an uploaded zip."""
 
     name: str = Field(default="", max_length=_MAX_NAME)
-    """What to call it in the list of fits, such as the file's name."""
+    """Name in the list of fits, such as the file's name."""
 
     measurement: str | None = Field(default=None, min_length=1, max_length=_MAX_NAME)
     """Id of a matrix the RTC has measured for this service; there is no body then."""
@@ -230,10 +230,10 @@ class FitAcceptedView(BaseModel):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     id: str
-    """Of the fit."""
+    """Id of the fit."""
 
     links: dict[str, str]
-    """Where to look for what becomes of it."""
+    """Paths where its result appears."""
 
 
 _UPLOAD: dict[str, Any] = {

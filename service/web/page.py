@@ -1,6 +1,6 @@
-"""The operator's page: its files, the manual, and what it lives on.
+"""The operator's page: its files, the manual, and its data.
 
-That is the stream of the state and the log, the last slopes, and the drawing of the mirror.
+The data are the stream of state and log, the last slopes, and the nominal geometry of the mirror.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ router = APIRouter(prefix="/v1", tags=["state"])
 FILES: Final = Path(__file__).parent / "dashboard"
 
 MANUAL: Final = Path(__file__).parent / "manual"
-"""Where ``make docs`` has put the manual."""
+"""Folder of the manual that ``make docs`` writes."""
 
 SWAGGER: Final = Path(__file__).parent / "swagger"
 """Swagger UI, which shows what REST answers and tries it out: no observatory needs the internet."""
 
 OPENAPI: Final = Path(__file__).parent / "openapi.json"
-"""What REST answers: ``python -m pyrcal_studies.pages`` writes it."""
+"""The OpenAPI document, written by ``python -m pyrcal_studies.pages``."""
 
 HEADERS: Final = {
     # its own files and its own service: nothing inline, no other host
@@ -166,16 +166,16 @@ class MirrorDrawing:
     """Across the sensor's grid."""
 
     pupil_diameter_subap: float
-    """Of the pupil's image."""
+    """Diameter of the pupil image, subapertures."""
 
     obscuration_ratio: float
-    """Of it, linear."""
+    """Obscuration ratio of the pupil, linear."""
 
     stop: Stop
     """"mirror": the pupil's rim moves with the shift, and keeps its size; "telescope": it stays."""
 
     nominal: Misregistration
-    """Where the mirror should be: what the instrument file says."""
+    """Nominal registration by the instrument file."""
 
     tolerance: NDArray[np.float64]
     """``(4,)`` further than this from what the reconstructor in use was made for, and another one
@@ -185,8 +185,8 @@ class MirrorDrawing:
     """Largest RMS motion of an outer actuator for slope noise of 1 that the gate accepts."""
 
     actuators: tuple[tuple[float, float], ...]
-    """x and y of each on the sensor where α is nothing; empty: modes were measured, and nobody has
-    told where the actuators are."""
+    """x and y of each actuator on the sensor at nominal registration; empty if the modes were
+    measured and the actuators are unknown."""
 
 
 MIRROR: Final = define_view("MirrorView", MirrorDrawing)
@@ -194,7 +194,9 @@ MIRROR: Final = define_view("MirrorView", MirrorDrawing)
 
 @router.get("/mirror", responses={200: shows(MIRROR)})
 async def mirror(service: ServiceDep) -> Response:
-    """Return the mirror's drawing on the sensor; ``GET /v1/alpha`` says where it lies."""
+    """Return the nominal geometry of the mirror on the sensor; ``GET /v1/alpha`` has its
+    registration.
+    """
     instrument = service.instrument
     wfs = instrument.wfs
     return answer(
@@ -224,26 +226,27 @@ def _actuators(instrument: Instrument) -> tuple[tuple[float, float], ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlopeMaps:
-    """The last slopes that came, over the subapertures.
+    """The last slopes, over the subapertures.
 
-    Rows from the lowest y on, Sx beside Sy, in conventions' axes; null where none is valid.
+    Rows from the lowest y upwards, Sx and Sy side by side, in the axes of the conventions; null
+    where none is valid.
     """
 
     t_ns_utc: int
-    """Of the first of these frames, the RTC's clock."""
+    """Time of the first of these frames, by the RTC's clock."""
 
     n_frames: int
     """About a tenth of a second of them."""
 
     cm_id: str | None
-    """The reconstructor that multiplied them; null: nobody has told."""
+    """Reconstructor that multiplied them; null if unknown."""
 
     rms: list[list[float]]
     """Over these frames, about zero, in the slopes' own unit."""
 
 
 SHOWN_S = 0.5
-"""So long a picture of the slopes serves whoever asks."""
+"""Time for which a picture of the slopes is reused."""
 
 SLOPES = define_view("SlopeMapsView", SlopeMaps)
 
@@ -302,10 +305,10 @@ MAX_LISTENERS = 60
 """Listeners to the stream. Fewer than connections, so that other requests find a place."""
 
 RETRY_MS = 1000
-"""When a listener that was cut off should come back, milliseconds."""
+"""Time after which a disconnected listener reconnects, milliseconds."""
 
 _CLOCKS = {"now_ns", "now_utc", "uptime_s", "age_s", "window_age_s", "frame_age_s"}
-"""What changes in the state while nothing happens."""
+"""Fields of the state that change while nothing happens."""
 
 Log = tuple[LogEntry, ...]
 
@@ -391,9 +394,9 @@ class Stream:
 
 
 def _ids(log: Log, started_ns: int) -> list[str]:
-    """Return ids of the log's beginning and of its lines: the same for as long as one service runs.
+    """Return ids of the log's beginning and of its lines, constant while one service runs.
 
-    Where the log has left out lines its beginning is nothing that anybody can have heard.
+    If the log has dropped lines, no listener can have received its beginning.
     """
     run = f"{started_ns:x}"
     beginning = run if len(log) < LOG_LENGTH else f"{run}-"
@@ -453,7 +456,7 @@ async def stream(
 ) -> StreamingResponse:
     """Send the state, at most twice a second, and the log as it grows.
 
-    Who comes back with the ``Last-Event-ID`` it has heard gets the lines it has missed.
+    A client that sends its last id in ``Last-Event-ID`` gets the lines it has missed.
     """
     if stream.n_listeners >= MAX_LISTENERS:
         raise BusyError(f"stream: found {MAX_LISTENERS} listeners, the most there may be")

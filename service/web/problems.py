@@ -51,7 +51,7 @@ class Problem(BaseModel):
     """The HTTP status."""
 
     detail: str
-    """What was found and what was expected."""
+    """Description: what was found and what was expected."""
 
     instance: str
     """Path of the request."""

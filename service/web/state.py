@@ -363,7 +363,7 @@ def _one_of(kinds: type[StrEnum], current: StrEnum | None) -> dict[str, int]:
 
 
 Numbers = float | None | Mapping[str, float]
-"""What is not known is NaN, as Prometheus has it."""
+"""Unknown values are NaN, as usual in Prometheus."""
 
 
 def _gauge(name: str, text: str, value: Numbers, label: str = "") -> Metric:

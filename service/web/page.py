@@ -194,8 +194,9 @@ MIRROR: Final = define_view("MirrorView", MirrorDrawing)
 
 @router.get("/mirror", responses={200: shows(MIRROR)})
 async def mirror(service: ServiceDep) -> Response:
-    """Return the nominal geometry of the mirror on the sensor; ``GET /v1/alpha`` has its
-    registration.
+    """Return the nominal geometry of the mirror on the sensor.
+
+    ``GET /v1/alpha`` has its registration.
     """
     instrument = service.instrument
     wfs = instrument.wfs

@@ -1,6 +1,6 @@
-"""The service's own commands: ``run`` it; make, list and revoke the ``key`` of whoever asks it.
+"""The service's own commands: ``run`` it; make, list and revoke a client's ``key``.
 
-Each imports only what it needs, and what is large when nothing can be refused any more.
+Heavy modules are imported after argument parsing, so that usage errors are instant.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _OPTIONS = {
     "cluster": "compute.cluster",
     "log_format": "service.log_format",
 }
-"""Command-line options that stand for a settings key."""
+"""Command-line options that set a settings key."""
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -118,7 +118,7 @@ _WITHOUT = {
         "machine needs none"
     ),
 }
-"""What that means, by whether there is a file."""
+"""Meaning of a missing option, with and without a file."""
 
 
 def _key(options: argparse.Namespace) -> int:
@@ -150,10 +150,10 @@ def _key(options: argparse.Namespace) -> int:
 
 
 def _recorded(file: KeyFile, name: str, text: str) -> None:
-    """Write into the audit trail, beside a service that may be running, what was done.
+    """Record in the audit trail what was done, while a service may be running.
 
-    Before the first start of a service there is no trail. What the disk refuses is only said: what
-    was done is done.
+    Before the first start of a service there is no trail. If the disk refuses, the command says so
+    and stays done.
     """
     path = file.path.with_name("index.sqlite")
     if not path.is_file():

@@ -1,6 +1,6 @@
-"""How a program of ``pyrcal`` ends, logs, is found; the arguments of ``run`` and ``key``.
+"""End, logging and description of a program of ``pyrcal``; arguments of ``run`` and ``key``.
 
-Quick to import. What the program calls modes and scopes stands here as text; a test compares it.
+Quick to import. Names of modes and scopes are repeated here as text; a test compares them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def status_of(task: Callable[[], int], name: str = "pyrcal") -> int:
 
 
 ENOUGH_MB = 1000.0
-"""Of address space: what fails within such a limit and more, fails for another reason."""
+"""Address space in megabytes above which a failed allocation has another reason than a limit."""
 
 
 def _memory_limit_mb() -> float | None:
@@ -113,9 +113,10 @@ def run_command(
 
 
 def _leave_when_asked(status: int) -> None:
-    """End at once on SIGINT and SIGTERM: nothing has begun, and imports must not be cut in two.
+    """End at once on SIGINT and SIGTERM while nothing has begun and imports must not be
+    interrupted.
 
-    Holds for ``run`` until the service hears them itself.
+    It applies to ``run`` until the service handles the signals itself.
     """
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: leave(status))
@@ -160,11 +161,11 @@ def stop_signal() -> threading.Event:
 
 
 def leave(status: int) -> NoReturn:
-    """End this process at once, when all it has opened is closed or must be left behind.
+    """End this process at once, when everything it opened is closed or must be left behind.
 
-    Threads of zenoh let go of callbacks after their session is closed. One that wants the
-    interpreter while it is being taken down aborts the process (before Python 3.14). A process that
-    was started and still runs ends with it: one that is stopped would not notice.
+    Threads of zenoh release callbacks after their session is closed. A thread that needs the
+    interpreter while it is being finalised aborts the process (before Python 3.14). Child processes
+    are ended as well: a suspended one would not notice.
     """
     processes = sys.modules.get("multiprocessing")
     for child in () if processes is None else processes.active_children():
@@ -288,7 +289,7 @@ def _is_own(folder: Path) -> bool:
 _Read = TypeVar("_Read")
 
 _ENDPOINT = re.compile(r"[\w-]+/\S+")
-"""Of zenoh: a protocol and an address."""
+"""Endpoint of zenoh: a protocol and an address."""
 
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own

@@ -52,7 +52,7 @@ from service.tracking.state import (
 from service.web.keys import KeyFile
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
-"""Of mallopt(3)."""
+"""Parameters of mallopt(3)."""
 
 LARGE_BYTES = 2_500_000
 """What is larger gets memory of its own, and gives it back at once: seconds of frames, matrices."""

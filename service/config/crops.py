@@ -102,7 +102,7 @@ def modes_of_crops(
 
 
 def _table_of(file: Section[MirrorTable], crops: NDArray[np.floating]) -> tuple[int, int]:
-    """Return the shape of the whole table that finite crops lie on."""
+    """Return the shape of the table that finite crops are part of."""
     shape = file.said.influence_table
     if shape is None:
         raise ConfigurationError(
@@ -152,7 +152,7 @@ def _origins(
 def _placed(
     crops: NDArray[np.floating], origins: NDArray[np.intp], shape: tuple[int, int]
 ) -> Iterator[tuple[tuple[slice, slice], NDArray[np.floating]]]:
-    """Yield where each crop lies on the table, and as much of it as does."""
+    """Yield the position of each crop on the table, and the part of it that is inside."""
     for crop, (row, column) in zip(crops, origins.tolist(), strict=True):
         rows = slice(max(row, 0), min(row + crop.shape[0], shape[0]))
         columns = slice(max(column, 0), min(column + crop.shape[1], shape[1]))

@@ -80,7 +80,7 @@ class MirrorTable(kinds.InfluenceShape):
     instead of ``first_ring`` and ``last_ring``."""
 
     ring_radii_m: tuple[kinds.Positive, ...] | None = None
-    """Beside ``ring_actuators``: radius of each ring, metres."""
+    """Radius of each ring, metres; together with ``ring_actuators``."""
 
     n_across: Annotated[int, Field(ge=2, le=1000)] | None = None
     """Grid only: actuators along a diameter."""
@@ -92,9 +92,9 @@ class MirrorTable(kinds.InfluenceShape):
     """Hexagonal only: diameter of a hole in the middle, where there are no actuators."""
 
     segments_deg: tuple[float, ...] = ()
-    """Gaussian only: where each gap between segments goes from the centre outwards, degrees from
-    +x towards +y. No function crosses one, no actuator of a grid stands on one, and KL modes leave
-    out the segments' differential pistons."""
+    """Direction of each gap between segments from the centre outwards, degrees from +x towards +y;
+    Gaussian influence only. No function crosses a gap, no actuator of a grid is on one, and KL
+    modes exclude the differential pistons of the segments."""
 
     positions: str | None = None
     """Positions only: ``path:/dataset`` of ``(n_actuators, 2)``, x and y in metres."""
@@ -106,7 +106,7 @@ class MirrorTable(kinds.InfluenceShape):
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
     nominal_rotation_deg: float | None = None
-    """Where a fit starts; None: found from tip and tilt."""
+    """Rotation at which a fit starts; None to find it from tip and tilt."""
 
     nominal_anamorphosis: tuple[Stretch, Stretch] | None = None
     """Stretch of the mirror's turned image along the sensor's x over the mean of both axes, ratio
@@ -147,7 +147,7 @@ class OrientationTable(Table):
     flip_x: bool = False
     flip_y: bool = False
     sign: Annotated[tuple[int, int], BeforeValidator(_signs)] = (1, 1)
-    """Of both components on the RTC's own grid, or of Sx and Sy each."""
+    """Sign of both components on the RTC's own grid, or of Sx and Sy each."""
 
 
 class SlopesTable(Table):
@@ -161,7 +161,8 @@ class SlopesTable(Table):
 
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
     normalisation: kinds.Normalisation = kinds.Normalisation.GLOBAL
-    """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
+    """Normalisation by the mean flux of all subapertures, or by each one's own: of its four pixels
+    together."""
 
 
 @cache
@@ -180,7 +181,9 @@ def whole_of(kind: SensorKind) -> type[Table]:
 
 
 def unknown_values(kind: SensorKind) -> dict[str, float | None]:
-    """Return keys that may be "unknown", and what is taken until a measured matrix tells."""
+    """Return keys that may be "unknown", with the value assumed until a measured matrix determines
+    it.
+    """
     of_sensor = {f"wfs.{key}": value for key, value in kind.unknown.items()}
     return {**of_sensor, "mirror.coupling": 0.35}
 
@@ -197,7 +200,7 @@ class Section(Generic[Said]):
     """Keys that are written."""
 
     path: Path
-    """Of the file; references are relative to where it lies."""
+    """Path of the file; references are relative to its folder."""
 
     name: str
 
@@ -216,7 +219,7 @@ class InstrumentFile:
 
     sections: tuple[Section[Any], ...]
     kind: SensorKind
-    """Of its sensor."""
+    """Kind of its sensor."""
 
     unknown: frozenset[str] = frozenset()
     """Keys, with their tables, that are said to be unknown."""
@@ -293,7 +296,7 @@ def _check_one_sensor(written: Mapping[str, Any], kind: SensorKind, path: Path) 
 
 @contextmanager
 def refused_at(path: Path, table: str) -> Iterator[None]:
-    """Say where in a file stands what a kind of sensor refuses."""
+    """Add the place in a file to what a kind of sensor rejects."""
     try:
         yield
     except ModelError as error:

@@ -95,13 +95,13 @@ _Magnification = Annotated[
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawTable(Read):
-    """``[law]``: where the mirror lies at any pointing, each number a law of its own.
+    """``[law]``: the registration as a function of the pointing, each parameter a law of its own.
 
     A number, an expression of `azimuth`, `elevation` (degrees, as the RTC's status or the
-    observatory reports them) and of names of the observatory's values, or a table
-    `{ of = "elevation", at = [20, 80], values = [0.1, -0.1] }` with straight lines between.
-    α is followed as its deviation from this. After a whole turn of azimuth each term must be the
-    same, but for whole turns of the rotation.
+    observatory reports them) and of names of the observatory's values, or a table `{ of =
+    "elevation", at = [20, 80], values = [0.1, -0.1] }` with linear interpolation. α is tracked as
+    the deviation from this. After a whole turn of azimuth each term must be the same, except for
+    whole turns of the rotation.
     """
 
     shift_x_subap: _Shift = None

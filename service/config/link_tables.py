@@ -1,4 +1,4 @@
-"""``[zenoh]`` of the settings, and what zenoh is told of it."""
+"""``[zenoh]`` of the settings, and the zenoh configuration made of it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.wire.keys import Keys
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
 USERS: Final = "transport/auth/usrpwd"
-"""Of zenoh's configuration."""
+"""Key of zenoh's configuration."""
 
 SHORTEST_SECRET: Final = 32
 """Characters."""
@@ -31,7 +31,7 @@ Names = tuple[Annotated[str, Field(min_length=1, max_length=64)], ...]
 
 
 class TlsTable(Table):
-    """``[zenoh.tls]``: certificates, without which nobody connects."""
+    """``[zenoh.tls]``: certificates that every program must have to connect."""
 
     ca: Path
     """Certificate of the authority that has signed all others, PEM."""
@@ -40,7 +40,7 @@ class TlsTable(Table):
     """This program's own, PEM."""
 
     key: Path
-    """The private key of it, PEM; nobody else may read the file."""
+    """Its private key, PEM; no other user may read the file."""
 
     watched: tuple[Path, ...] = ()
     """Certificates of other programs, like the RTC's, whose end is to be foreseen, too."""
@@ -50,16 +50,16 @@ class TlsTable(Table):
 
 
 class UsersTable(Table):
-    """``[zenoh.users]``: names and passwords, beside certificates or, on loopback, instead."""
+    """``[zenoh.users]``: names and passwords, in addition to certificates or, on loopback, instead."""
 
     name: str = Field(min_length=1, pattern="^[^:]+$")
     """This program's own name."""
 
     password_file: Path
-    """The file whose first line is its password; nobody else may read it."""
+    """File whose first line is its password; no other user may read it."""
 
     file: Path | None = None
-    """Of the service with its own router: the lines ``NAME:PASSWORD`` of all who may connect."""
+    """Lines ``NAME:PASSWORD`` of all who may connect, for a service with its own router."""
 
 
 class AccessTable(Table):
@@ -87,23 +87,23 @@ class AccessTable(Table):
 
 
 class SigningTable(Table):
-    """``[zenoh.signing]``: service and RTC vouch for what they send, whoever runs the router."""
+    """``[zenoh.signing]``: service and RTC sign what they send, whoever runs the router."""
 
     key_file: Path
-    """The file whose first line is the secret that both share; nobody else may read it."""
+    """File whose first line is the shared secret; no other user may read it."""
 
 
 class CredentialsTable(Table):
     """``[zenoh]`` of a program that only connects: who it is, and whom it trusts."""
 
     tls: TlsTable | None = None
-    """Certificates; left out: whoever reaches the port may put a matrix on the mirror."""
+    """Certificates. Without them anybody who reaches the port may put a matrix on the mirror."""
 
     users: UsersTable | None = None
-    """Names and passwords; left out: none are asked for."""
+    """Names and passwords; without them none are required."""
 
     signing: SigningTable | None = None
-    """A shared secret; left out: nothing is signed, and no signature is asked for."""
+    """Shared secret; without it nothing is signed, and no signature is required."""
 
 
 class ZenohTable(CredentialsTable):
@@ -119,11 +119,11 @@ class ZenohTable(CredentialsTable):
     """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
 
     access: AccessTable = Field(default_factory=AccessTable)
-    """Who may do what, as soon as certificates or users tell who is who."""
+    """Roles of the names in certificates or users."""
 
     anyone_may_command_the_mirror: bool = False
-    """Accept that whoever reaches ``listen`` can put a matrix of their own on the mirror: without
-    ``[zenoh.tls]`` it is refused for any address but loopback."""
+    """Accept that anybody who reaches ``listen`` can put a matrix on the mirror. Without
+    ``[zenoh.tls]`` any address but loopback is otherwise refused."""
 
     @model_validator(mode="after")
     def _with_certificates_no_way_around_them(self) -> ZenohTable:
@@ -189,10 +189,10 @@ class Router:
 
     endpoint: str
     security: Mapping[str, object] = field(default_factory=dict)
-    """What zenoh is told about certificates and users; empty: it shows nothing."""
+    """Certificates and users for zenoh's configuration; empty if there are none."""
 
     secret: bytes | None = None
-    """What messages are signed with; None: they are not."""
+    """Secret that messages are signed with; None if they are not."""
 
 
 def router_of(path: Path | None, connect: str | None) -> Router:

@@ -45,7 +45,8 @@ _FOREIGN = {
 """Keys that mean nothing to a mirror of each kind."""
 
 _ON_A_GAP = 1e-9
-"""Of a mirror's half width, by which an actuator may lie beside a gap and yet on it."""
+"""Distance from a gap, as a fraction of the mirror's half width, within which an actuator is on it.
+"""
 
 _BROKEN_SHARE = 0.1
 """Share of a table that a broken function lacks beyond what the others lack, as outside a pupil."""
@@ -162,7 +163,7 @@ def _analytic(file: MirrorSection) -> tuple[Mirror, tuple[str, ...]]:
 
 
 def _about_segments(file: MirrorSection, mirror: Mirror) -> tuple[str, ...]:
-    """Return what whoever uses a segmented mirror should know of its modes."""
+    """Return remarks on the modes of a segmented mirror."""
     if not mirror.segments_deg or own_modes(mirror) is not None:
         return ()
     return (
@@ -364,9 +365,9 @@ def grid(n_across: int, pitch_m: float, diameter_m: float) -> NDArray[np.float64
 def hexagonal(pitch_m: float, diameter_m: float, hole_m: float = 0.0) -> NDArray[np.float64]:
     """Return the points of a triangular lattice inside a circle, ``(n_actuators, 2)``, metres.
 
-    Each has six neighbours at ``pitch_m``. One lies at the centre, rows run along +x, from the
-    lowest y up: the layout is its own mirror image under y -> -y. Points closer to the centre than
-    half of ``hole_m`` are left out.
+    Each has six neighbours at ``pitch_m``. One is at the centre, rows are along +x, from the lowest
+    y upwards: the layout is its own mirror image under y -> -y. Points closer to the centre than
+    half of ``hole_m`` are excluded.
     """
     rows = int(diameter_m / 2 / (pitch_m * np.sqrt(0.75)) + 1e-9)
     row = np.arange(-rows, rows + 1)
@@ -380,7 +381,7 @@ def hexagonal(pitch_m: float, diameter_m: float, hole_m: float = 0.0) -> NDArray
 def _inside(
     x_m: NDArray[np.float64], y_m: NDArray[np.float64], diameter_m: float
 ) -> NDArray[np.float64]:
-    """Return the points that lie in a circle or on it, ``(n, 2)``, row by row."""
+    """Return the points in or on a circle, ``(n, 2)``, row by row."""
     points = np.column_stack([x_m.ravel(), y_m.ravel()])
     rounding = 1.0 + 1e-9
     inside = np.linalg.norm(points, axis=1) <= diameter_m / 2 * rounding
@@ -472,9 +473,9 @@ def _without_defects(
 ) -> tuple[NDArray[np.floating], tuple[str, ...]]:
     """Return a cube whose unusable entries are 0, and notes that name them.
 
-    An entry is unusable if it holds no numbers in much more of the table than the others do (it
-    would make the surface unknown for all of them), if it is zero, or if it equals an earlier one.
-    Equal crops are no copies: they lie elsewhere.
+    An entry is unusable if it has far more undefined points than the others (it would make the
+    surface unknown for all of them), if it is zero, or if it equals an earlier one. Equal crops are
+    not copies, because they have different positions.
     """
     unknown = np.mean(~np.isfinite(cube), axis=(1, 2))
     broken = unknown > np.median(unknown) + _BROKEN_SHARE

@@ -19,8 +19,9 @@ from service.tracking.alarms import Interlock, Severity
 from service.tracking.policy import Offloading, Policy, Rule, SensorModePolicy
 
 FLAT = (0.004, 0.01, 0.001)
-"""Shift in subapertures, rotation in degrees, magnification: where telemetry of a working pyramid
-is compared with the response to a flat wavefront. What a window's misfit tells comes on top."""
+"""Shift in subapertures, rotation in degrees, magnification: floor of the model error if the
+telemetry of a working pyramid is compared with the response to a flat wavefront. The misfit of
+windows is added."""
 
 AT_WORK = (0.001, 0.005, 0.0005)
 """The same where it is compared with the response at the working point."""
@@ -79,8 +80,8 @@ def _coarser(instrument: Instrument | None) -> float:
 def policy_of(settings: Settings, instrument: Instrument | None = None) -> Policy:
     """Return the policy in numeric units: radians, rates per square root of a second.
 
-    ``instrument`` tells the modes of its sensor, its law of pointing and how coarse its mirror is;
-    None: it has neither, and a mirror like FLAO's.
+    ``instrument`` provides the sensor modes, the pointing law and the pitch of the mirror; without
+    it there are no modes and no law, and the mirror is like FLAO's.
     """
     dither, tracking, control = settings.dither, settings.tracking, settings.control
     per_minute = _vector(

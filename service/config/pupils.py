@@ -13,10 +13,12 @@ _LIT_FRACTION = 0.5
 """Illumination of a point, of the largest, above which it belongs to the pupil."""
 
 _WIDTHS = (0.8, 1.1)
-"""Width of a map's light over ``diameter_m``: a segmented pupil's corners stand out."""
+"""Plausible width of a map's light divided by ``diameter_m``; the corners of a segmented pupil
+extend beyond it."""
 
 _OFF_CENTRE = 0.02
-"""Of the diameter, by which a map's light may lie beside the middle of its array."""
+"""Tolerated distance of a map's light from the middle of its array, as a fraction of the diameter.
+"""
 
 
 def read_pupil(file: Section[AboutTable], subaperture_m: float) -> PupilMap | None:

@@ -16,10 +16,10 @@ from service.errors import ConfigurationError
 from service.model.kinds import ArrayLibrary
 
 PREFIX = "PYRCAL_"
-"""Of the environment variables: ``PYRCAL_<SECTION>__<KEY>``, like ``PYRCAL_API__PORT``."""
+"""Prefix of the environment variables: ``PYRCAL_<SECTION>__<KEY>``, like ``PYRCAL_API__PORT``."""
 
 OF_CLIENTS = {"PYRCAL_URL", "PYRCAL_API_KEY"}
-"""Where a service is asked, and with which key: no settings of one."""
+"""Variables of clients, which are no settings of a service."""
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -62,7 +62,7 @@ class ApiTable(Table):
 
     trusted_proxies: tuple[Network, ...] = ()
     """Addresses and networks of proxies whose ``X-Forwarded-For`` and ``X-Forwarded-Proto`` are
-    believed; of others they are ignored."""
+    used; those of others are ignored."""
 
 
 class DitherTable(Table):
@@ -78,10 +78,10 @@ class DitherTable(Table):
     """1 σ of each shift to keep, subapertures."""
 
     sigma_rotation_deg: Positive = 0.02
-    """Of the rotation, degrees."""
+    """1 σ of the rotation, degrees."""
 
     sigma_magnification: Positive = 0.001
-    """Of the magnification."""
+    """1 σ of the magnification."""
 
     longest_pause_s: float = Field(default=0.0, ge=0.0, le=3600.0)
     """Longest pause between two windows, seconds; a jump may go unseen as long."""
@@ -133,23 +133,24 @@ class TrackingTable(Table):
     """Random walk of each shift, 1 σ after a minute, subapertures."""
 
     drift_deg_per_minute: Positive = 0.05
-    """Of the rotation, degrees."""
+    """Drift of the rotation, degrees."""
 
     drift_magnification_per_minute: Positive = 0.0005
-    """Of the magnification."""
+    """Drift of the magnification."""
 
     floor_shift_subap: float | None = Field(default=None, ge=0.0)
     """1 σ model error of each shift, subapertures. None: as measured."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
-    """Of the rotation, degrees. None: as measured, or more of a coarse mirror."""
+    """Model error of the rotation, degrees. None for the measured value, larger for a coarse
+    mirror."""
 
     floor_magnification: float | None = Field(default=None, ge=0.0)
-    """Of the magnification. None: as measured, or more of a coarse mirror."""
+    """Model error of the magnification. None for the measured value, larger for a coarse mirror."""
 
     anamorphosis: bool = False
-    """Follow the stretch of the mirror's image, too; else it is as the instrument file says. The
-    four numbers are a little less certain for it until some windows have told."""
+    """Track the anamorphosis of the mirror's image as well; otherwise it is that of the instrument
+    file. The four parameters are slightly less certain until some windows have measured it."""
 
     bias_memory_s: Positive = 3600.0
     """Time in which the learnt bias of the passive estimate decays to 1/e, seconds."""
@@ -171,10 +172,10 @@ class TrackingTable(Table):
     500 modes on 30 subapertures, more for fewer modes."""
 
     stale_rotation_deg: Positive | None = None
-    """Of the rotation, degrees. None: 0.1 for 500 modes, more for fewer."""
+    """1 σ of the rotation, degrees. None for 0.1 with 500 modes, more with fewer."""
 
     stale_magnification: Positive | None = None
-    """Of the magnification. None: 0.003 for 500 modes, more for fewer."""
+    """1 σ of the magnification. None for 0.003 with 500 modes, more with fewer."""
 
 
 class AcquisitionTable(Table):
@@ -217,10 +218,10 @@ class ControlTable(Table):
     500 modes on 30 subapertures, more for fewer modes."""
 
     update_rotation_deg: Positive | None = None
-    """Of the rotation, degrees. None: 0.08 for 500 modes, more for fewer."""
+    """Change of the rotation, degrees. None for 0.08 with 500 modes, more with fewer."""
 
     update_magnification: Positive | None = None
-    """Of the magnification. None: 0.005 for 500 modes, more for fewer."""
+    """Change of the magnification. None for 0.005 with 500 modes, more with fewer."""
 
     wind_m_s: Positive = 15.0
     """Wind for the expected loss, metres per second."""
@@ -248,10 +249,10 @@ class OffloadTable(Table):
     """Ask for moves."""
 
     gain: float = Field(default=0.8, gt=0.0, le=1.0)
-    """Share of the way back to the nominal registration that is asked for at once."""
+    """Fraction of the distance to the nominal registration that is requested at once."""
 
     dead_band: FourAxes = (0.015, 0.015, 0.015, 0.002)
-    """Distance within which nothing is asked for."""
+    """Distance below which nothing is requested."""
 
     most_step: FourAxes = (0.1, 0.1, 0.2, 0.005)
     """Largest single move."""
@@ -260,7 +261,7 @@ class OffloadTable(Table):
     """Largest sum of all moves, either way, across restarts; 0: cannot be moved."""
 
     settle_s: float = Field(default=3.0, ge=0.0, le=50.0)
-    """Time from the reply until the image stands still, unless the reply says it, seconds."""
+    """Time from the reply until the image is at rest, unless the reply states it, seconds."""
 
 
 class ComputeTable(Table):
@@ -344,20 +345,20 @@ class RuleTable(Table):
     """Its alarm is ``rule.NAME``."""
 
     when: tuple[str, Literal["==", "!=", "<", "<=", ">", ">="], Scalar] = Field(strict=False)
-    """Name of a value told with ``PUT /v1/values/{name}``, or of a field such as
-    ``state.elevation_deg``; how it is compared; with what."""
+    """Name of a value reported with ``PUT /v1/values/{name}``, or of a field such as
+    ``state.elevation_deg``; the comparison; the other value."""
 
     blocks: tuple[Literal["measure", "decide", "send_new", "send_known", "ask"], ...] = ()
-    """What it forbids, as docs/operate/runbook.md explains."""
+    """Actions that it forbids, as docs/operate/runbook.md explains."""
 
     severity: Literal["warning", "serious", "critical"] = "serious"
-    """How much it matters."""
+    """Severity of the alarm."""
 
     text: str = Field(min_length=1, max_length=300)
     """What is wrong and what to do, in a sentence."""
 
     unknown: Literal["holds", "does-not-hold"] = "holds"
-    """Whether it holds while the value is unknown."""
+    """Result of the comparison while the value is unknown."""
 
     @model_validator(mode="after")
     def _compared_with_sense(self) -> RuleTable:
@@ -380,7 +381,7 @@ STATE_FIELDS: dict[str, type] = {
     "state.elevation_deg": float,
     "state.azimuth_deg": float,
 }
-"""What a rule may ask of the state."""
+"""Fields of the state that a rule may use."""
 
 _WORD = {str: "text", float: "number"}
 

@@ -1,8 +1,8 @@
 """Measured matrices and telemetry in files.
 
-The fit itself is ``pyrcal.offline``; nothing here decides anything about it. This module looks at
-what a user asks of one, in the words of the command line and of REST, and at what a file cannot be,
-before anything large is imported: a mistake is told at once.
+The fit is in ``pyrcal.offline``; this module decides nothing about it. It checks a request, in the
+words of the command line and of REST, and the type of a file, before anything large is imported, so
+that a mistake is reported at once.
 """
 
 from __future__ import annotations

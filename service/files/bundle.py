@@ -54,17 +54,17 @@ class Bundle:
     """A reconstructor and all that belongs to it."""
 
     id: str
-    """Of the reconstructor."""
+    """Id of the reconstructor."""
 
     arrays: Mapping[str, Array]
-    """By their names in ``DESCRIBED``, float32 or float64."""
+    """Arrays by their names in ``DESCRIBED``, float32 or float64."""
 
     facts: Mapping[str, Any]
-    """What is known of it, as JSON has it: alpha, sigma, verdict, provenance, parent..."""
+    """Metadata that JSON can hold: alpha, sigma, verdict, provenance, parent..."""
 
     @property
     def sha256(self) -> str:
-        """Of the manifest, and so of all."""
+        """Checksum of the manifest, and so of the whole bundle."""
         return _digest(_manifest(self))
 
 
@@ -149,7 +149,7 @@ class Place:
     """``(n_modes, n_actuators)`` strokes of the loop's basis, in any unit."""
 
     takes: frozenset[str] = frozenset()
-    """Of ``gain_factor`` and ``reference_slopes`` those that can be set."""
+    """Arrays among ``gain_factor`` and ``reference_slopes`` that can be set."""
 
 
 def why_not(bundle: Bundle, place: Place) -> str:

@@ -51,7 +51,7 @@ class StoredArray:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     stored_bytes: int
-    """What the file holds of it, compressed."""
+    """Size in the file, compressed."""
 
     load: Callable[[], NDArray[Any]]
     """Returns it as the file has it, unchecked."""
@@ -98,8 +98,8 @@ class Container:
 
     path: Path
     arrays: Mapping[str, StoredArray]
-    """By name: of HDF5 the path without its first slash, of FITS the EXTNAME or, where an image has
-    none, its number."""
+    """Arrays by name: in HDF5 the path without its first slash; in FITS the EXTNAME or, if an image
+    has none, its number."""
 
     find: Callable[[str], StoredArray | None]
     """Returns the array of a name, or None: in HDF5 links are followed, in FITS any case and the
@@ -109,7 +109,7 @@ class Container:
     """HDF5 attributes of the file, or keywords of the primary FITS header in lower case."""
 
     is_fits: bool = False
-    """Whether images may have no name."""
+    """True if images may have no name."""
 
     def listing(self) -> str:
         """Return what is in the file, in words."""
@@ -252,7 +252,7 @@ def _data(hdu: _ImageHdu) -> NDArray[Any]:
 
 
 NUMPY_DAMAGE = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)
-"""What a damaged header of NumPy raises: it is read by Python's own parser."""
+"""Exceptions that a damaged NumPy header raises: it is parsed by Python."""
 
 
 @contextmanager
@@ -280,7 +280,7 @@ def _numpy(path: Path) -> Iterator[Container]:
 Array = NDArray[np.float64]
 
 DATASET = "interaction_matrix"
-"""What is read unless another name is given; our own archive writes it."""
+"""Array that is read unless another name is given; the archive writes it."""
 
 
 # --- what pyrcal writes

@@ -33,7 +33,7 @@ MAX_BYTES = 1_000_000_000
 """All files together; the ones used least recently go first."""
 
 VARIABLE = "PYRCAL_SERVICE__CACHE_DIR"
-"""Of the environment; the service's setting ``service.cache_dir`` has the same name there."""
+"""Environment variable of the folder; that of the setting ``service.cache_dir``."""
 
 _SUFFIX = ".npz"
 _ABANDONED_S = 3600.0
@@ -64,9 +64,9 @@ class DiskCache:
     def basis(self, instrument: Instrument) -> Basis:
         """Return the modes of this instrument, as ``modal_basis`` does.
 
-        Only modes of analytic mirrors are cached: the statistics of turbulence take seconds even
-        where the strokes are given. A table of shapes is ready within milliseconds. Modes are
-        computed on the finest subapertures of the sensor: binned ones cannot tell them apart.
+        Only modes of analytic mirrors are cached: the statistics of turbulence take seconds even if
+        the strokes are given. A table of shapes is ready within milliseconds. Modes are computed
+        for the finest sensor mode, because a binned one could not distinguish them.
         """
         return in_subapertures(self._found(instrument.finest), instrument)
 
@@ -98,7 +98,7 @@ class DiskCache:
     ) -> Arrays:
         """Return named arrays of an instrument, from disk or from ``compute``.
 
-        ``what`` tells everything else that they depend on; it is known by its ``repr``.
+        ``what`` is everything else that they depend on, identified by its ``repr``.
         """
         if self._folder is None:
             return compute()

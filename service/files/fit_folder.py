@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 UPLOAD = "upload"
-"""What was uploaded: a measured matrix, or a zip archive of it and an instrument."""
+"""Upload: a measured matrix, or a zip archive of it and an instrument."""
 
 REQUEST = "request.json"
 """A :class:`FitRequest`."""
@@ -23,13 +23,13 @@ STAGE = "stage"
 """One word of :data:`STAGES`."""
 
 STAGES = ("reading", "modes", "orientation", "fit", "verdict", "figures")
-"""What a fit does, in this order."""
+"""Stages of a fit, in order."""
 
 DOCUMENT = "document.json"
-"""What was found: what ``pyrcal fit --json`` prints."""
+"""Result: the document that ``pyrcal fit --json`` prints."""
 
 FIGURES = "figures.json"
-"""What its figures are drawn from."""
+"""Data of its figures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,26 +37,26 @@ class FitRequest:
     """A fit to run, its options, and its limits on this machine."""
 
     asked: Mapping[str, Any]
-    """As ``POST /v1/fits`` names it: dataset, method, modes, start, gain_map, anamorphosis,
+    """Options named as in ``POST /v1/fits``: dataset, method, modes, start, gain_map, anamorphosis,
     instrument, reference."""
 
     own_instrument: str
-    """That of the service: a packaged name, or a file."""
+    """Instrument of the service: a packaged name, or a file."""
 
     own_sha256: str
-    """Of the instrument as the service has read it: the file may have changed since."""
+    """Checksum of the instrument as the service has read it: the file may have changed since."""
 
     max_bytes: int
-    """Of the files of an archive together."""
+    """Limit of the files of an archive together."""
 
     threads: int
-    """That share the work."""
+    """Number of threads."""
 
     nice: int
-    """Of the process: the telescope goes first."""
+    """Priority of the process: the telescope goes first."""
 
     memory_mb: int
-    """That the process may allocate."""
+    """Memory that the process may allocate."""
 
     def write(self, folder: Path) -> None:
         """Put it into the folder of its fit."""

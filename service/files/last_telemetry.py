@@ -1,8 +1,8 @@
-"""Hold the last telemetry in memory, for recordings that begin before now.
+"""Hold the last telemetry in memory, for recordings that include the time before their start.
 
-Messages are joined in chunks of one megabyte that lie in memory maps of their own. On the heap,
-between objects that live for moments, messages kept for half a minute fragment it: 100 MB of pages
-were held that nothing used.
+Messages are joined in chunks of one megabyte in separate memory maps. On the heap, between
+short-lived objects, messages that are kept for half a minute fragment it: 100 MB of unused pages
+were held.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ OVERHEAD_BYTES: Final = 200
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Chunk:
-    """Messages whose bytes lie one after another in a memory map."""
+    """Consecutive messages in one memory map."""
 
     heads: tuple[Message, ...]
     """Time and kind of each message; payloads and attachments are empty."""

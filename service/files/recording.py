@@ -45,10 +45,10 @@ VERSION: Final = 1
 _SLAB_ROWS = 256
 
 FLUSH_S: Final = 0.5
-"""Most that a killed process loses, beside the time the disk needs."""
+"""Longest telemetry that a killed process loses, in addition to the time the disk needs."""
 
 BACKLOG_BYTES: Final = 64_000_000
-"""What may wait for the disk; beyond it messages are dropped and counted."""
+"""Size of the messages that may wait for the disk; beyond it they are dropped and counted."""
 
 PAST_PART_BYTES: Final = 16_000_000
 """Bytes of earlier telemetry that are written to the disk at once."""
@@ -178,7 +178,7 @@ class Recording:
 
 
 _REFUSED = (OSError, RuntimeError, ValueError)
-"""What h5py raises where the disk refuses: of a flush or a close a RuntimeError."""
+"""Exceptions of h5py when the disk refuses; a flush or a close raises a RuntimeError."""
 
 
 class RecordingWriter:

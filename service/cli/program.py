@@ -113,8 +113,7 @@ def run_command(
 
 
 def _leave_when_asked(status: int) -> None:
-    """End at once on SIGINT and SIGTERM while nothing has begun and imports must not be
-    interrupted.
+    """End at once on SIGINT and SIGTERM, which must not interrupt an import.
 
     It applies to ``run`` until the service handles the signals itself.
     """

@@ -60,7 +60,7 @@ def packaged_file(name: str) -> Path:
 
 
 def __getattr__(name: str) -> object:
-    """Import a name when it is first used: settings need none of the mathematics of an instrument."""
+    """Import a name when it is first used: settings need no mathematics of an instrument."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = "settings" if name in {"Settings", "load_settings"} else "instrument"

@@ -181,9 +181,7 @@ def whole_of(kind: SensorKind) -> type[Table]:
 
 
 def unknown_values(kind: SensorKind) -> dict[str, float | None]:
-    """Return keys that may be "unknown", with the value assumed until a measured matrix determines
-    it.
-    """
+    """Return keys that may be "unknown", each with the value assumed until it is determined."""
     of_sensor = {f"wfs.{key}": value for key, value in kind.unknown.items()}
     return {**of_sensor, "mirror.coupling": 0.35}
 

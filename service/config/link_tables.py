@@ -50,7 +50,7 @@ class TlsTable(Table):
 
 
 class UsersTable(Table):
-    """``[zenoh.users]``: names and passwords, in addition to certificates or, on loopback, instead."""
+    """``[zenoh.users]``: names and passwords; on loopback they may replace certificates."""
 
     name: str = Field(min_length=1, pattern="^[^:]+$")
     """This program's own name."""

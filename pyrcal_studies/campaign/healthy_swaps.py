@@ -57,6 +57,9 @@ AFTER_S = 6.0
 CLOSING_S = 0.5
 """The loop closes in it; its telemetry is not shown."""
 
+SLOW_SHARES = (0.2, 0.12)
+"""Of the loop gain, in a worse matrix of the simulator's telescope."""
+
 BLOCK_S = 0.05
 WORSE_RATIO = 1.5
 DELAY_FRAMES = 2
@@ -519,14 +522,23 @@ class SimulatedNight:
             found = self.state if self.state.found is not found_before else Comparison()
             yield _row(self._trial, found, swap_s=begun_s, swap=k)
 
-    def worse(self, share: float) -> dict[str, object]:
-        """Swap a matrix of so much of the loop gain in; the ratio is that of the wavefront."""
+    def worse(self, share: float, healthy_nm: float | None = None) -> dict[str, object]:
+        """Swap a matrix of so much of the loop gain in.
+
+        The ratio is that of the wavefront error to ``healthy_nm``, of the same night with the right
+        matrix, or to that before the swap.
+        """
         before_nm = self._wavefront_nm(RECENT_S)
         right = next(reversed(self._matrices.values()))
         self._swap(np.asarray(share * right, np.float32))
         self._pass(4.5)
-        ratio = self._wavefront_nm(4.0) / before_nm
+        ratio = self._wavefront_nm(4.0) / (before_nm if healthy_nm is None else healthy_nm)
         return _row(self._trial, self.state, way="slow", ratio=ratio)
+
+    def healthy_nm(self) -> float:
+        """Return the wavefront error of the 4 s after a swap to the same matrix."""
+        self.worse(1.0)
+        return self._wavefront_nm(4.0)
 
     def _seeing_words(self, n_swaps: int) -> Iterator[str]:
         """Yield a seeing that changes by two in 10 s, and a gust of a second around each swap."""
@@ -577,13 +589,28 @@ def simulated_rows(plant: str, kind: str, n: int, seed: int) -> Iterator[dict[st
     while done < n:
         rate_hz = RATES_HZ[night_number % len(RATES_HZ)]
         trial = replace(drawn(plant, kind, seed + night_number), rate_hz=rate_hz)
+        if plant == "diffractive" and kind != "healthy":
+            trial = _calm(trial, night_number)
         n_swaps = min(SWAPS_A_NIGHT if kind == "healthy" else 1, n - done)
         night = SimulatedNight(trial, n_swaps)
         if kind == "healthy":
             yield from night.swaps(n_swaps)
+        elif kind == "worse":
+            healthy_nm = SimulatedNight(trial, n_swaps).healthy_nm()
+            yield night.worse(SLOW_SHARES[night_number // 2 % 2], healthy_nm)
         else:
-            yield night.worse(0.15 if kind == "worse" else -0.5)
+            yield night.worse(-0.5)
         done, night_number = done + n_swaps, night_number + 1
+
+
+def _calm(trial: Trial, night_number: int) -> Trial:
+    """Return it in seeing that this small pyramid stands: doubled, it loses every loop."""
+    return replace(
+        trial,
+        rate_hz=RATES_HZ[night_number % 2],
+        seeing_trend=min(trial.seeing_trend, 0),
+        seeing_arcsec=0.5 + 0.4 * (trial.seeing_arcsec - 0.5),
+    )
 
 
 def rows_of(plant: str, kind: str, n: int, seed: int) -> Iterator[dict[str, object]]:

@@ -44,8 +44,12 @@ LATELY = 3
 
 LOST_RATIO = 9.0
 """Residual power over that before which a lost loop exceeds at least: a gust makes it 2.6. The
-power of the commands alone says nothing: tip and tilt wander, and a healthy mirror may move ten
+power of all commands alone says nothing: tip and tilt wander, and a healthy mirror may move ten
 times as much as in the seconds before."""
+
+RUNAWAY_RATIO = 6.25
+"""Power of the commands of the upper half of the modes, over that before, which only a loop that
+is lost exceeds in each of ``LATELY`` parts: seeing that doubles makes it 3.2, a gust 2.6."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -185,15 +189,29 @@ class ResidualLevel:
         logs = [log_ratio(self.total, part, known) for part in parts if part.n_seen]
         return np.array(logs) - usual
 
+    def _runs_away(self, part: Residual) -> bool:
+        """Return whether the upper half of the modes is commanded far more than before."""
+        usual = self.total.commanded / self.total.n_seen
+        upper = np.flatnonzero(usual > 0.0)
+        upper = upper[len(upper) // 2 :]
+        if not len(upper) or len(part.commanded) != len(usual) or not part.n_seen:
+            return False
+        power = float(part.commanded[upper].sum()) / part.n_seen
+        return power > RUNAWAY_RATIO * float(usual[upper].sum())
+
     def lost(self, parts: tuple[Residual, ...]) -> bool:
         """Return whether the loop no longer does what it is for.
 
         Its residual is far larger than before, and either as large as the turbulence that the
-        mirror followed then, or the mirror itself moves by far more.
+        mirror followed then, or the mirror itself moves by far more. A pyramid that saturates
+        reads a small residual of a lost loop: there the commands of the upper half of the modes
+        tell, which wander less than those of tip and tilt.
         """
         last = total_of(parts[-LATELY:])
         if last is None or not last.n_seen:
             return False
+        if len(parts) >= LATELY and all(map(self._runs_away, parts[-LATELY:])):
+            return True
         followed = self.total.commanded.sum() / self.total.n_seen
         before = self.total.seen.sum() / self.total.n_seen
         left, moves = last.seen.sum() / last.n_seen, last.commanded.sum() / last.n_seen

@@ -11,7 +11,15 @@ import scipy
 from service.estimation.comparison import Verdict
 from service.estimation.frames import FrameBlock
 from service.estimation.probation import Comparison, observe
-from service.estimation.residual import LAG, Reader, Residual, ResidualLevel, ratio, stride_frames
+from service.estimation.residual import (
+    LAG,
+    LATELY,
+    Reader,
+    Residual,
+    ResidualLevel,
+    ratio,
+    stride_frames,
+)
 
 N_MODES, N_SLOPES, BLOCK, DT_NS = 40, 100, 20, 1_000_000
 STRIDE = stride_frames(DT_NS)
@@ -93,6 +101,32 @@ def test_a_loop_at_a_third_of_its_gain_is_worse_though_no_mode_rings():
     assert not found.lost
     (unread,) = judged([("a", 4.0, MATRIX, 1.0), ("b", 4.5, 0.3 * MATRIX, 1.0)], whole=False)
     assert unread.residual_ratio is None
+
+
+@pytest.mark.parametrize(("factor", "is_lost"), [(1.0, False), (2.0, False), (3.0, True)])
+def test_a_lost_loop_whose_sensor_saturates_is_told_by_the_commands_of_its_upper_modes(
+    factor, is_lost
+):
+    """The residual stays as it was; tip and tilt may move ten times as much."""
+    commanded = np.full(N_MODES, 1e-14)
+    none = np.zeros((0, N_MODES), np.float32)
+
+    def part(factors):
+        return Residual(
+            n_seen=10,
+            seen=np.full(N_MODES, 1e-16),
+            n_moved=10,
+            moved=np.full(N_MODES, 1e-16),
+            commanded=commanded * factors**2,
+            kept=(none,),
+        )
+
+    usual = np.ones(N_MODES)
+    level = ResidualLevel.of((part(usual),) * 8, 8)
+    factors = np.full(N_MODES, factor)
+    factors[:2] = 10.0
+    assert level.lost((part(factors),) * LATELY) is is_lost
+    assert not level.lost((part(usual), *(part(factors),) * (LATELY - 1)))
 
 
 @pytest.mark.parametrize("seed", [2, 3])

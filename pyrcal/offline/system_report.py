@@ -45,7 +45,8 @@ class SystemReport:
         ):
             if np.isfinite(misfit).all():
                 used |= set(system.names(pair))
-        return frozenset({one.name for one in (*system.sensors, *system.mirrors)} - used)
+        names = {sensor.name for sensor in system.sensors}
+        return frozenset((names | {mirror.name for mirror in system.mirrors}) - used)
 
     @property
     def refused(self) -> tuple[str, ...]:

@@ -92,7 +92,7 @@ def track(
 def _is_recording(path: Path) -> bool:
     try:
         with h5py.File(path, "r", locking=False, swmr=True) as file:
-            return bool(file.attrs.get("format") == FORMAT)
+            return str(file.attrs.get("format")) == FORMAT
     except (OSError, RuntimeError):  # read as arrays it is refused with the reason
         return False
 

@@ -694,6 +694,8 @@ def spoilt(name, data, rng):
     """Return a file with something wrong, or None for one that is not there."""
     if rng.random() < 0.01:
         return None
+    if not data:
+        return rng.randbytes(40)
     suffix = Path(name).suffix
     if rng.random() < 0.3 or suffix not in _ARRAYS | _TEXTS:
         return mutated(data, rng, [data])

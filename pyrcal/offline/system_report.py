@@ -45,8 +45,8 @@ class SystemReport:
         ):
             if np.isfinite(misfit).all():
                 used |= set(system.names(pair))
-        names = {one.name for one in system.sensors} | {one.name for one in system.mirrors}
-        return frozenset(names - used)
+        names = {sensor.name for sensor in system.sensors}
+        return frozenset((names | {mirror.name for mirror in system.mirrors}) - used)
 
     @property
     def refused(self) -> tuple[str, ...]:

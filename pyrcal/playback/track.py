@@ -91,7 +91,7 @@ def track(
 def _is_recording(path: Path) -> bool:
     try:
         with open_hdf5(path, swmr=True) as file:
-            return bool(file.attrs.get("format") == FORMAT)
+            return str(file.attrs.get("format")) == FORMAT
     except (OSError, RuntimeError):  # read as arrays it is refused with the reason
         return False
 

@@ -206,7 +206,7 @@ def _fits(path: Path) -> Iterator[Container]:
         try:
             for number, hdu in enumerate(file):
                 _check_part(hdu, number, path)
-                if hdu.is_image and hdu.shape:
+                if hdu.is_image and getattr(hdu, "shape", ()):  # a damaged one has none
                     name = str(hdu.header.get("EXTNAME", number))
                     array = _image(hdu, f"{path}[{name}]", path.stat().st_size)
                     arrays[str(number) if name in arrays else name] = array

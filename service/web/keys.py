@@ -98,7 +98,7 @@ class KeyFile:
                 self._seen = (stamp, keys)
         except FileNotFoundError:
             return ()
-        except (OSError, msgspec.MsgspecError) as error:
+        except (OSError, UnicodeDecodeError, msgspec.MsgspecError) as error:
             raise ConfigurationError(
                 f"{self.path}: cannot be read: {error}; it must belong to whom the service runs "
                 "as. Made anew by pyrcal key add when it has been moved away"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from service.errors import MatrixError, PyrcalError
 from service.files.container import opened
-from tests import malformed
+from tests import malformed, malformed_commands
 from tests.unit.files.forged import TWO_BY_THREE, fits_bytes
 
 OF_BYTES = [kind for kind in malformed.KINDS if kind.name != "rest"]
@@ -69,3 +69,9 @@ def test_what_the_millions_found_stays_mended(tmp_path):
         b"SIMPLE  =                    T", b"SIMPLE  = \xff T" + b" " * 17
     )
     assert "damaged FITS file" in refusal(tmp_path, "a.fits", card)
+
+
+@pytest.mark.parametrize("reader", malformed_commands.READERS, ids=lambda reader: reader.name)
+def test_a_command_on_a_mutated_file_ends_as_it_documents(reader):
+    found = malformed_commands.tried(reader, 2, seed=7)
+    assert dict(found.findings) == {}

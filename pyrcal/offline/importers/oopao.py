@@ -61,9 +61,6 @@ _OF_SENSOR = {
 """Attributes of ``wfs`` that only one kind of sensor has."""
 
 _WORDS = {"tag", "postProcessing"}
-_FREE = {"sign", "flip_", "flip_lr"}
-"""Attributes that are numbers or arrays, and that are looked at as they are."""
-
 _ARRAYS = {
     **dict.fromkeys(("pupil", "validI4Q", "valid_subapertures"), (2,)),
     "pupilReflectivity": (0, 2),
@@ -73,7 +70,15 @@ _ARRAYS = {
 }
 """Attributes that are arrays, and how many axes they may have."""
 
-_COUNTS = {"resolution", "nSubap", "n_pix_subap", "binning", "nActAlongDiameter"}
+_COUNTS = {
+    **dict.fromkeys(("nSubap", "n_pix_subap", "binning"), 1),
+    **dict.fromkeys(("resolution", "nActAlongDiameter"), 2),
+}
+"""Attributes that are counts, and the least of each."""
+
+_AXES = 2
+"""Coordinates of a point."""
+
 _POSITIVE = {"D", "wavelength", "mechCoupling", "pixel_scale"}
 
 _MAX_NUMBER = 1e6
@@ -501,6 +506,19 @@ def from_saved(arrays: Mapping[str, Array], where: str) -> Imported:
     missing = [f"{owner}.{name}" for owner, name in _missing(objects)]
     if missing:
         raise ConfigurationError(f"{where}: found no {', '.join(missing)}; expected it beside them")
+    side = int(objects["tel"].resolution)
+    for name in ("pupil", "pupilReflectivity"):
+        shape = np.shape(getattr(objects["tel"], name, ()))
+        if shape not in {(), (side, side)}:
+            raise ConfigurationError(
+                f"{where}: tel.{name}: found shape {shape}, expected ({side}, {side}) as "
+                "tel.resolution says"
+            )
+    places = np.shape(objects["dm"].initial_coordinates)
+    if places[1] != _AXES:
+        raise ConfigurationError(
+            f"{where}: dm.initial_coordinates: found shape {places}, expected (n_actuators, 2)"
+        )
     objects["dm"].misReg = objects["dm.misReg"]
     return from_oopao(
         objects["tel"],
@@ -520,8 +538,11 @@ def _checked(where: str, attribute: str, values: Array) -> object:
     ConfigurationError
         If it is of another kind, has other axes, or is a number that cannot be.
     """
-    if attribute in _WORDS or attribute in _FREE:
-        return values.item() if values.size == 1 else values
+    if attribute in _WORDS:
+        word = values.item() if values.size == 1 else values
+        if not isinstance(word, str):
+            raise ConfigurationError(f"{where}: found {word!r}, expected a word")
+        return word
     if attribute in _ARRAYS:
         axes = _ARRAYS[attribute]
         if values.dtype.kind not in "iufb" or values.ndim not in axes or not values.size:
@@ -532,7 +553,13 @@ def _checked(where: str, attribute: str, values: Array) -> object:
             )
         return values
     number = values.item() if values.size == 1 and values.dtype.kind in "iufb" else np.nan
-    low = 1.0 if attribute in _COUNTS else 0.0 if attribute in _POSITIVE else -_MAX_NUMBER
+    low = (
+        float(_COUNTS.get(attribute, 0))
+        if attribute in _COUNTS
+        else 0.0
+        if attribute in _POSITIVE
+        else -_MAX_NUMBER
+    )
     if not low <= float(number) <= _MAX_NUMBER or (attribute in _POSITIVE and number == 0.0):
         found = values if values.size == 1 else f"shape {values.shape}"
         raise ConfigurationError(f"{where}: found {found}, expected {_expected(attribute)}")
@@ -541,7 +568,7 @@ def _checked(where: str, attribute: str, values: Array) -> object:
 
 def _expected(attribute: str) -> str:
     if attribute in _COUNTS:
-        return "a number of at least 1"
+        return f"a number of at least {_COUNTS[attribute]}"
     return "a number above 0" if attribute in _POSITIVE else "a finite number"
 
 

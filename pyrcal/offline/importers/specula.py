@@ -35,6 +35,10 @@ LENSLETS = (
 )
 
 
+MAX_WIDTH = 4096
+"""Width of the largest sensor, subapertures; indices that span more are damaged."""
+
+
 class Subapertures(NamedTuple):
     """Where the subapertures lie, as they are listed."""
 
@@ -44,7 +48,12 @@ class Subapertures(NamedTuple):
     @property
     def mask(self) -> NDArray[np.bool_]:
         """``(n, n)``: the smallest square that holds them, in its middle."""
-        n = int(max(np.ptp(self.rows), np.ptp(self.columns))) + 1
+        n = int(max(np.ptp(self.rows), np.ptp(self.columns))) + 1 if len(self.rows) else 0
+        if not 0 < n <= MAX_WIDTH:
+            raise MatrixError(
+                f"indices: found {len(self.rows)} subapertures {n} across, expected at most "
+                f"{MAX_WIDTH} across"
+            )
         mask = np.zeros((n, n), dtype=bool)
         row, column = ((n - 1 - np.ptp(each)) // 2 for each in (self.rows, self.columns))
         mask[self.rows - self.rows.min() + row, self.columns - self.columns.min() + column] = True

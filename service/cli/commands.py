@@ -50,7 +50,7 @@ _OPTIONS = {
     "cluster": "compute.cluster",
     "log_format": "service.log_format",
 }
-"""Command-line options that stand for a settings key."""
+"""Settings key of each command-line option."""
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -118,7 +118,7 @@ _WITHOUT = {
         "machine needs none"
     ),
 }
-"""What that means, by whether there is a file."""
+"""Meaning of an empty list of keys, by whether there is a file."""
 
 
 def _key(options: argparse.Namespace) -> int:

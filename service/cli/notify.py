@@ -1,4 +1,4 @@
-"""What systemd hears of the service: that it has started, that it goes on, that it ends.
+"""Notify systemd that the service has started, is alive, and ends.
 
 The protocol of sd_notify(3): datagrams to the socket that systemd names in the environment. Who
 starts the service otherwise names none, and nothing is sent.
@@ -17,10 +17,10 @@ import structlog
 from service.errors import shown
 
 IDLE_S = 10.0
-"""Between two lines of status where no watchdog asks for more."""
+"""Time between two status lines if no watchdog needs more, seconds."""
 
 FEEDS = 3.0
-"""In the time that the watchdog allows: one may come late, and one be lost."""
+"""Messages within the watchdog's timeout: one may come late, and one may be lost."""
 
 
 def notify(text: str, environment: Mapping[str, str] = os.environ) -> None:
@@ -36,7 +36,7 @@ def notify(text: str, environment: Mapping[str, str] = os.environ) -> None:
 
 
 def feeding_interval_s(environment: Mapping[str, str] = os.environ) -> float | None:
-    """Return how often the watchdog wants to be fed; None: no watchdog is set for this process."""
+    """Return the period of watchdog messages; None if this process has no watchdog."""
     limit_us, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
     if not limit_us.isdecimal() or int(limit_us) == 0 or pid not in {"", str(os.getpid())}:
         return None

@@ -55,7 +55,7 @@ def status_of(task: Callable[[], int], name: str = "pyrcal") -> int:
 
 
 ENOUGH_MB = 1000.0
-"""Of address space: what fails within such a limit and more, fails for another reason."""
+"""Address space that every program needs: with more than this, a failure has another cause."""
 
 
 def _memory_limit_mb() -> float | None:
@@ -288,7 +288,7 @@ def _is_own(folder: Path) -> bool:
 _Read = TypeVar("_Read")
 
 _ENDPOINT = re.compile(r"[\w-]+/\S+")
-"""Of zenoh: a protocol and an address."""
+"""Zenoh endpoint: a protocol and an address."""
 
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own

@@ -54,17 +54,17 @@ class Bundle:
     """A reconstructor and all that belongs to it."""
 
     id: str
-    """Of the reconstructor."""
+    """Id of the reconstructor."""
 
     arrays: Mapping[str, Array]
-    """By their names in ``DESCRIBED``, float32 or float64."""
+    """Arrays by their names in ``DESCRIBED``, float32 or float64."""
 
     facts: Mapping[str, Any]
     """What is known of it, as JSON has it: alpha, sigma, verdict, provenance, parent..."""
 
     @property
     def sha256(self) -> str:
-        """Of the manifest, and so of all."""
+        """SHA-256 of the manifest, which has the checksums of all arrays."""
         return _digest(_manifest(self))
 
 

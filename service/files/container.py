@@ -51,7 +51,7 @@ class StoredArray:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     stored_bytes: int
-    """What the file holds of it, compressed."""
+    """Bytes of it in the file, compressed."""
 
     load: Callable[[], NDArray[Any]]
     """Returns it as the file has it, unchecked."""
@@ -109,7 +109,7 @@ class Container:
     """HDF5 attributes of the file, or keywords of the primary FITS header in lower case."""
 
     is_fits: bool = False
-    """Whether images may have no name."""
+    """True for FITS, whose images may have no name."""
 
     def listing(self) -> str:
         """Return what is in the file, in words."""
@@ -252,7 +252,7 @@ def _data(hdu: _ImageHdu) -> NDArray[Any]:
 
 
 NUMPY_DAMAGE = (OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, TokenError)
-"""What a damaged header of NumPy raises: it is read by Python's own parser."""
+"""Errors raised by a damaged NumPy header, which Python's own parser reads."""
 
 
 @contextmanager
@@ -280,7 +280,7 @@ def _numpy(path: Path) -> Iterator[Container]:
 Array = NDArray[np.float64]
 
 DATASET = "interaction_matrix"
-"""What is read unless another name is given; our own archive writes it."""
+"""Default name of the array to read; our own archive writes it."""
 
 
 # --- what pyrcal writes

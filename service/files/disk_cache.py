@@ -33,7 +33,7 @@ MAX_BYTES = 1_000_000_000
 """All files together; the ones used least recently go first."""
 
 VARIABLE = "PYRCAL_SERVICE__CACHE_DIR"
-"""Of the environment; the service's setting ``service.cache_dir`` has the same name there."""
+"""Environment variable with the folder; the setting ``service.cache_dir`` uses the same name."""
 
 _SUFFIX = ".npz"
 _ABANDONED_S = 3600.0

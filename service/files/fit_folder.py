@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 UPLOAD = "upload"
-"""What was uploaded: a measured matrix, or a zip archive of it and an instrument."""
+"""The uploaded file: a measured matrix, or a zip archive of a matrix and an instrument."""
 
 REQUEST = "request.json"
 """A :class:`FitRequest`."""
@@ -23,13 +23,13 @@ STAGE = "stage"
 """One word of :data:`STAGES`."""
 
 STAGES = ("reading", "modes", "orientation", "fit", "verdict", "figures")
-"""What a fit does, in this order."""
+"""Stages of a fit, in this order."""
 
 DOCUMENT = "document.json"
-"""What was found: what ``pyrcal fit --json`` prints."""
+"""Result of the fit, as printed by ``pyrcal fit --json``."""
 
 FIGURES = "figures.json"
-"""What its figures are drawn from."""
+"""Data of the figures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,22 +41,22 @@ class FitRequest:
     instrument, reference."""
 
     own_instrument: str
-    """That of the service: a packaged name, or a file."""
+    """Instrument of the service: a packaged name or a file."""
 
     own_sha256: str
-    """Of the instrument as the service has read it: the file may have changed since."""
+    """Digest of the instrument as the service read it; the file may have changed since."""
 
     max_bytes: int
-    """Of the files of an archive together."""
+    """Largest size of all files of an archive together."""
 
     threads: int
-    """That share the work."""
+    """Threads that share the work."""
 
     nice: int
-    """Of the process: the telescope goes first."""
+    """Niceness of the process, so that the telescope has priority."""
 
     memory_mb: int
-    """That the process may allocate."""
+    """Memory that the process may allocate."""
 
     def write(self, folder: Path) -> None:
         """Put it into the folder of its fit."""

@@ -1,6 +1,6 @@
 """Hold the last telemetry in memory, for recordings that begin before now.
 
-Messages are joined in chunks of one megabyte that lie in memory maps of their own. On the heap,
+Messages are joined in chunks of one megabyte, each in a memory map of its own. On the heap,
 between objects that live for moments, messages kept for half a minute fragment it: 100 MB of pages
 were held that nothing used.
 """
@@ -26,7 +26,7 @@ OVERHEAD_BYTES: Final = 200
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Chunk:
-    """Messages whose bytes lie one after another in a memory map."""
+    """Messages, their bytes one after another in a memory map."""
 
     heads: tuple[Message, ...]
     """Time and kind of each message; payloads and attachments are empty."""

@@ -48,7 +48,7 @@ FLUSH_S: Final = 0.5
 """Most that a killed process loses, beside the time the disk needs."""
 
 BACKLOG_BYTES: Final = 64_000_000
-"""What may wait for the disk; beyond it messages are dropped and counted."""
+"""Bytes that may wait for the disk; beyond it messages are dropped and counted."""
 
 PAST_PART_BYTES: Final = 16_000_000
 """Bytes of earlier telemetry that are written to the disk at once."""

@@ -106,7 +106,7 @@ class MirrorTable(kinds.InfluenceShape):
     """Modes of an analytic mirror without ``mode_to_actuator``."""
 
     nominal_rotation_deg: float | None = None
-    """Where a fit starts; None: found from tip and tilt."""
+    """Rotation at which a fit starts. None: determined from tip and tilt."""
 
     nominal_anamorphosis: tuple[Stretch, Stretch] | None = None
     """Stretch of the mirror's turned image along the sensor's x over the mean of both axes, ratio
@@ -147,7 +147,7 @@ class OrientationTable(Table):
     flip_x: bool = False
     flip_y: bool = False
     sign: Annotated[tuple[int, int], BeforeValidator(_signs)] = (1, 1)
-    """Of both components on the RTC's own grid, or of Sx and Sy each."""
+    """Signs of both components on the RTC's own grid, or of Sx and Sy each."""
 
 
 class SlopesTable(Table):
@@ -161,7 +161,8 @@ class SlopesTable(Table):
 
     orientation: Annotated[OrientationTable | None, BeforeValidator(_auto_is_none)] = None
     normalisation: kinds.Normalisation = kinds.Normalisation.GLOBAL
-    """By the mean flux of a subaperture, or by each one's own: of its four pixels together."""
+    """Normalisation by the mean flux of all subapertures, or by the flux of each one (the sum of
+    its four pixels)."""
 
 
 @cache
@@ -197,7 +198,7 @@ class Section(Generic[Said]):
     """Keys that are written."""
 
     path: Path
-    """Of the file; references are relative to where it lies."""
+    """Path of the file; references in it are relative to its folder."""
 
     name: str
 
@@ -216,7 +217,7 @@ class InstrumentFile:
 
     sections: tuple[Section[Any], ...]
     kind: SensorKind
-    """Of its sensor."""
+    """Kind of its sensor."""
 
     unknown: frozenset[str] = frozenset()
     """Keys, with their tables, that are said to be unknown."""

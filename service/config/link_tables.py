@@ -20,7 +20,7 @@ from service.wire.keys import Keys
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
 USERS: Final = "transport/auth/usrpwd"
-"""Of zenoh's configuration."""
+"""Key of zenoh's configuration."""
 
 SHORTEST_SECRET: Final = 32
 """Characters."""
@@ -119,7 +119,7 @@ class ZenohTable(CredentialsTable):
     """Size of a reconstructor's chunks; a default build of zenoh-pico drops more than 4 KB."""
 
     access: AccessTable = Field(default_factory=AccessTable)
-    """Who may do what, as soon as certificates or users tell who is who."""
+    """Access rules, which need certificates or users to identify the clients."""
 
     anyone_may_command_the_mirror: bool = False
     """Accept that whoever reaches ``listen`` can put a matrix of their own on the mirror: without
@@ -189,10 +189,10 @@ class Router:
 
     endpoint: str
     security: Mapping[str, object] = field(default_factory=dict)
-    """What zenoh is told about certificates and users; empty: it shows nothing."""
+    """Zenoh's configuration of certificates and users; empty if there are none."""
 
     secret: bytes | None = None
-    """What messages are signed with; None: they are not."""
+    """Secret with which messages are signed; None if they are not."""
 
 
 def router_of(path: Path | None, connect: str | None) -> Router:

@@ -26,13 +26,13 @@ class KeyText:
     """Type and limits, in words."""
 
     needed: bool
-    """Whether a file must have it."""
+    """True if a file must have it."""
 
     default: object
-    """What it is where a file does not have it; None: nothing, or a rule that the meaning tells."""
+    """Value where a file does not have it. None: no value, or a rule that the meaning describes."""
 
     meaning: str
-    """What it means; empty where its name says all."""
+    """Meaning of the key; empty where its name is enough."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,10 +40,10 @@ class TableText:
     """A table of a file."""
 
     header: str
-    """As TOML has it: ``[wfs]``, ``[[wfs.mode]]``."""
+    """Header of the table in TOML: ``[wfs]``, ``[[wfs.mode]]``."""
 
     about: str
-    """What it is about."""
+    """Subject of the table."""
 
     keys: tuple[KeyText, ...]
 

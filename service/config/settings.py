@@ -78,10 +78,10 @@ class DitherTable(Table):
     """1 σ of each shift to keep, subapertures."""
 
     sigma_rotation_deg: Positive = 0.02
-    """Of the rotation, degrees."""
+    """1 σ of the rotation to keep, degrees."""
 
     sigma_magnification: Positive = 0.001
-    """Of the magnification."""
+    """1 σ of the magnification to keep."""
 
     longest_pause_s: float = Field(default=0.0, ge=0.0, le=3600.0)
     """Longest pause between two windows, seconds; a jump may go unseen as long."""
@@ -133,19 +133,19 @@ class TrackingTable(Table):
     """Random walk of each shift, 1 σ after a minute, subapertures."""
 
     drift_deg_per_minute: Positive = 0.05
-    """Of the rotation, degrees."""
+    """Random walk of the rotation, 1 σ after a minute, degrees."""
 
     drift_magnification_per_minute: Positive = 0.0005
-    """Of the magnification."""
+    """Random walk of the magnification, 1 σ after a minute."""
 
     floor_shift_subap: float | None = Field(default=None, ge=0.0)
     """1 σ model error of each shift, subapertures. None: as measured."""
 
     floor_rotation_deg: float | None = Field(default=None, ge=0.0)
-    """Of the rotation, degrees. None: as measured, or more of a coarse mirror."""
+    """Model error of the rotation, 1 σ, degrees. None: as measured, or more for a coarse mirror."""
 
     floor_magnification: float | None = Field(default=None, ge=0.0)
-    """Of the magnification. None: as measured, or more of a coarse mirror."""
+    """Model error of the magnification, 1 σ. None: as measured, or more for a coarse mirror."""
 
     anamorphosis: bool = False
     """Follow the stretch of the mirror's image, too; else it is as the instrument file says. The
@@ -158,10 +158,10 @@ class TrackingTable(Table):
     """Shift per degree of elevation, 1 σ, subapertures."""
 
     flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
-    """The same for the rotation, degrees."""
+    """Rotation per degree of elevation, 1 σ, degrees."""
 
     flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
-    """The same for the magnification."""
+    """Magnification per degree of elevation, 1 σ."""
 
     slew_limit_deg: Positive = 5.0
     """α is invalid when the telescope has moved further since the last window, degrees."""
@@ -171,10 +171,11 @@ class TrackingTable(Table):
     500 modes on 30 subapertures, more for fewer modes."""
 
     stale_rotation_deg: Positive | None = None
-    """Of the rotation, degrees. None: 0.1 for 500 modes, more for fewer."""
+    """1 σ of the rotation from which α is stale, degrees. None: 0.1 for 500 modes, more for
+    fewer."""
 
     stale_magnification: Positive | None = None
-    """Of the magnification. None: 0.003 for 500 modes, more for fewer."""
+    """1 σ of the magnification from which α is stale. None: 0.003 for 500 modes, more for fewer."""
 
 
 class AcquisitionTable(Table):
@@ -217,10 +218,12 @@ class ControlTable(Table):
     500 modes on 30 subapertures, more for fewer modes."""
 
     update_rotation_deg: Positive | None = None
-    """Of the rotation, degrees. None: 0.08 for 500 modes, more for fewer."""
+    """Change of the rotation that calls for a new matrix, degrees. None: 0.08 for 500 modes, more
+    for fewer."""
 
     update_magnification: Positive | None = None
-    """Of the magnification. None: 0.005 for 500 modes, more for fewer."""
+    """Change of the magnification that calls for a new matrix. None: 0.005 for 500 modes, more for
+    fewer."""
 
     wind_m_s: Positive = 15.0
     """Wind for the expected loss, metres per second."""
@@ -348,16 +351,16 @@ class RuleTable(Table):
     ``state.elevation_deg``; how it is compared; with what."""
 
     blocks: tuple[Literal["measure", "decide", "send_new", "send_known", "ask"], ...] = ()
-    """What it forbids, as docs/operate/runbook.md explains."""
+    """Actions that the alarm forbids, as docs/operate/runbook.md explains."""
 
     severity: Literal["warning", "serious", "critical"] = "serious"
-    """How much it matters."""
+    """Severity of the alarm."""
 
     text: str = Field(min_length=1, max_length=300)
-    """What is wrong and what to do, in a sentence."""
+    """Text of the alarm: what is wrong and what to do, in a sentence."""
 
     unknown: Literal["holds", "does-not-hold"] = "holds"
-    """Whether it holds while the value is unknown."""
+    """Result of the rule while the value is unknown."""
 
     @model_validator(mode="after")
     def _compared_with_sense(self) -> RuleTable:
@@ -380,7 +383,7 @@ STATE_FIELDS: dict[str, type] = {
     "state.elevation_deg": float,
     "state.azimuth_deg": float,
 }
-"""What a rule may ask of the state."""
+"""Types of the values that a rule may use, by their path in the state."""
 
 _WORD = {str: "text", float: "number"}
 

@@ -34,10 +34,10 @@ class Step(NamedTuple):
     text: str
     under_way: bool
     well: bool
-    """Whether it has come to a good end."""
+    """True if it succeeded."""
 
     lasts_s: float | None = None
-    """How long it takes, seconds; None: nobody knows."""
+    """Expected duration, seconds; None if it is unknown."""
 
 
 def run_command(service: Service, request: Request, options: argparse.Namespace) -> int:

@@ -45,27 +45,27 @@ class Request(NamedTuple):
     name: str
     purpose: str
     module: str
-    """Of this package; its ``run_command`` does the work."""
+    """Module of this package whose ``run_command`` does the work."""
 
     call: str
     """Method and path of REST; words in braces are options."""
 
     words: tuple[Words, ...] = ()
     always: Mapping[str, str] = {}
-    """What the body says besides."""
+    """Fixed content of the request body."""
 
     decides_on: str = ""
     """Path of what is shown before, and named in ``If-Match``; empty: nothing."""
 
     asks: str = ""
-    """What somebody at a terminal has to agree to before; empty: nothing."""
+    """Question that must be confirmed at a terminal; empty if there is none."""
 
     needs_why: bool = False
     permitted: str = ""
     """Name of the order in the state's ``permitted``; empty: it may always be given."""
 
     then: str = ""
-    """What to do afterwards."""
+    """Action after the answer."""
 
     follows: str = ""
     """Path of what is looked at until the work is done, of all reconstructors: the copy that goes
@@ -303,7 +303,7 @@ REQUESTS = (
         words("id ID", "id of the measurement"),
     ),
 )
-"""What there is, in the order of ``pyrcal --help``."""
+"""Commands, in the order of ``pyrcal --help``."""
 
 
 def declare(commands: Any) -> None:  # noqa: ANN401 - argparse's own

@@ -47,7 +47,7 @@ class Latest:
 
     state: Document | None = None
     at_s: float = 0.0
-    """When the state came, monotonic."""
+    """Time at which the state came, monotonic seconds."""
 
     log: tuple[Document, ...] = ()
     last: str = ""

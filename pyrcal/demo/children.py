@@ -30,7 +30,7 @@ class Child:
 
     @property
     def ended(self) -> str | None:
-        """How it ended, with its last words; None: it runs."""
+        """Exit status and last output of the process; None while it runs."""
         status = self.process.poll()
         if status is None:
             return None

@@ -1,4 +1,4 @@
-"""What came of the demo: the estimate against the truth, the loop before and after, as a table."""
+"""Result of the demo: the estimate against the truth, the loop before and after, as a table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOLERANCE_ACROSS_SUBAP = 30.0
 MAX_ERROR_IN_SIGMA = 4.0
 
 LONG_S = 5.0
-"""What has been missing for so long is missing."""
+"""Time without data after which its source counts as stopped, seconds."""
 
 MODEL = "model"
 """Name of what the service waits for until its model is prepared."""
@@ -39,28 +39,28 @@ View = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Circumstances:
-    """What the demo has seen from outside: it tells why something did not come out right."""
+    """Observations of the demo that explain why a result is bad."""
 
     seconds_to_ready: float | None = None
     """From the start until model and simulator were prepared; None: they never were."""
 
     seconds_to_first_applied: float | None = None
-    """After that; None: no matrix of the service has been applied."""
+    """Time from then to the first applied matrix of the service, seconds; None if there is none."""
 
     pace: float | None = None
     """Seconds of telemetry that the simulator made in a second; None: not known."""
 
     unanswered_s: float = 0.0
-    """How long the service has not answered."""
+    """Time for which the service has not answered, seconds."""
 
     frameless_s: float = 0.0
-    """How long the service has received no frame."""
+    """Time for which the service has received no frame, seconds."""
 
     untold_s: float = 0.0
-    """How long the simulator has made nothing."""
+    """Time for which the simulator has written no truth, seconds."""
 
     endings: tuple[str, ...] = ()
-    """Of processes that have ended, and their last words."""
+    """Exit status and last output of processes that have ended."""
 
     wanted_ratio: float = 1.0
     """Wavefront error at the start over that at the end which is wanted at least."""
@@ -85,7 +85,7 @@ class Stage:
     """From the simulator's truth."""
 
     worst_pole_radius: float | None = None
-    """As the service's gate predicts it within 3 sigma."""
+    """Largest closed-loop pole radius within 3 sigma, as predicted by the service's gate."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -117,7 +117,7 @@ class Report:
     frames_lost: int = 0
     seconds_to_ready: float | None = None
     seconds_to_first_applied: float | None = None
-    """After all was ready."""
+    """Time from the end of preparation, seconds; None if no matrix was applied."""
 
     pace: float | None = None
     """Seconds of telemetry that the simulator made in a second."""
@@ -129,7 +129,7 @@ class Report:
 
     @property
     def good(self) -> bool:
-        """Whether the main job was done."""
+        """True if the main job was done."""
         return not self.failures
 
     def to_json(self) -> str:

@@ -82,7 +82,7 @@ and the simulator's own matrices: some 9 GB beside 6 of the service's.
 """
 
 HELD_GFLOP_S = 30.0
-"""Of products of a matrix with few frames, what half a processor of two cores does."""
+"""Speed of matrix products with few frames on half of a processor with two cores, GFLOP/s."""
 
 CHECK_WITHIN_S = 60.0
 
@@ -184,10 +184,10 @@ class _Large(NamedTuple):
     """A linear plant that no ordinary machine runs in real time."""
 
     rate_hz: float
-    """Of its frames."""
+    """Frame rate."""
 
     gflop_s: float
-    """Of the products of its slopes and modes, by which it was judged."""
+    """Speed that the products of slopes and modes need, GFLOP/s."""
 
 
 def _too_large(options: argparse.Namespace) -> _Large | None:

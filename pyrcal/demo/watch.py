@@ -45,7 +45,7 @@ LARGE_WITHIN_S = 1800.0
 """The same of a telescope of thousands of modes."""
 
 USUAL_RATE_HZ = 1000.0
-"""Of the simulated RTC, where the machine holds it."""
+"""Frame rate of the simulated RTC, if the machine is fast enough."""
 
 HOLD_S = 5.0
 """All must have been right for so long before the demo ends by itself."""
@@ -106,7 +106,7 @@ class Stopwatch:
 
     @property
     def silent_s(self) -> float:
-        """How long the simulator has made nothing."""
+        """Time for which the simulator has written no truth, seconds."""
         return self._now_s - self._alive_s
 
     @property
@@ -117,10 +117,10 @@ class Stopwatch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Promise:
-    """How long the demo takes, and whether it may end before."""
+    """Duration of the demo, and whether it may end earlier."""
 
     seconds: float | None
-    """After all is ready; None: until Ctrl-C."""
+    """Duration from the end of preparation, seconds; None: until Ctrl-C."""
 
     whole: bool
     """Something is to happen at a time of its own: all the seconds are wanted."""

@@ -232,7 +232,7 @@ class Index:
         return bool(version == 0)
 
     def look(self) -> None:
-        """Open the file to read it, as it is, beside a service that may be using it.
+        """Open the file to read it, while a service may be using it.
 
         Raises
         ------

@@ -164,16 +164,16 @@ class Night:
     """Summary of one night."""
 
     date: str
-    """UTC, of the noon at which it begins, such as 2026-03-01."""
+    """Date of the noon at which it begins, UTC, such as 2026-03-01."""
 
     since_ns_utc: int
     """Noon at which the night begins."""
 
     until_ns_utc: int
-    """The last nanosecond before the next one."""
+    """Last nanosecond before the next noon."""
 
     duration_s: float = 0.0
-    """From the first estimate to the last."""
+    """Time from the first estimate to the last, seconds."""
 
     n_estimates: int = 0
     n_swaps: int = 0

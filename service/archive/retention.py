@@ -37,21 +37,21 @@ EVERYTHING = RetentionPolicy()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Item:
-    """A product whose numbers lie in the archive."""
+    """A product whose numbers are stored in the archive."""
 
     id: str
     kind: str
     """"reconstructor", "measurement", "noisy matrix" or "recording"."""
 
     state: str
-    """What has become of it."""
+    """State of the product."""
 
     stored_ns_utc: int
-    """When its file was written, by the service's clock; 0: it is not there."""
+    """Time at which its file was written, by the service's clock; 0 if there is no file."""
 
     n_bytes: int
     counted: bool = True
-    """Whether it counts in ``keep_gb``."""
+    """True if it counts in ``keep_gb``."""
 
     kept_because: str = ""
     """Why it is kept for ever; empty: it goes when it is old, or there is too much."""

@@ -21,10 +21,10 @@ from service.tracking.registration import Registration
 from service.tracking.state import Saved
 
 NOT_UNDERSTOOD = (ValueError, KeyError, TypeError, ModelError)
-"""What reading a record of another version, or a damaged one, raises."""
+"""Errors raised by a record that is damaged or of another version."""
 
 _OF_THIS_RUN = "judged"
-"""What a restarted service must find out anew."""
+"""Field that a restarted service has to determine again."""
 
 _NUMERIC = ("shift_x_subap", "shift_y_subap", "rotation_rad", "magnification")
 _RADIANS, _DEGREES, _DEGREES_PER_RADIAN = "rotation_rad", "rotation_deg", float(BOUNDARY_SCALE[2])
@@ -113,7 +113,7 @@ def _in_radians(values: dict[str, Any]) -> dict[str, Any]:
 VERSION = 1
 
 _NOT_KEPT = ("grown", "validity", "suspected_jump", "previous_estimate", "restored_ns_utc")
-"""Of the registration and its bias: what the next service works out anew."""
+"""Fields of the registration and its bias that the next service computes again."""
 
 _ACQUISITION_KEPT = (
     "stage",
@@ -161,7 +161,7 @@ class TrackingFile:
             raise StorageError(f"{self._path}: cannot be written: {error}") from error
 
     def read(self) -> Saved | None:
-        """Return what was saved; None: nothing was.
+        """Return the saved state; None if there is no file.
 
         Raises
         ------

@@ -20,10 +20,10 @@ from service.files.whole import open_hdf5, write_whole
 from service.wire import checksum, validate_id
 
 Provenance = str | int | float | bool | NDArray[Any]
-"""What an HDF5 attribute can hold."""
+"""Types that an HDF5 attribute can hold."""
 
 DAMAGE = (OSError, RuntimeError, *NOT_UNDERSTOOD)
-"""What h5py raises, depending on where a file is damaged."""
+"""Errors raised by h5py, depending on where a file is damaged."""
 
 Record = TypeVar("Record", bound=Product)
 
@@ -33,16 +33,16 @@ FOLDER_MODE = 0o700
 
 
 class Folder:
-    """A file for each of what is kept, and beside it, as JSON, what is to be known."""
+    """Folder with an HDF5 file for each product, and a JSON file with its record."""
 
     noun: str
-    """What one of them is called in messages."""
+    """Name of such a product in messages."""
 
     counted = True
-    """Whether they count in ``keep_gb``."""
+    """True if they count in ``keep_gb``."""
 
     lost_with_it = "it cannot be fitted or compared any more; what is known of it is in the index"
-    """What it means that one is damaged."""
+    """Consequence of a damaged file, for messages."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -96,7 +96,7 @@ class Store(Folder, Generic[Record]):
     """
 
     kind: type[Record]
-    """Of their records."""
+    """Type of their records."""
 
     described: str
     """Axes and unit of the matrix."""
@@ -112,7 +112,7 @@ class Store(Folder, Generic[Record]):
         self._stand_ins: dict[str, Record] = {}
 
     def stored(self) -> frozenset[str]:
-        """Return the ids of those whose numbers lie here."""
+        """Return the ids of the products whose numbers are stored."""
         return frozenset(self._index.checksums(self._table))
 
     @override

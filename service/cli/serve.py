@@ -55,10 +55,11 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Parameters of mallopt(3)."""
 
 LARGE_BYTES = 2_500_000
-"""What is larger gets memory of its own, and gives it back at once: seconds of frames, matrices."""
+"""Size from which an allocation is a memory map of its own, which is returned at once: frames of
+seconds, matrices."""
 
 UNUSED_BYTES = 8_000_000
-"""Free at the end of the heap before it is given back."""
+"""Unused memory at the end of the heap above which it is returned to the system."""
 
 END_WITHIN_S = 4.5
 """After this what holds the service up is named, and left behind: five seconds is what operators

@@ -159,10 +159,10 @@ class TrackingTable(Table):
     """Shift per degree of elevation, 1 σ, subapertures."""
 
     flexure_deg_per_degree: float = Field(default=0.01, ge=0.0)
-    """The same for the rotation, degrees."""
+    """Rotation per degree of elevation, 1 σ, degrees."""
 
     flexure_magnification_per_degree: float = Field(default=1e-4, ge=0.0)
-    """The same for the magnification."""
+    """Magnification per degree of elevation, 1 σ."""
 
     slew_limit_deg: Positive = 5.0
     """α is invalid when the telescope has moved further since the last window, degrees."""
@@ -355,7 +355,7 @@ class RuleTable(Table):
     """Severity of the alarm."""
 
     text: str = Field(min_length=1, max_length=300)
-    """What is wrong and what to do, in a sentence."""
+    """Text of the alarm: what is wrong and what to do, in a sentence."""
 
     unknown: Literal["holds", "does-not-hold"] = "holds"
     """Result of the comparison while the value is unknown."""

@@ -38,7 +38,7 @@ UNAVAILABLE_RETRY_S = 5
 
 
 class Middleware:
-    """Stands before the application; what is no request over HTTP passes by it.
+    """Base of our middleware: it handles HTTP requests and passes everything else on.
 
     Parameters
     ----------

@@ -163,7 +163,7 @@ class MirrorDrawing:
     """The mirror on the sensor, as far as it can be drawn: lengths in subapertures, centred."""
 
     n_subapertures: int
-    """Across the sensor's grid."""
+    """Subapertures across the sensor's grid."""
 
     pupil_diameter_subap: float
     """Diameter of the pupil image, subapertures."""
@@ -172,14 +172,15 @@ class MirrorDrawing:
     """Obscuration ratio of the pupil, linear."""
 
     stop: Stop
-    """"mirror": the pupil's rim moves with the shift, and keeps its size; "telescope": it stays."""
+    """Stop of the pupil: with "mirror" its rim moves with the shift and keeps its size, with
+    "telescope" it stays."""
 
     nominal: Misregistration
     """Nominal registration by the instrument file."""
 
     tolerance: NDArray[np.float64]
-    """``(4,)`` further than this from what the reconstructor in use was made for, and another one
-    is made whatever it wins, numeric units."""
+    """``(4,)`` distance from the registration of the reconstructor in use from which a new one is
+    made whatever it gains, numeric units."""
 
     edge_limit_m: float
     """Largest RMS motion of an outer actuator for slope noise of 1 that the gate accepts."""

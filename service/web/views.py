@@ -1,4 +1,4 @@
-"""Which fields of which record REST shows, and how.
+"""Views: the fields of the service's records that REST shows.
 
 Records leave as they are: a view names the fields of one, in boundary units. A registration, or its
 1 σ, leaves as its four parameters; a number that is not finite is null. The OpenAPI document takes
@@ -54,11 +54,11 @@ class FieldView(NamedTuple):
     """A field of a picture."""
 
     path: str
-    """Where to find it, from the record on."""
+    """Attributes from the record to the field, separated by dots."""
 
     taken: Callable[[Any], Any]
     below: View | None
-    """Of the records in it, where it is not the usual one."""
+    """View of the records in the field; None if it is their usual one."""
 
     clock: str
     """Name under which it leaves by the clock, too; empty: it is no time."""
@@ -69,18 +69,18 @@ class View:
     """A picture of a record."""
 
     name: str
-    """Of its schema."""
+    """Name of its schema in OpenAPI."""
 
     record: type
     text: str
-    """What it shows."""
+    """Description of the schema."""
 
     parts: Mapping[str, FieldView]
-    """By the name each leaves under."""
+    """Fields by their names in JSON."""
 
 
 USUAL_VIEWS: dict[type, View] = {}
-"""By the type of the record."""
+"""Usual view of each type of record."""
 
 NAMED_VIEWS: dict[str, View] = {}
 """All of them, by name."""
@@ -131,7 +131,7 @@ def to_json(record: object, of: View | None = None) -> dict[str, Any]:
 
 @lru_cache(maxsize=1500)
 def _lasting(record: HistoryEntry | LogEntry | archive.AuditEntry) -> dict[str, Any]:
-    """Return the picture of what is asked for again and again, and never changes."""
+    """Return the view of a record that never changes and is requested often."""
     return to_json(record)
 
 

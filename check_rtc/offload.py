@@ -157,6 +157,7 @@ def _compare_move(
     ratio = change[0] / demand.shift_x_subap
     found = f"the image moved by {ratio:.2f} of the {STEP_SUBAP:g} subap demanded, ± {sigma:.2f}"
     side_motion = np.abs(change * _SIDE_MOTION_SCALE)[1:].max()
+    # The measured ratio has the noise of two windows of α, so the range is wider by 2 σ.
     if not MOVE_RATIO_RANGE[0] - 2 * sigma <= ratio <= MOVE_RATIO_RANGE[1] + 2 * sigma:
         problems.append(_explain_ratio(ratio))
     if problems:

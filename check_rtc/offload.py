@@ -49,7 +49,7 @@ MOVE_RATIO_RANGE: Final = (0.67, 1.33)
 """Accepted range of the measured move over the demand."""
 
 MAX_SIDE_MOTION: Final = 0.05
-"""Largest change of the other parameters, in units of ``_SIDE_MOTION_SCALE``."""
+"""Largest change of the other parameters, each multiplied by ``_SIDE_MOTION_SCALE``."""
 
 ALPHA_LINE_RATIOS: Final = (0.21, 0.24, 0.27, 0.3)
 """Frequencies of the dither over the frame rate."""

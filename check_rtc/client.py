@@ -22,6 +22,7 @@ from service.estimation.dither_monitor import DitherMeasurement, DitherMonitor, 
 from service.estimation.frames import FrameBlock
 from service.estimation.windows import ExpectedDither
 from service.wire import (
+    FRAMES_PER_BATCH,
     CommandKind,
     DitherKind,
     DitherRequest,
@@ -136,6 +137,8 @@ def _invalid_commands(client: RtcClient, status: Status) -> list[_InvalidCommand
     dithering = CommandKind.DITHER
     without = {key: value for key, value in keys.items() if key != "modes"}
     return [
+        # 0xc1 is the one byte that msgpack never uses. On a link with signatures these bytes are
+        # refused before they are parsed, because they have none.
         _InvalidCommand(dithering, b"\xc1", "bytes of no message", ("range", "signature")),
         _InvalidCommand(
             dithering,
@@ -175,8 +178,8 @@ def check_replies(client: RtcClient, status: Status) -> CheckResult:
     problems, absent, slowest_s, first = [], [], 0.0, b""
     commands = _invalid_commands(client, status)
     for command in commands:
-        answer, took_s = client.connection.ask(command.kind, command.payload)
-        if answer is None:
+        response, took_s = client.connection.ask(command.kind, command.payload)
+        if response is None:
             # zenoh says at once that a key has no queryable; a queryable that does not answer
             # costs the whole timeout.
             if command.optional and took_s < ANSWER_TIMEOUT_S / 2:
@@ -185,8 +188,8 @@ def check_replies(client: RtcClient, status: Status) -> CheckResult:
                 problems.append(f"no answer to {command.what}")
             continue
         slowest_s = max(slowest_s, took_s)
-        problems += _find_reply_problems(answer, command, took_s)
-        first = answer if command is commands[3] else first
+        problems += _find_reply_problems(response, command, took_s)
+        first = response if command is commands[3] else first
     again, _ = client.connection.ask(commands[3].kind, commands[3].payload)
     if first and (again is None or decode(Reply, again) != decode(Reply, first)):
         problems.append("a repeated id had another reply")
@@ -197,9 +200,9 @@ def check_replies(client: RtcClient, status: Status) -> CheckResult:
     return fine("replies", f"{found}, and the same reply for a repeated id{without}")
 
 
-def _find_reply_problems(answer: bytes, command: _InvalidCommand, took_s: float) -> list[str]:
+def _find_reply_problems(response: bytes, command: _InvalidCommand, took_s: float) -> list[str]:
     try:
-        reply = decode(Reply, answer)
+        reply = decode(Reply, response)
     except WireError as error:
         return [f"the reply to {command.what} cannot be read: {error}"]
     if reply.accepted:
@@ -228,8 +231,8 @@ def check_signatures(client: RtcClient, status: Status) -> CheckResult:
         ("a signed command", signed, True),
         ("a replayed command", signed, False),
     ):
-        answer, _ = connection.ask(kind, payload, is_signed=True)
-        reply = None if answer is None else decode(Reply, answer)
+        response, _ = connection.ask(kind, payload, is_signed=True)
+        reply = None if response is None else decode(Reply, response)
         if reply is None:
             problems.append(f"no reply to {what}")
         elif reply.accepted is not expected:
@@ -252,13 +255,20 @@ class _DitherRecorder:
         self, asked: ExpectedDither, matrix: NDArray[np.float32] | None, in_loop: list[int]
     ) -> None:
         self.first_seq: int | None = None
+        """First frame with dither; None if none has come."""
         self.last_seq = -1
+        """Last frame with dither."""
         self.next_seq = 0
+        """Frame after the last one received."""
         self.findings: list[DitherMeasurement] = []
+        """Measurements of the dither, one per second."""
         self.seq: list[NDArray[np.int64]] = []
-        self.seen_m: list[NDArray[np.float64]] = []
-        self.moved_m: list[NDArray[np.float64]] = []
-        self._meter, self._matrix, self._in_loop = DitherMonitor(asked=asked), matrix, in_loop
+        """Sequence numbers of the analysed frames, a block each; as the two below."""
+        self.responses_m: list[NDArray[np.float64]] = []
+        """Slopes times matrix of the controlled modes, ``(n_frames, n_modes)``."""
+        self.commands_m: list[NDArray[np.float64]] = []
+        """Commands of the same modes, ``(n_frames, n_modes)``."""
+        self._monitor, self._matrix, self._in_loop = DitherMonitor(asked=asked), matrix, in_loop
         self._span = asked.first_seq, asked.stop_seq
 
     def take(self, block: FrameBlock) -> None:
@@ -270,29 +280,30 @@ class _DitherRecorder:
                 self.last_seq = block.first_seq + int(rows[-1])
                 if self.first_seq is None:
                     self.first_seq = block.first_seq + int(rows[0])
-        self._meter, found = measure_block(self._meter, block)
+        self._monitor, found = measure_block(self._monitor, block)
         self.findings += [] if found is None else [found]
         first, stop = self._span
+        # Only whole blocks inside the dither: outside it there is no response to measure.
         if self._matrix is None or block.first_seq < first or block.next_seq > stop:
             return
         self.seq.append(np.arange(block.first_seq, block.next_seq))
         modes = self._in_loop
-        self.seen_m.append(np.asarray(block.slopes @ self._matrix[modes].T, dtype=float))
-        self.moved_m.append(np.asarray(block.commands_m[:, modes], dtype=float))
+        self.responses_m.append(np.asarray(block.slopes @ self._matrix[modes].T, dtype=float))
+        self.commands_m.append(np.asarray(block.commands_m[:, modes], dtype=float))
 
 
 def check_dither(
     client: RtcClient,
     status: Status,
     matrix: NDArray[np.float32] | None,
-    most_m: float = DITHER_RMS_M,
+    max_rms_m: float = DITHER_RMS_M,
 ) -> list[CheckResult]:
     """Check that a small dither is played as requested and stops, and the columns of frames."""
     if status.dither is not None:
-        why = f"{status.dither_id} plays: stop it first"
-        return [skipped("dither", why), skipped("columns", why)]
+        reason = f"{status.dither_id} plays: stop it first"
+        return [skipped("dither", reason), skipped("columns", reason)]
     modes = choose_dither_modes(status)
-    amplitude = min(most_m / np.sqrt(len(modes)), status.max_dither_m)
+    amplitude = min(max_rms_m / np.sqrt(len(modes)), status.max_dither_m)
     request = DitherRequest(
         id=client.connection.new_id("dither"),
         kind=DitherKind.SINE,
@@ -314,25 +325,26 @@ def check_dither(
         recorder = _record_dither(client, status, request, reply.start_seq, matrix)
     finally:  # also if the user interrupts the check
         ended = stop_dither(client)
-    ordered_seq = recorder.next_seq
-    gone = client.listen(
+    stop_command_seq = recorder.next_seq
+    has_stopped = client.listen(
         _STOP_TIMEOUT_S,
         lambda: (
             client.observer.status is not None
             and client.observer.status.dither is None
-            and recorder.next_seq > recorder.last_seq + 50
+            # a full batch of frames without dither after the last frame with it
+            and recorder.next_seq > recorder.last_seq + FRAMES_PER_BATCH
         ),
     )
     client.observer.block_callbacks.remove(recorder.take)
-    judged = _compare_dither(client, request, reply.start_seq, recorder)
-    if not judged and not (ended.accepted and gone):
-        still_s = (recorder.last_seq - ordered_seq) / status.frame_rate_hz
-        judged = (
+    problem = _compare_dither(client, request, reply.start_seq, recorder)
+    if not problem and not (ended.accepted and has_stopped):
+        still_s = (recorder.last_seq - stop_command_seq) / status.frame_rate_hz
+        problem = (
             f"not stopped: frames have it {still_s:.1f} s after the command to stop, or the status "
             f"still has it; reply: {ended.reason or 'accepted'}"
         )
-    if judged:
-        return [wrong("dither", judged), _check_columns(recorder, modes, status)]
+    if problem:
+        return [wrong("dither", problem), _check_columns(recorder, modes, status)]
     found_m = recorder.findings[-1].found_m
     found = (
         f"{1e9 * found_m:.2f} nm RMS on modes {', '.join(map(str, modes))} from frame "
@@ -373,7 +385,7 @@ def _record_dither(
     """Record the dither after its command has been accepted."""
     rate_hz = status.frame_rate_hz
     stop_seq = start_seq + round(ANALYSED_S * rate_hz)
-    own = tuple(mode not in status.in_loop for mode in request.modes)
+    is_uncontrolled = tuple(mode not in status.in_loop for mode in request.modes)
     asked = ExpectedDither(
         modes=request.modes,
         amplitude_m=request.amplitude_m,
@@ -381,9 +393,9 @@ def _record_dither(
         frame_rate_hz=rate_hz,
         first_seq=start_seq,
         stop_seq=stop_seq,
-        own=own,
+        own=is_uncontrolled,
     )
-    in_loop = [mode for mode, outside in zip(request.modes, own, strict=True) if not outside]
+    in_loop = [mode for mode in request.modes if mode in status.in_loop]
     recorder = _DitherRecorder(asked, matrix, in_loop)
     client.observer.block_callbacks.append(recorder.take)
     client.listen(2.0 * ANALYSED_S, lambda: recorder.next_seq >= stop_seq)
@@ -422,53 +434,59 @@ def _check_columns(
     The matrix in use turns slopes into modes. Their phase at the dither lines against that of the
     commands is a lag, if it is proportional to frequency, or a reversed sign.
     """
-    n_lines = recorder.seen_m[0].shape[1] if recorder.seen_m else 0
+    n_lines = recorder.responses_m[0].shape[1] if recorder.responses_m else 0
     if n_lines < 2 or recorder.first_seq is None:
         return skipped("columns", "needs the matrix in use and a dither on two controlled modes")
     seq = np.concatenate(recorder.seq)
-    turns = (
-        2
-        * np.pi
-        * np.array(DITHER_LINE_RATIOS[: len(modes)])[[mode in status.in_loop for mode in modes]]
+    in_loop = [mode in status.in_loop for mode in modes]
+    phase_per_frame = 2 * np.pi * np.array(DITHER_LINE_RATIOS[: len(modes)])[in_loop]
+    response, noise = _measure_transfer(
+        seq,
+        np.concatenate(recorder.responses_m),
+        np.concatenate(recorder.commands_m),
+        phase_per_frame,
     )
-    answer, noise = _measure_transfer(
-        seq, np.concatenate(recorder.seen_m), np.concatenate(recorder.moved_m), turns
-    )
-    if (np.abs(answer) + noise < MIN_RESPONSE_RATIO).all():
+    if (np.abs(response) + noise < MIN_RESPONSE_RATIO).all():
         return wrong("columns", "slopes do not respond to the commands: the mirror does not move")
-    if (noise > MAX_NOISE_RATIO * np.abs(answer)).any():
-        ratio = np.max(noise / np.abs(answer))
+    if (noise > MAX_NOISE_RATIO * np.abs(response)).any():
+        ratio = np.max(noise / np.abs(response))
         return skipped("columns", f"too noisy: noise is {ratio:.2f} of the response")
-    unit, weight = answer / np.abs(answer), np.abs(answer) / np.maximum(noise, 1e-9)
-    models = np.exp(-1j * np.outer(LAG_GRID_FRAMES, turns))
+    # Fit sign and lag to the phases at both lines, each weighted by its signal-to-noise ratio.
+    unit, weight = response / np.abs(response), np.abs(response) / np.maximum(noise, 1e-9)
+    models = np.exp(-1j * np.outer(LAG_GRID_FRAMES, phase_per_frame))
     misfit = np.stack([np.abs(unit - sign * models) ** 2 @ weight**2 for sign in (1.0, -1.0)])
     k_sign, k_lag = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
-    lag, sigma = float(LAG_GRID_FRAMES[k_lag]), float(1.0 / np.sqrt(np.sum((weight * turns) ** 2)))
-    share = float(np.median(np.abs(answer)))
+    lag, sigma = (
+        float(LAG_GRID_FRAMES[k_lag]),
+        float(1.0 / np.sqrt(np.sum((weight * phase_per_frame) ** 2))),
+    )
+    share = float(np.median(np.abs(response)))
     if k_sign:
         return wrong("columns", "slopes times matrix have the opposite sign of the commands")
     found = f"slopes lag {lag:+.2f} frames behind the commands of their row"
     if abs(lag) > MAX_LAG_FRAMES + 3.0 * sigma:
         return wrong("columns", found)
+    # Optical gain and double pass explain a response between 0.1 and 3; units do not.
     found += f"; their response by the matrix in use is {share:.2f}"
     return (fine if 0.1 < share < 3.0 else seen)("columns", found)
 
 
 def _measure_transfer(
     seq: NDArray[np.int64],
-    seen_m: NDArray[np.float64],
-    moved_m: NDArray[np.float64],
-    turns: NDArray[np.float64],
+    responses_m: NDArray[np.float64],
+    commands_m: NDArray[np.float64],
+    phase_per_frame: NDArray[np.float64],
 ) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
     """Return the response over the command at each line ``(n_lines,)``, complex, and its noise."""
     window = np.hanning(len(seq))
     bin_rad = 2 * np.pi / max(int(seq[-1] - seq[0]), 1)
 
     def at(columns: NDArray[np.float64], shift: float) -> NDArray[np.complex128]:
-        phasors = np.exp(-1j * np.outer(seq, turns + shift * bin_rad)) * window[:, None]
+        phasors = np.exp(-1j * np.outer(seq, phase_per_frame + shift * bin_rad)) * window[:, None]
         return np.asarray(np.sum(phasors * (columns - columns.mean(axis=0)), axis=0))
 
-    moved = at(moved_m, 0.0)
-    sides = np.stack([at(seen_m - moved_m, shift) for shift in _NOISE_BINS])
+    moved = at(commands_m, 0.0)
+    # Slopes see commands and turbulence. What exceeds the commands is turbulence and noise.
+    sides = np.stack([at(responses_m - commands_m, shift) for shift in _NOISE_BINS])
     noise = np.sqrt(np.mean(np.abs(sides) ** 2, axis=0)) / np.abs(moved)
-    return at(seen_m, 0.0) / moved, noise
+    return at(responses_m, 0.0) / moved, noise

@@ -110,18 +110,19 @@ def check_chunks(client: RtcClient, before: MatrixInUse) -> tuple[CheckResult, M
     for index, part in enumerate(new.parts):
         if index != _OMITTED_CHUNK:
             client.connection.put_chunk(name, index, part)
-    wanted = f"{client.connection.keys.matrix(name)}?chunk={_OMITTED_CHUNK}"
+    selector = f"{client.connection.keys.matrix(name)}?chunk={_OMITTED_CHUNK}"
     answers = _wait_for_acknowledgements(client, name, ACKNOWLEDGEMENT_TIMEOUT_S)
-    asked = [at_s - began_s for at_s, key in client.observer.queries if key == wanted]
+    delays_s = [at_s - began_s for at_s, key in client.observer.queries if key == selector]
     if not answers or answers[-1][1].state is not AckState.APPLIED:
         tail = _explain_outcome(client, name, answers)
-        when = f"it was queried after {asked[0]:.1f} s" if asked else "it was not queried"
+        when = f"it was queried after {delays_s[0]:.1f} s" if delays_s else "it was not queried"
         return wrong("chunks", f"chunk {_OMITTED_CHUNK} was left out: {when}; {tail}"), None
     client.observer.loop.use(name, new.matrix)
-    if not asked:
+    if not delays_s:
+        # An RTC that applies an incomplete matrix plays numbers that were never judged.
         return wrong("chunks", f"applied though chunk {_OMITTED_CHUNK} never came"), new
-    found = f"chunk {_OMITTED_CHUNK} was left out and queried after {asked[0]:.1f} s"
-    late = asked[0] > CHUNK_REQUEST_DELAY_S + 1.0
+    found = f"chunk {_OMITTED_CHUNK} was left out and queried after {delays_s[0]:.1f} s"
+    late = delays_s[0] > CHUNK_REQUEST_DELAY_S + 1.0
     return (wrong if late else fine)("chunks", f"{found}; then the matrix was applied"), new
 
 
@@ -149,6 +150,7 @@ def check_rejection(client: RtcClient, in_use: MatrixInUse) -> CheckResult:
 
 
 def _bad_manifests(client: RtcClient, in_use: MatrixInUse) -> list[tuple[str, Manifest]]:
+    """Return manifests that must be rejected, each with a description of its defect."""
     new = client.connection.new_id
     other_sum = hashlib.sha256(b"other numbers").hexdigest()
     first = in_use.copy_as(new("sum")).manifest
@@ -163,6 +165,7 @@ def _bad_manifests(client: RtcClient, in_use: MatrixInUse) -> list[tuple[str, Ma
 
 def _check_repeat(client: RtcClient, in_use: MatrixInUse) -> list[str]:
     """Send the commit of the matrix in use again; return a problem if no acknowledgement comes."""
+    # A service that lost the acknowledgement on the network sends its commit again.
     name, known = in_use.manifest.id, len(client.observer.acknowledgements)
     client.connection.put_commit(name, encode(in_use.manifest))
     answers = _wait_for_acknowledgements(client, name, MAX_APPLY_DELAY_S, known)
@@ -278,6 +281,7 @@ def check_reconnect(client: RtcClient) -> CheckResult:
         return skipped("reconnect", "the router is another program")
     before = client.observer.session
     n_asked = len(client.observer.queries)
+    # Closing the connection ends the router, as a restart of the service does.
     client.connection.close()
     client.listen(ROUTER_DOWN_S)
     opened_s = client.clock()

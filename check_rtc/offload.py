@@ -49,7 +49,7 @@ MOVE_RATIO_RANGE: Final = (0.67, 1.33)
 """Accepted range of the measured move over the demand."""
 
 MAX_SIDE_MOTION: Final = 0.05
-"""Largest change of the other parameters, in units of ``_SIDE_MOTION_SCALE``."""
+"""Largest change of the other parameters, each multiplied by ``_SIDE_MOTION_SCALE``."""
 
 ALPHA_LINE_RATIOS: Final = (0.21, 0.24, 0.27, 0.3)
 """Frequencies of the dither over the frame rate."""
@@ -157,6 +157,7 @@ def _compare_move(
     ratio = change[0] / demand.shift_x_subap
     found = f"the image moved by {ratio:.2f} of the {STEP_SUBAP:g} subap demanded, ± {sigma:.2f}"
     side_motion = np.abs(change * _SIDE_MOTION_SCALE)[1:].max()
+    # The measured ratio has the noise of two windows of α, so the range is wider by 2 σ.
     if not MOVE_RATIO_RANGE[0] - 2 * sigma <= ratio <= MOVE_RATIO_RANGE[1] + 2 * sigma:
         problems.append(_explain_ratio(ratio))
     if problems:

@@ -99,6 +99,7 @@ class TelemetryObserver:
                 self.refused.append(
                     RefusedMessage(at_s=item.at_s, topic=item.topic, text=str(error))
                 )
+        # The intake is that of the service, so sessions and lost frames are judged by its rules.
         for block in self.intake.drain():
             self.loop.observe(block)
             for take in self.block_callbacks:
@@ -154,6 +155,7 @@ class TelemetryObserver:
         self.intake.frames(item.data, item.attachment, recoverable=item.recoverable)
 
     def _count_frozen(self, slopes: NDArray[np.float32]) -> None:
+        """Count frames with the slopes of the frame before: photon noise never repeats exactly."""
         before = self._last_slopes
         if before is None or before.shape != slopes[0].shape:
             before = np.full_like(slopes[0], np.nan)
@@ -190,6 +192,7 @@ class LoopObserver:
     def take_status(self, status: Status) -> None:
         """Add a status; a change of the loop or its matrix resets the comparison."""
         before, self._status = self._status, status
+        # Frames across a change have commands of two laws. Only those after it are compared.
         if before is None or not same_loop(before, status) or before.cm_id != status.cm_id:
             self._check = LoopCheck(from_seq=last_seq(status) + 1)
             self._law = ControlLawCheck(from_seq=last_seq(status) + 1)
@@ -209,6 +212,7 @@ class LoopObserver:
         self._law = control_law.follow(self._law, block, terms)
 
     def _terms(self, cm_id: str | None) -> ClosedLoop | None:
+        """Return the loop with this matrix; None if it is open or the matrix is unknown."""
         status, matrix = self._status, self.matrix
         if status is None or matrix is None or cm_id is None or cm_id != self.cm_id:
             return None
@@ -217,6 +221,7 @@ class LoopObserver:
         return closed_loop(status, cm_id, matrix)
 
     def _judge(self, terms: ClosedLoop, seq: int) -> None:
+        """Add results for the frames up to ``seq``, which this and the last status enclose."""
         span = loopcheck.last_samples(self._check, seq)
         if span is not None:
             self._check, obeyed = loopcheck.command_residual(self._check, terms, *span)

@@ -112,10 +112,12 @@ def _advance(context: StepContext, event: Event) -> None:
     if context.state.measuring is not None:
         return
     fetch_in_use(context)
+    # After an emergency stop nothing is sent or played until an operator resumes.
     if context.operator.stopped_because:
         resume.keep_stopped(context)
         return
     acquisition.advance(context, event)
+    # Updates follow α, which an acquisition is about to determine.
     if context.acquisition.under_way:
         return
     noisy_measurement.advance(context, event)

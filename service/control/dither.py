@@ -190,6 +190,8 @@ def place_lines(
     """
     low, high = (np.ceil(range_hz[0] / step_hz), np.floor(range_hz[1] / step_hz))
     grid = step_hz * np.arange(low, high + 1)
+    # Lines are placed one after the other, each on the nearest free frequency: a vibration moves
+    # the lines next to it and leaves the others where they are.
     chosen: list[float] = []
     for wanted in wanted_hz:
         by_distance = grid[np.argsort(np.abs(grid - wanted), kind="stable")]
@@ -274,6 +276,7 @@ def select_informative_modes(
         return tuple(pool)
     scaled = information * np.outer(wanted, wanted)
     chosen = [pool[k] for k in np.linspace(0, len(pool) - 1, n).round().astype(int)]
+    # Variances are compared in units of the wanted ones, so that all parameters count alike.
     cost, improving = float(_worst_variance_ratio(scaled[chosen].sum(axis=0))), True
     while improving:
         improving = False
@@ -282,6 +285,7 @@ def select_informative_modes(
             others = [mode for mode in pool if mode not in kept]
             costs = _worst_variance_ratio(scaled[kept].sum(axis=0) + scaled[others])
             best = int(np.argmin(costs))
+            # The small margin keeps two equal sets from being exchanged for ever.
             if costs[best] < cost * (1.0 - 1e-6):
                 chosen, cost, improving = [*kept, others[best]], float(costs[best]), True
     return tuple(sorted(chosen))
@@ -420,6 +424,7 @@ def look_up_precision(magnitude: float | None) -> Array:
     An unknown magnitude counts as the faintest row. Beyond it κ is extrapolated from the last two
     rows, because the noise of a faint star keeps growing.
     """
+    # κ is interpolated in its logarithm: photon noise is a power of the flux.
     m, logs = TABLE_MAGNITUDES, np.log(PRECISION_TABLE)
     star = m[-1] if magnitude is None else max(float(magnitude), m[0])
     row = min(int(np.searchsorted(m, star, side="right")) - 1, len(m) - 2)

@@ -104,6 +104,7 @@ def expected_gain(
     Both are ``(n_controlled, n_slopes)``; ``interaction_matrix`` ``(n_slopes, n_basis)`` is that of
     the present registration. A mode without loop gain counts as uncontrolled.
     """
+    # A loop without any gain is about to be closed: it is judged with all of its modes.
     moving = np.flatnonzero(loop.gains if loop.gains.any() else loop.gains == 0.0)
     order = np.concatenate([moving, np.setdiff1d(np.arange(len(sky.variance_m2)), moving)])
     seen = (interaction_matrix * np.asarray(loop.optical_gain, np.float32))[:, order]
@@ -144,6 +145,7 @@ class _LoopModel:
     def __init__(self, loop: ControlLoop, sky: Sky, order: NDArray[np.intp]) -> None:
         self.loop, self.slope_noise = loop, sky.slope_noise
         self.variance_m2 = sky.variance_m2[order]
+        # Logarithmic, because turbulence has most of its power at low frequencies.
         edges = np.geomspace(1e-3, 0.5, N_FREQUENCIES + 1)
         per_frame = np.sqrt(edges[1:] * edges[:-1])
         z: Complex = np.exp(-2j * np.pi * per_frame)
@@ -152,6 +154,8 @@ class _LoopModel:
         corners = (
             _CORNER_RATIO * (compute_radial_orders(len(sky.variance_m2)) + 1.0) * sky.crossing_hz
         )
+        # Modes with nearly the same corner share a spectrum, so that variances need a few products
+        # of matrices instead of one for each mode. The margins keep both ends inside.
         bounds = np.geomspace(corners[0] * 0.999, corners[-1] * 1.001, _N_SPECTRUM_GROUPS + 1)
         corners = corners[order]
         self.group: NDArray[np.intp] = np.searchsorted(bounds, corners) - 1
@@ -170,12 +174,15 @@ def compute_radial_orders(n_modes: int) -> Array:
 
 
 def _residual_variance(
-    reconstructor: NDArray[np.float32], seen: NDArray[np.float32], model: _LoopModel
+    reconstructor: NDArray[np.float32], response: NDArray[np.float32], model: _LoopModel
 ) -> tuple[float, float]:
-    """Return the residual variance of the controlled modes, m², and the largest pole radius."""
+    """Return the residual variance of the controlled modes, m², and the largest pole radius.
+
+    ``response`` ``(n_slopes, n_basis)`` is the sensor's, with the modes in the model's order.
+    """
     n = len(reconstructor)
     gains = model.loop.gains[:, None]
-    coupling = gains * (reconstructor @ seen).astype(float)
+    coupling = gains * (reconstructor @ response).astype(float)
     eigenvalues, vectors = find_eigenmodes(coupling[:, :n])
     radius = model.loop.pole_radius(eigenvalues).max()
     rejected = 1.0 / (1.0 + model.integrator[:, None] * eigenvalues)
@@ -184,6 +191,7 @@ def _residual_variance(
     scale, total = np.sqrt(model.variance_m2), 0.0
     for k, shape in enumerate(model.shapes):
         own, other = model.group[:n] == k, n + np.flatnonzero(model.group[n:] == k)
+        # Controlled modes are rejected by the loop; the others alias into it through the coupling.
         if own.any():
             total += basis.variance(np.diag(scale[:n])[:, own], rejected, shape)
         if len(other):

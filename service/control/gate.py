@@ -374,6 +374,7 @@ def check_edge_motion(motion_m: float, leak: float, *, holds: bool = False) -> s
     ``holds`` is True if the loop runs already with as many modes and these gains and does not slip.
     """
     limit_m = MAX_HELD_EDGE_MOTION_M if holds else MAX_EDGE_MOTION_M
+    # A leak does not prevent a slip, but brings the segment back within a tenth of a second.
     if motion_m <= limit_m or leak <= MAX_SLIP_SAFE_LEAK:
         return None
     return (

@@ -83,6 +83,7 @@ def invert(
         )
     if n_modes >= _N_MODES_FOR_EIGENVECTORS and max_condition <= _MAX_NORMAL_CONDITION:
         return _invert_by_eigenvectors(controlled, normal, max_condition)
+    # The SVD is exact for any condition number; the normal equations above square it.
     left, singular, right = scipy.linalg.svd(controlled, full_matrices=False)
     kept = singular > singular[0] / max_condition
     inverse = (right[kept].T / singular[kept]) @ left[:, kept].T

@@ -139,7 +139,7 @@ class Form(Generic[_R]):
     """Keys that are sent before the others, which follow in the order of the fields."""
 
     optional_keys: tuple[str, ...] = ()
-    """Keys that were added after version 1, or that apply to some messages only."""
+    """Keys that an older sender does not know, or that apply to some messages only."""
 
     unpack: Callable[[bytes, str], Map] | None = None
     """Parser of the bytes; None if they are a map of at most :data:`MESSAGE_LIMIT` bytes."""
@@ -211,6 +211,7 @@ def from_map(kind: type[_R], values: Map, where: str) -> _R:
     """
     form: Form[_R] = _FORMS[kind]
     record = read(form.fields(values, where), kind, where, form.optional_keys)
+    # After all single fields: a rule for several may assume that each of them is valid.
     form.check(record, where)
     return record
 
@@ -243,6 +244,7 @@ def unpack(data: bytes, where: str, limit: int = MESSAGE_LIMIT) -> Map:
     WireError
         If there are more bytes, or they are not a msgpack map.
     """
+    # Before parsing, which takes time and memory in proportion to the length.
     if len(data) > limit:
         raise WireError(f"range: {where} has {len(data)} bytes, expected at most {limit}")
     try:
@@ -407,6 +409,7 @@ def _find_mismatch(value: Any, kind: Any, where: str, key: str = "") -> WireErro
     if is_record:
         lacking = next(name for name in _field_types(kind) if name not in value)
         return WireError(f"missing: key {lacking!r} in {where}")
+    # An invalid id has an error code of its own in the contract.
     if _describe_type(kind) == ID_EXPECTED:
         validate_id(value, f"key {key!r} in {where}")
     return refusal(key, value, _describe_type(kind), where)

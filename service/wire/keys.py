@@ -162,6 +162,7 @@ def parse_chunk_index(text: str, where: str) -> int:
     WireError
         If ``text`` is not a plain decimal number of at most 6 digits.
     """
+    # str.isdigit() accepts digits of other scripts, and int() of a long text takes quadratic time.
     if not (text.isascii() and text.isdigit() and len(text) <= 6):
         raise WireError(f"range: chunk {text!r:.40} in {where}, expected a number from 0 on")
     return int(text)

@@ -308,6 +308,7 @@ class ChunkAssembler:
         WireError
             If it is too long, does not fit the manifest, or would exceed the limit on memory.
         """
+        # zenoh may deliver a chunk twice: once published, once as the answer to a query.
         if index in self._parts:
             return
         if not 0 < len(data) <= CHUNK_LIMIT:
@@ -338,6 +339,8 @@ class ChunkAssembler:
                 f"expected at most {self._limit_bytes}"
             )
         self._layout = layout
+        # All chunks are checked before the first error is raised, so that one round of queries
+        # brings all that are missing.
         refusals = []
         for index in list(self._parts):
             try:
@@ -381,6 +384,7 @@ class ChunkAssembler:
         if found != layout.sha256:
             raise WireError(f"range: the matrix has sha256 {found}, expected {layout.sha256}")
         matrix = np.frombuffer(data, dtype=DTYPE).reshape(layout.shape)
+        # A checksum does not exclude NaN, which would reach all actuators within one frame.
         if not np.all(np.isfinite(matrix)):
             n_bad = int(np.sum(~np.isfinite(matrix)))
             raise WireError(f"range: {n_bad} numbers of the matrix are not finite, expected none")

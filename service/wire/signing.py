@@ -129,14 +129,18 @@ class Signatures:
             return
         signature = _read_signature(data)
         mac = self._mac(self._other, key, data[:-MAC_BYTES], rows)
+        # compare_digest takes the same time for all bytes, so that it does not reveal how many of
+        # a forged signature are right.
         if not hmac.compare_digest(mac, data[-MAC_BYTES:]):
             raise WireError(
                 f"signature: wrong on {key}: signed with another key, or changed on its way"
             )
+        # Only now: a forged message must not use up the number of a true one.
         with self._lock:
             self._admit(signature)
 
     def _admit(self, signature: Map) -> None:
+        """Record a message whose HMAC is right; raise a ``WireError`` if it is a replay."""
         signer, n = signature["signer"], signature["signed_n"]
         if self._role is Role.RTC and signature["signed_for"] != self.signer:
             raise WireError(
@@ -180,7 +184,7 @@ def _split_map(data: bytes) -> tuple[int, bytes]:
     first = data[0]
     if 0x80 <= first <= 0x8F:
         return first & 0x0F, data[1:]
-    return int.from_bytes(data[1:3]), data[3:]  # no message has 65,536 keys
+    return int.from_bytes(data[1:3]), data[3:]  # a map of 16 bits; no message has 65,536 keys
 
 
 def _read_signature(data: bytes) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from service.model.interaction import InteractionModel
 from service.model.kinds import Influence, InfluenceShape
 from service.model.misregistration import Misregistration
 from service.model.modes import Basis, analytic_basis, modal_basis
+from service.model.pupil import rtc_valid_subapertures
 from sim_rtc.assembly import STROKE_M, Telescope, build_telescope
 from sim_rtc.computer.feed import BATCH_FRAMES
 from sim_rtc.computer.loop import LoopTerms, ModalLoop
@@ -109,7 +110,9 @@ CASES = (
 def model_matrix(case: Case, instrument: Instrument, true: Misregistration) -> Array:
     """Return the wrong model's matrix ``(n_slopes, N_MODES)``."""
     alpha = true.moved_to(true.vector + np.array(case.off) * [1.0, 1.0, np.pi / 180.0, 1.0])
-    about = replace(instrument, wfs=replace(instrument.wfs, **case.wfs), **case.changes)
+    # the RTC's mask is known, whatever else the model has wrong
+    wfs = replace(instrument.wfs, valid_subapertures=rtc_valid_subapertures(instrument))
+    about = replace(instrument, wfs=replace(wfs, **case.wfs), **case.changes)
     basis: Basis = analytic_basis(instrument)
     if case.gaussian is not None:
         shape = InfluenceShape(influence=Influence.GAUSSIAN, coupling=case.gaussian)

@@ -29,8 +29,12 @@ GAIN = 0.5
 
 DELAY_FRAMES = 2.0
 
-N_TRIED = 24
-"""Numbers of modes that are tried, spread evenly in their logarithm."""
+CHECKED = np.array([1.0, 1.7, 3.5])
+"""All modes over the numbers of modes that are checked before it is said that all are stable."""
+
+RESOLUTION = 0.03
+"""Relative distance of the numbers of modes of a stable and an unstable loop at which the search
+for the most stable modes ends."""
 
 CORNER_FRAMES = 50.0
 """Correlation time of the turbulence that the loss is computed for, in frames."""
@@ -206,23 +210,20 @@ class _Loops:
 
 def _most_stable(loops: _Loops, n_most: int) -> int:
     """Return the number of modes up to which loops are stable."""
-    if not n_most:
-        return 0
-    tried = np.unique(np.round(np.geomspace(1, n_most, N_TRIED)).astype(int))
-    checked = [len(tried) - 1, len(tried) - 4, len(tried) - 8]
-    if all(loops.radius(int(tried[k])) < 1.0 for k in checked if k >= 0):
+    checked = np.unique(np.round(n_most / CHECKED).astype(int))
+    unstable = [int(n) for n in checked if n and loops.radius(int(n)) >= 1.0]
+    if not unstable:
         return n_most
-    low, high = -1, len(tried) - 1
-    for k in checked:
-        if k >= 0 and loops.radius(int(tried[k])) >= 1.0:
-            high = k
-    while high - low > 1:
-        middle = (low + high) // 2
-        if loops.radius(int(tried[middle])) < 1.0:
-            low = middle
+    most, fewest_unstable = 0, min(unstable)
+    while fewest_unstable - most > max(1.0, RESOLUTION * most):
+        # halfway in the logarithm: few modes take hardly any time
+        middle = max(most + 1, round(float(np.sqrt(most * fewest_unstable))))
+        middle = min(middle, fewest_unstable - 1)
+        if loops.radius(middle) < 1.0:
+            most = middle
         else:
-            high = middle
-    return int(tried[low]) if low >= 0 else 0
+            fewest_unstable = middle
+    return most
 
 
 def _reason(found: ReconstructorVerdict) -> str:

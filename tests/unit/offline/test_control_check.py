@@ -33,7 +33,7 @@ def test_a_mode_of_the_other_sign_bounds_the_number_of_modes_and_is_named():
     plant = MODEL.copy()
     plant[:, 7] *= -1.0
     found = check(plant)
-    assert 0 < found.stable_modes <= 7
+    assert found.stable_modes == 7
     assert found.pole_radius_all > 1.0
     assert found.weakest_modes == (7,)
     assert not found.noise_limited
@@ -45,3 +45,13 @@ def test_noise_that_alone_makes_a_loop_unstable_is_said_to_bound_the_answer():
     assert not found.holds
     assert found.noise_limited
     assert "noise" in found.reason
+
+
+@pytest.mark.parametrize("wrong", [26, 33, 41])
+def test_the_number_of_stable_modes_is_found_to_three_percent(wrong):
+    model = np.linalg.qr(np.random.default_rng(1).normal(size=(200, 60)))[0]
+    plant = model.copy()
+    plant[:, wrong] *= -1.0
+    rows = np.ones(len(model), dtype=bool)
+    found = check_control(plant, model, np.ones(60), np.arange(60), rows)
+    assert 0.97 * wrong - 1 <= found.stable_modes <= wrong

@@ -102,10 +102,20 @@ class PyramidKind(SensorKind):
         return slopes_from_frames(instrument, frames, flux_frame)
 
     @override
-    def remarks_on_frames(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Iterator[str]:
-        from service.model.sensors.pyramid.detector_windows import remarks_on_windows
+    def locate_images(
+        self, instrument: Instrument, flux_frame: NDArray[Any]
+    ) -> tuple[Instrument, tuple[str, ...]]:
+        from service.model.sensors.pyramid.detector_windows import locate_images
 
-        yield from remarks_on_windows(instrument, flux_frame)
+        return locate_images(instrument, flux_frame)
+
+    @override
+    def image_centres(
+        self, instrument: Instrument, flux_frame: NDArray[Any]
+    ) -> NDArray[np.float64] | None:
+        from service.model.sensors.pyramid.detector_windows import image_centres
+
+        return image_centres(instrument, flux_frame)
 
     @override
     def identity(self, sensor: Pyramid) -> tuple[float, ...]:

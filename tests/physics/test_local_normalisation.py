@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation, SlopeOrder
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
 from tests.numerics import SOMEWHERE, small_basis, small_instrument
-from tests.physics.fft_pyramid import FftPyramid
 
 MODES = [0, 1, 2, 5, 11, 23, 39]
 STROKE_M = 1e-9

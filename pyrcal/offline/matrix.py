@@ -380,8 +380,9 @@ def _answer(
     before = uncertainty(
         seen,
         values,
-        nuisances.prior,
+        settled.prior,
         regions,
+        dispersed=solution.dispersion,
         shift_subap=float(np.hypot(*solution.vector[:2])),
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
         magnification_floor=LOCAL_MAGNIFICATION_FLOOR

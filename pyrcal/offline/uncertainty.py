@@ -147,6 +147,7 @@ def uncertainty(
     prior: Array,
     regions: NDArray[np.intp],
     *,
+    dispersed: float,
     shift_subap: float,
     radius_subap: float,
     magnification_floor: float,
@@ -165,9 +166,12 @@ def uncertainty(
         ``(n_unknowns,)`` of the nuisances at the solution; 0 for the registration, whose prior is
         none.
     prior
-        ``(n_unknowns,)`` reciprocal variance of each unknown.
+        ``(n_unknowns,)`` weight of the prior of each unknown: its reciprocal variance times
+        ``dispersed``.
     regions
         ``(n_rows,)`` region of the pupil of each slope.
+    dispersed
+        Number of dependent slopes that count as one, see ``dispersion``.
     shift_subap
         Length of the shift at the solution: part of the model's error grows with it.
     radius_subap
@@ -200,7 +204,9 @@ def uncertainty(
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = strange * FAR_SHARE * shift_subap
     floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
-    from_model = np.diag(share**2 + floor**2 + far**2)
+    # what the prior holds may be anywhere within it
+    held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
+    from_model = np.diag(share**2 + floor**2 + far**2) + held_back
     pull = prior * noise * values
     by_row = Normals.of_rows(projection, regions)
     sets = (
@@ -220,6 +226,24 @@ def uncertainty(
         subset_steps=steps,
         subset_covariance=covariances + from_model,
     )
+
+
+def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
+    """Return how many dependent slopes count as one independent slope, at least 1.
+
+    Parts of a projection, its modes or the regions of the pupil ``(n_rows,)``, pull the unknowns
+    apart. If slopes were independent, the squares of these pulls would add up to the variance of
+    the residual times the normal matrix; where errors are common to a part, they add up to more.
+    """
+    n_unknowns = len(projection.jacobian)
+    noise = projection.chi / max(projection.residual.size - len(projection.gains), 1)
+    if not noise > 0.0:
+        return 1.0
+    spread = np.linalg.pinv(projection.normal, hermitian=True) / (noise * n_unknowns)
+    found = 1.0
+    for scores in (projection.scores, _regional_scores(projection, regions)):
+        found = max(found, float(np.einsum("kc,kl,lc->", scores, spread, scores)))
+    return found
 
 
 def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:

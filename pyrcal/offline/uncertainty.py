@@ -31,9 +31,15 @@ subapertures, modulated by 20 points, by 0.05 % and 0.0017 deg."""
 MAGNIFICATION_FLOOR = 1e-4
 """The same of the magnification: of those matrices 3e-5 with modes, 1.2e-4 with actuators."""
 
-LOCAL_MAGNIFICATION_FLOOR = 2.5e-4
+LOCAL_MAGNIFICATION_FLOOR = 1e-3
 """The same where each subaperture is divided by its own flux: those at the border then weigh as
-much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small."""
+much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small, others
+0.1 to 0.3 %."""
+
+WEAK_MODULATION_FLOOR = 1e-3
+"""The same of a pyramid that is modulated by little more than the width of a star. OOPAO samples a
+circle of 1 λ/D by 8 points: matrices of it were read 0.1 to 0.3 % wrong, and with an FFT pyramid of
+12 subapertures those 8 points alone move the magnification by 2.7e-4."""
 
 FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
 """1 σ by parameter over the length of the shift in subapertures: far off, a mirror of another kind

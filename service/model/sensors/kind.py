@@ -170,6 +170,10 @@ class SensorKind(ABC):
         """
         return instrument, ()
 
+    def is_weakly_modulated(self, sensor: Any) -> bool:  # noqa: ANN401 - its own
+        """Return whether a modulation is so narrow that models of the focus differ."""
+        return False
+
     def image_centres(
         self, instrument: Instrument, flux_frame: NDArray[Any]
     ) -> NDArray[np.float64] | None:

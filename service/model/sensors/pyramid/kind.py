@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _IMAGES = "image_offsets_px"
 
+_WEAK_LAMBDA_OVER_D = 1.5
+"""Modulation up to which the star's own width counts as much."""
+
 
 class PyramidKind(SensorKind):
     """The modulated pyramid."""
@@ -171,6 +174,10 @@ class PyramidKind(SensorKind):
         # the phase of a modulation wide for its subapertures turns too fast for one point
         wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.pupil_diameter
         return 2 if wide else 1
+
+    @override
+    def is_weakly_modulated(self, sensor: Pyramid) -> bool:
+        return sensor.modulation_lambda_over_d <= _WEAK_LAMBDA_OVER_D
 
     @override
     def fitted_key(self, sensor: Pyramid) -> str | None:

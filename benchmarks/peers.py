@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.model.interaction import InteractionModel
 from service.model.sensors.pyramid.description import pyramid_in
 from service.model.sensors.pyramid.optics import enough_modulation_points
 from service.model.sensors.sensor import Fineness
-from tests.physics.fft_pyramid import FftPyramid
 
 MODES = (0, 50, 200, 400)
 """The modes timed: every one costs the same."""

@@ -445,10 +445,10 @@ def _held(settled: Settled) -> Iterator[Alternative]:
 
 def _with(settled: Settled, steps: dict[int, float]) -> tuple[float, Array]:
     """Return χ² over the fit's, and α's move, where nuisances are held so far from theirs."""
-    seen, nuisances = settled.solution.projection, settled.nuisances
+    seen = settled.solution.projection
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
     normal = seen.normal
-    held = normal + np.diag(nuisances.prior * noise)
+    held = normal + np.diag(settled.prior * noise)
     places = np.array([4 + place for place in steps])
     free = np.setdiff1d(np.arange(len(normal)), places)
     step = np.zeros(len(normal))
@@ -490,7 +490,7 @@ def _stepped(settled: Settled, weights: Array) -> Array:
     """Return how far other weights of the modes ``(n_modes,)`` move α."""
     seen, nuisances = settled.solution.projection, settled.nuisances
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
-    prior = nuisances.prior * noise
+    prior = settled.prior * noise
     values = np.concatenate([np.zeros(4), nuisances.from_prior(settled.solution.nuisances)])
 
     def step(weights: Array) -> Array:

@@ -215,9 +215,8 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
     frames = recorded.values.ndim == 3
     if frames and recorded.noise is not None:
         notes.append("the noise in the measured file is of frames, not of slopes: not used")
-    matrix = _slopes(recorded, instrument)
-    if instrument.frames is not None and recorded.flux_frame is not None:
-        notes.extend(kind_of(instrument).remarks_on_frames(instrument, recorded.flux_frame))
+    matrix, found = _slopes(recorded, instrument)
+    notes += found
     reference = Reference(
         matrix=matrix,
         modes=recorded.modes,
@@ -227,8 +226,10 @@ def reference_of(recorded: Recorded, instrument: Instrument) -> tuple[Reference,
     return reference, tuple(notes)
 
 
-def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
-    """Return the measured slopes, cut from detector frames if need be."""
+def _slopes(
+    recorded: Recorded, instrument: Instrument
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Return the measured slopes, cut from detector frames if need be, and remarks on these."""
     found = f"{recorded.where}: found shape {recorded.values.shape}"
     if instrument.frames is None:
         if recorded.values.ndim == 3:
@@ -236,7 +237,7 @@ def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
                 f"{found}, expected (n_slopes, n_modes): detector frames need "
                 'wfs.input = "frames" in the instrument file'
             )
-        return recorded.values
+        return recorded.values, ()
     if recorded.values.ndim != 3:
         raise MatrixError(
             f'{found}, expected detector frames (n_modes, ny, nx): wfs.input is "frames"'
@@ -246,5 +247,6 @@ def _slopes(recorded: Recorded, instrument: Instrument) -> NDArray[np.float64]:
             f"{recorded.where}: found no {FLUX_FRAME} beside it, expected a mean detector frame "
             "(ny, nx) in the same counts"
         )
-    flux_frame = recorded.flux_frame
-    return kind_of(instrument).signals_of_frames(instrument, recorded.values, flux_frame)
+    kind, flux_frame = kind_of(instrument), recorded.flux_frame
+    located, remarks = kind.locate_images(instrument, flux_frame)
+    return kind.signals_of_frames(located, recorded.values, flux_frame), remarks

@@ -53,6 +53,7 @@ from pyrcal.offline.solver import Nuisances, Solution, image_patterns, nuisances
 from pyrcal.offline.uncertainty import (
     LOCAL_MAGNIFICATION_FLOOR,
     MAGNIFICATION_FLOOR,
+    WEAK_MODULATION_FLOOR,
     pupil_places,
     pupil_regions,
     uncertainty,
@@ -482,19 +483,19 @@ def _answer(
     structured = structure(seen.residual, power, noise)
     by_light = residual_fraction**2 * (1.0 - left_by_light(few))
     n_planes = slopes.kind.n_planes
+    floor_of_size, floor_words = _magnification_floor(models.instrument)
     before = uncertainty(
         seen,
         values,
-        nuisances.prior,
+        settled.prior,
         regions,
         pupil_places(target.valid, n_planes, models.instrument.wfs.pupil_diameter / 2.0)[
             target.rows
         ],
+        dispersed=solution.dispersion,
         shift_subap=float(np.hypot(*solution.vector[:2])),
         radius_subap=models.instrument.wfs.pupil_diameter / 2.0,
-        magnification_floor=LOCAL_MAGNIFICATION_FLOOR
-        if slopes.normalisation is Normalisation.LOCAL
-        else MAGNIFICATION_FLOOR,
+        magnification_floor=floor_of_size,
         residual_fraction=residual_fraction,
         noise_share=_noise_share(residual_fraction, structured),
         mode_sets=mode_partitions(target, n_planes, by_actuator=is_by_actuator(models.instrument)),
@@ -558,6 +559,11 @@ def _answer(
             *remarks(findings, reported=reported, found=slopes, about=models.instrument),
             *columns,
             *smeared,
+            *(
+                (floor_words,)
+                if floor_words and floor_of_size**2 > sure.covariance[3, 3] / 2.0
+                else ()
+            ),
         ),
         left_out=(*usable.left_out, *_rows_left_out(target, models.instrument)),
         n_evaluations=models.counter.n,
@@ -598,6 +604,22 @@ def _answer(
         return replace(fit, recommendation=recommendation(fit, grounds))
     causes = gain_causes(settled, passes=usable.passes, stroke_known=stroke_known)
     return explained(fit, tried, replace(grounds, gains=tuple(causes)))
+
+
+def _magnification_floor(instrument: Instrument) -> tuple[float, str]:
+    """Return 1 σ that no magnification is surer than, and why where it is larger than usual."""
+    if instrument.slopes.normalisation is Normalisation.LOCAL:
+        floor = LOCAL_MAGNIFICATION_FLOOR
+        cause = "each subaperture is divided by its own light, which lets its border weigh as much"
+    elif kind_of(instrument).is_weakly_modulated(instrument.wfs):
+        floor = WEAK_MODULATION_FLOOR
+        cause = "the modulation is at most 1.5 λ/D, where models sample the focus differently"
+    else:
+        return MAGNIFICATION_FLOOR, ""
+    return floor, (
+        f"sigma of the magnification is mostly a floor of {floor:.1%}: {cause}, and matrices of "
+        "such sensors differ by 0.1 to 0.3 % from their model"
+    )
 
 
 def _noise_share(residual: float, structured: float) -> float:

@@ -59,6 +59,10 @@ minimum leaves several times as much."""
 SAME = np.array([0.15, 0.15, np.deg2rad(0.5), 0.01])
 """Minima nearer than this are one (numeric units)."""
 
+SAME_SENSOR = 0.1
+"""Logarithm by which the sensor's number may differ for derivatives with respect to other unknowns
+to be as good."""
+
 NEARLY_AS_GOOD = 1.3
 """A minimum with less than this times the least misfit is a rival."""
 
@@ -67,7 +71,11 @@ LINEAR = 0.01
 """A logarithm of the instrument's that differs by less is as good as linear."""
 
 LINEAR_IMAGES = 0.02
-"""A pupil image displaced by less, in subapertures, is as good as linear."""
+"""A pupil image displaced by less, in subapertures, is as good as linear, ..."""
+
+LINEAR_IMAGES_LEFT = 0.08
+"""... or by less than this times the root of the share of the signal that is left over: the second
+order of a displacement d, at most (π d)² / 2 of the signal, is then a thirtieth of that."""
 
 BLURS = (-0.5, -0.25, 0.25, 0.5)
 """Displacements of a pattern that are tried, subapertures: half of each in every image."""
@@ -201,6 +209,11 @@ class Settled:
     """Whether the fine model has decided."""
 
     @property
+    def prior(self) -> Array:
+        """``(4 + n_nuisances,)`` weight of the prior of each unknown, 1 / σ², as it counts."""
+        return self.nuisances.prior * self.solution.dispersion
+
+    @property
     def by_mode(self) -> Array:
         """``(n_modes,)`` RMS of the residual over the RMS of the measurement."""
         left = np.sum(self.solution.projection.residual**2, axis=0)
@@ -224,11 +237,13 @@ def settle(
     fit is done again if that changed anything.
     """
     seen = _known(models, target, start)
-    solution = refine(models, seen, start, nuisances)
-    settled = Settled(solution=solution, target=seen, models=models, nuisances=nuisances)
+    solution = refine(models, seen, start, nuisances, decides=models.cheap)
+    settled = Settled(
+        solution=solution, target=seen, models=models, nuisances=nuisances, on_fine_grid=False
+    )
     settled = _with_nearest_instrument(settled)
     models, nuisances = settled.models, settled.nuisances
-    before, approaching = np.inf, True
+    before, approaching, taken = np.inf, True, settled
     for _ in range(MAX_REPEATS):
         left = settled.solution.projection.chi
         if models is settled.models:
@@ -240,8 +255,10 @@ def settle(
                 break
             approaching, near = False, settled.solution.near
         decides = models.cheap if approaching else models.fine
-        start = settled.solution.alpha
-        solution = refine(models, there, start, nuisances, near=near, decides=decides)
+        start, images = settled.solution.alpha, _images_of(taken, start, nuisances)
+        solution = refine(
+            models, there, start, nuisances, near=near, of_images=images, decides=decides
+        )
         settled = Settled(
             solution=solution,
             target=there,
@@ -249,10 +266,29 @@ def settle(
             nuisances=nuisances,
             on_fine_grid=not approaching,
         )
+        taken = settled if images is None and near is None else taken
     if settled.on_fine_grid:
         return settled
     solution = refine(models, settled.target, settled.solution.alpha, nuisances)
     return replace(settled, solution=solution, on_fine_grid=True)
+
+
+def _images_of(settled: Settled, alpha: Misregistration, nuisances: Nuisances) -> Array | None:
+    """Return the derivatives of a fit with the images' places, if they hold for another nearby.
+
+    They take as long as all others together. None if α, the images or the sensor differ too much.
+    """
+    before = settled.nuisances
+    sensors = [dict(one.optics).get(Optic.SENSOR, 0.0) for one in (before, nuisances)]
+    apart = np.abs(alpha.vector - settled.solution.alpha.vector)
+    if (
+        abs(sensors[1] - sensors[0]) > SAME_SENSOR
+        or np.any(apart > SAME)
+        or not np.array_equal(before.displaced, nuisances.displaced)
+    ):
+        return None
+    first = 4 + before.image_places.start
+    return settled.solution.near[first : first + len(before.images)]
 
 
 def _with_nearest_instrument(settled: Settled) -> Settled:
@@ -299,7 +335,7 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
         matrix = changed.model(CHEAP, once=True).interaction_matrix(solution.alpha)
         return few.project(matrix, every).chi_at_best
 
-    found = [left(change) for change in CHANGES]
+    found = _descended(left)
     best = int(np.argmin(found))
     change = CHANGES[best]
     nothing = float(np.log(NO_SENSOR_NUMBER / models.sensor_number))
@@ -316,16 +352,35 @@ def _with_nearest_sensor(settled: Settled) -> tuple[FitModels, Nuisances]:
     return moved, replace(nuisances, optics=tuple(optics))
 
 
+def _descended(left: Callable[[float], float]) -> Array:
+    """Return χ² at ``CHANGES``, outwards from none until it grows; infinite beyond.
+
+    The widest modulations take longest.
+    """
+    found = np.full(len(CHANGES), np.inf)
+    middle = len(CHANGES) // 2
+    found[middle] = left(0.0)
+    for side in (-1, 1):
+        k = middle + side
+        while 0 <= k < len(found):
+            found[k] = left(CHANGES[k])
+            if found[k] > found[k - side]:
+                break
+            k += side
+    return found
+
+
 def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     """Return the models with their pupil images where a few modes are explained best.
 
-    Only where the first steps displace them. Quadrupoles and common displacements change a matrix
-    to first order. The others blur it, and a blur hardly tells its sign: so each of them is looked
-    for in turn, on the cheap grid, all other unknowns left free to first order.
+    Only where the first steps displace them, and no further than is likely. Quadrupoles and common
+    displacements change a matrix to first order. The others blur it, and a blur hardly tells its
+    sign: so each of them is looked for in turn, on the cheap grid, all other unknowns left free to
+    first order.
     """
     models, nuisances, solution = settled.models, settled.nuisances, settled.solution
     values = solution.nuisances[nuisances.image_places]
-    if not np.any(np.abs(values @ nuisances.images) > LINEAR_IMAGES):
+    if not np.any(np.abs(values @ nuisances.images) > _linear_images(settled)):
         return models, nuisances
     modes = spread(settled.target.n_modes)
     few = settled.target.column_subset(modes)
@@ -336,11 +391,17 @@ def _with_nearest_images(settled: Settled) -> tuple[FitModels, Nuisances]:
     free[nuisances.image_places] = ~blurring
     every = np.concatenate([solution.derivatives, solution.nuisance_derivatives[free]])
     every = every[:, :, modes]
+    seen = solution.projection
+    noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
+    unlikely = solution.dispersion * noise / nuisances.image_sigma**2
 
     def left(displaced: Array) -> float:
+        improbable = unlikely * float(np.sum((nuisances.images @ displaced) ** 2))
+        if improbable > seen.chi:
+            return np.inf
         models.counter.n += 1
         matrix = subset.displaced(displaced).cheap.interaction_matrix(solution.alpha)
-        return few.project(matrix, every).chi_at_best
+        return few.project(matrix, every).chi_at_best + improbable
 
     displaced = nuisances.displaced + np.where(blurring, 0.0, values) @ nuisances.images
     least = left(displaced)
@@ -358,6 +419,11 @@ def spread(n_modes: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, n_modes - 1, min(MAX_MODES, n_modes)).astype(np.intp))
 
 
+def _linear_images(settled: Settled) -> float:
+    """Return the displacement of a pupil image below which it is as good as linear, subap."""
+    return max(LINEAR_IMAGES, LINEAR_IMAGES_LEFT * float(np.sqrt(settled.share)))
+
+
 def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisances]:
     """Return the models of the instrument that was found, and the unknowns about it."""
     models, nuisances = settled.models, settled.nuisances
@@ -372,7 +438,7 @@ def _adjusted(settled: Settled, *, move_images: bool) -> tuple[FitModels, Nuisan
     step = settled.solution.nuisances[nuisances.image_places]
     step = np.clip(step, -LONGEST_MOVE, LONGEST_MOVE) @ nuisances.images
     displaced = nuisances.displaced + step
-    far = np.any(np.abs(displaced - nuisances.displaced) > LINEAR_IMAGES)
+    far = np.any(np.abs(displaced - nuisances.displaced) > _linear_images(settled))
     if move_images and far:
         return models.displaced(displaced), replace(nuisances, displaced=displaced)
     return models, nuisances

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal.offline.models import FitModels, Optic
+from pyrcal.offline.uncertainty import dispersion, pupil_regions
 from service.estimation.solver import (
     LONGEST_STEP,
     SETTLED,
@@ -97,6 +98,9 @@ def is_blurring(pattern: Array) -> bool:
 class Nuisances:
     """The unknowns beside the registration, in their order."""
 
+    regions: NDArray[np.intp]
+    """``(n_slopes,)`` region of the pupil of each slope."""
+
     maps: Array
     """``(n_maps, n_slopes)`` gain over the pupil of each coefficient of the gain map."""
 
@@ -172,12 +176,18 @@ class Nuisances:
         return np.concatenate([np.zeros(4), 1.0 / self.sigma**2])
 
     def derivatives(
-        self, models: FitModels, alpha: Misregistration, matrix: NDArray[Any], of_alpha: Array
+        self,
+        models: FitModels,
+        alpha: Misregistration,
+        matrix: NDArray[Any],
+        of_alpha: Array,
+        of_images: Array | None = None,
     ) -> Array:
         """Return the change of D with each unknown but the gain map.
 
         ``(n_nuisances - n_maps, n_slopes, n_modes)``. ``of_alpha`` ``(4, n_slopes, n_modes)`` are
-        the derivatives with respect to α.
+        the derivatives with respect to α, ``of_images`` those with respect to the images' places
+        where they are known.
         """
         model = models.cheap
         kind = model.instrument.slopes.kind
@@ -187,7 +197,9 @@ class Nuisances:
             models.counter.n += 2
             found += list(model.stretch_derivatives(alpha))
         found += models.optics_derivatives(alpha, [optic for optic, _ in self.optics])
-        if len(self.images):
+        if of_images is not None:
+            found += list(of_images)
+        elif len(self.images):
             models.counter.n += 2
             found += list(self._of_images(model.image_derivatives(alpha), of_alpha))
         return np.array(found)
@@ -257,6 +269,7 @@ def nuisances_of(
         unknown=unknown,
         images=np.zeros((0, 8)) if images is None else images,
         image_sigma=image_sigma,
+        regions=pupil_regions(valid, kind.n_planes),
     )
     if not gain_map:
         return unknowns
@@ -294,6 +307,9 @@ class Solution:
     """``(n_nuisances, n_slopes, n_modes)`` the same of the unknowns beside the registration."""
 
     projection: Projection
+    dispersion: float
+    """Number of dependent slopes that count as one independent slope."""
+
     converged: bool
 
     @property
@@ -310,6 +326,7 @@ def refine(
     max_steps: int = MAX_NEAR_STEPS,
     *,
     near: Array | None = None,
+    of_images: Array | None = None,
     decides: InteractionModel | None = None,
 ) -> Solution:
     """Return the minimum on the fine grid, with derivatives frozen on a cheaper one.
@@ -325,6 +342,8 @@ def refine(
         Steps after which it ends, settled or not.
     near
         Derivatives of a solution nearby, ``Solution.near``; None: they are computed here.
+    of_images
+        Those with respect to the places of the pupil images alone, of a solution nearby.
     decides
         The model whose residual decides; None: the fine one.
     """
@@ -334,17 +353,21 @@ def refine(
     if near is None:
         models.counter.n += 4
         frozen = models.cheap.derivatives(start)
-        near = np.concatenate([frozen, nuisances.derivatives(models, start, matrix, frozen)])
+        beside = nuisances.derivatives(models, start, matrix, frozen, of_images)
+        near = np.concatenate([frozen, beside])
     seen, every = _seen(columns, matrix, near, values, nuisances)
+    regions = nuisances.regions[columns.rows]
+    counts = dispersion(seen, regions)
     converged = False
     for _ in range(max_steps):
-        step = _bounded_step(seen, values, nuisances)
+        step = _bounded_step(seen, values, nuisances, counts)
         if not within_limits(vector + step[:4]):
             break
         vector, values = vector + step[:4], values + step[4:]
         matrix = models.matrix(decides, nuisances.at(start, vector, values))
         seen, every = _seen(columns, matrix, near, values, nuisances)
-        next_step = _bounded_step(seen, values, nuisances)
+        counts = dispersion(seen, regions)
+        next_step = _bounded_step(seen, values, nuisances, counts)
         stretching = next_step[4:][STRETCHES] if nuisances.anamorphosis else np.zeros(1)
         at_rest = np.all(np.abs(next_step[:4]) < SETTLED)
         if at_rest and np.all(np.abs(stretching) < SETTLED_STRETCH):
@@ -358,6 +381,7 @@ def refine(
         derivatives=every[:4],
         nuisance_derivatives=every[4:],
         projection=seen,
+        dispersion=counts,
         converged=converged,
     )
 
@@ -397,10 +421,15 @@ def _seen(
     return columns.project(model * gain, every), every
 
 
-def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances) -> Array:
-    """Return the step of the registration, then of the nuisances, these held by their prior."""
+def _bounded_step(seen: Projection, values: Array, nuisances: Nuisances, counts: float) -> Array:
+    """Return the step of the registration, then of the nuisances, these held by their prior.
+
+    ``counts`` slopes count as one: slopes whose misfit has one cause tell less than as many
+    independent ones. On real benches, where a third of the signal is left over, all of them would
+    move pupil images by a pixel to explain some of it.
+    """
     noise = seen.chi / max(seen.residual.size - len(seen.gains), 1)
-    prior = nuisances.prior * noise
+    prior = nuisances.prior * noise * counts
     pull = prior * np.concatenate([np.zeros(4), nuisances.from_prior(values)])
     step = np.linalg.solve(seen.normal + np.diag(prior), seen.scores.sum(axis=1) - pull)
     excess = np.abs(step[:4]) / LONGEST_STEP

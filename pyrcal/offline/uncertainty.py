@@ -37,9 +37,15 @@ subapertures, modulated by 20 points, by 0.05 % and 0.0017 deg."""
 MAGNIFICATION_FLOOR = 1e-4
 """The same of the magnification: of those matrices 3e-5 with modes, 1.2e-4 with actuators."""
 
-LOCAL_MAGNIFICATION_FLOOR = 2.5e-4
+LOCAL_MAGNIFICATION_FLOOR = 1e-3
 """The same where each subaperture is divided by its own flux: those at the border then weigh as
-much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small."""
+much as full ones. Matrices of HCIPy with 20 subapertures were read 2e-4 to 6e-4 too small, others
+0.1 to 0.3 %."""
+
+WEAK_MODULATION_FLOOR = 1e-3
+"""The same of a pyramid that is modulated by little more than the width of a star. OOPAO samples a
+circle of 1 λ/D by 8 points: matrices of it were read 0.1 to 0.3 % wrong, and with an FFT pyramid of
+12 subapertures those 8 points alone move the magnification by 2.7e-4."""
 
 FAR_SHARE = np.array([1.5e-3, 1.5e-3, np.deg2rad(2.5e-3), 2.5e-4])
 """1 σ by parameter over the length of the shift in subapertures: far off, a mirror of another kind
@@ -157,6 +163,7 @@ def uncertainty(
     regions: NDArray[np.intp],
     places: Array,
     *,
+    dispersed: float,
     shift_subap: float,
     radius_subap: float,
     magnification_floor: float,
@@ -175,11 +182,14 @@ def uncertainty(
         ``(n_unknowns,)`` of the nuisances at the solution; 0 for the registration, whose prior is
         none.
     prior
-        ``(n_unknowns,)`` reciprocal variance of each unknown.
+        ``(n_unknowns,)`` weight of the prior of each unknown: its reciprocal variance times
+        ``dispersed``.
     regions
         ``(n_rows,)`` region of the pupil of each slope.
     places
         ``(n_rows, 2)`` where each slope is seen, pupil radii.
+    dispersed
+        Number of dependent slopes that count as one, see ``dispersion``.
     shift_subap
         Length of the shift at the solution: part of the model's error grows with it.
     radius_subap
@@ -212,7 +222,9 @@ def uncertainty(
     strange = min(1.0, residual_fraction / STRANGE_RESIDUAL)
     far = strange * FAR_SHARE * shift_subap
     floor = np.array([FLOOR_SUBAP, FLOOR_SUBAP, FLOOR_SUBAP / radius_subap, magnification_floor])
-    from_model = np.diag(share**2 + floor**2 + far**2)
+    # what the prior holds may be anywhere within it
+    held_back = (spread * np.diag(held) @ spread)[:4, :4] * noise * dispersed
+    from_model = np.diag(share**2 + floor**2 + far**2) + held_back
     pull = prior * noise * values
     by_row = Normals.of_rows(projection, regions)
     distortion = by_row.fit_distortion(places, held, pull, projection.chi, noise)
@@ -245,6 +257,24 @@ def pupil_places(valid: NDArray[np.bool_], n_planes: int, radius_subap: float) -
     """Return where every signal is seen, ``(n_slopes, 2)`` along x and y, pupil radii."""
     y, x = np.stack(np.nonzero(valid)) - (len(valid) - 1) / 2
     return np.tile(np.column_stack([x, y]) / radius_subap, (n_planes, 1))
+
+
+def dispersion(projection: Projection, regions: NDArray[np.intp]) -> float:
+    """Return how many dependent slopes count as one independent slope, at least 1.
+
+    Parts of a projection, its modes or the regions of the pupil ``(n_rows,)``, pull the unknowns
+    apart. If slopes were independent, the squares of these pulls would add up to the variance of
+    the residual times the normal matrix; where errors are common to a part, they add up to more.
+    """
+    n_unknowns = len(projection.jacobian)
+    noise = projection.chi / max(projection.residual.size - len(projection.gains), 1)
+    if not noise > 0.0:
+        return 1.0
+    spread = np.linalg.pinv(projection.normal, hermitian=True) / (noise * n_unknowns)
+    found = 1.0
+    for scores in (projection.scores, _regional_scores(projection, regions)):
+        found = max(found, float(np.einsum("kc,kl,lc->", scores, spread, scores)))
+    return found
 
 
 def pupil_regions(valid: NDArray[np.bool_], n_planes: int) -> NDArray[np.intp]:

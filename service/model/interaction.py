@@ -49,6 +49,10 @@ LARGEST_STRETCH = 0.2
 
 _AXES = 2
 
+_DENSE = 5e5
+"""Points times functions of actuators up to which all are evaluated at once: tile by tile, what is
+done for each tile takes longer."""
+
 _POINTS_TOGETHER = 2048
 """Of the pupil, whose modes are evaluated at once: fewer would cut tiles of plates in pieces."""
 
@@ -186,9 +190,10 @@ class InteractionModel:
         self.basis = basis
         self._modes: _Last[Shapes] = _Last()
         local = local_of(basis)
-        self._tiles = () if local is None else tiles_of(self.pupil)
+        by_tiles = local is not None and len(self.pupil.points) * len(local.coefficients) > _DENSE
+        self._tiles = tiles_of(self.pupil) if by_tiles else ()
         self._combination: Array | None = None
-        if local is not None:
+        if local is not None and by_tiles:
             single = self._dtype is np.float32
             self._combination = (local.in_single if single else local).coefficients
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.config import load_instrument
 from service.model.pupil import valid_subapertures
 from service.model.sensors.pyramid.optics import PyramidOptics
 from service.model.sensors.pyramid.signals import normalised_jacobian, reference_slopes
 from sim_rtc.telescope.diffractive import DiffractivePyramid, Quadrature, centred_pupil
 from tests.numerics import flao_basis
-from tests.physics.fft_pyramid import FftPyramid
 
 MODES = [0, 1, 2, 5, 12, 35, 110, 230, 400, 593]
 """Ten modes from the tilts to the last one."""

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.model.interaction import InteractionModel
 from service.model.kinds import Normalisation
 from service.model.misregistration import Misregistration
@@ -20,7 +21,6 @@ from service.model.sensors.pyramid.detector_windows import (
 )
 from service.model.slopes import SlopeRecipe
 from tests.numerics import small_basis, small_instrument
-from tests.physics.fft_pyramid import FftPyramid
 
 SEPARATION_SUBAP = 18
 N = 12

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.config.instrument import load_instrument
 from service.model.interaction import InteractionModel
 from service.model.misregistration import Misregistration
 from service.model.modes import ModalBasis
 from tests.numerics import flao_basis
-from tests.physics.fft_pyramid import FftPyramid
 
 AGREEMENT = 0.003
 """Relative Frobenius norm of the difference when the reference is padded to 160 subapertures.

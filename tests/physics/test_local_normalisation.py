@@ -8,12 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pyrcal.offline.matrix import FitOptions, fit_matrix
+from pyrcal_studies import image_offsets
+from pyrcal_studies.fft_pyramid import FftPyramid
+from service.estimation.reference import Reference
 from service.model.interaction import InteractionModel
-from service.model.kinds import Normalisation, SlopeOrder
+from service.model.kinds import Normalisation, SlopeOrder, Stop
 from service.model.misregistration import Misregistration
 from service.model.slopes import SlopeRecipe
 from tests.numerics import SOMEWHERE, small_basis, small_instrument
-from tests.physics.fft_pyramid import FftPyramid
 
 MODES = [0, 1, 2, 5, 11, 23, 39]
 STROKE_M = 1e-9
@@ -121,3 +124,20 @@ def test_derivatives_agree_with_central_differences(axis, recipe):
     found = model.derivatives(SOMEWHERE)[axis]
     allowed = 2e-3 if axis < 2 else 1e-5
     assert np.linalg.norm(found - expected) < allowed * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize(
+    ("normalisation", "modulation", "floor"),
+    [(Normalisation.GLOBAL, 3.0, 1e-4), (Normalisation.LOCAL, 3.0, 1e-3), ("global", 1.0, 1e-3)],
+)
+def test_no_magnification_is_surer_than_models_of_its_kind_agree(normalisation, modulation, floor):
+    about = image_offsets.bench(Stop.MIRROR)
+    about = replace(
+        about,
+        slopes=replace(about.slopes, normalisation=Normalisation(normalisation)),
+        wfs=replace(about.wfs, modulation_lambda_over_d=modulation),
+    )
+    matrix = image_offsets.model_of(about).interaction_matrix(image_offsets.TRUTH)
+    fit = fit_matrix(about, Reference(matrix=matrix), FitOptions(), basis=image_offsets.basis())
+    assert floor <= fit.sigma[3] < 3.0 * floor
+    assert any("floor of 0.1%" in one for one in fit.remarks) is (floor == 1e-3)

@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.config.instrument import load_instrument
 from service.model.instrument import PupilMap
 from service.model.interaction import InteractionModel
 from service.model.kinds import Stop
 from service.model.misregistration import Misregistration
 from service.model.modes import modal_basis
-from tests.physics.fft_pyramid import FftPyramid
 from tests.unit.runtime.small import INSTRUMENT
 
 AGREEMENT = 0.004

@@ -22,11 +22,11 @@ from pyrcal.offline.importers.files import (
 )
 from pyrcal.offline.importers.frames import Frames, images_words, rounded_centres
 from pyrcal.offline.importers.imported import UNKNOWN, Array, Dataset, Imported
-from pyrcal.offline.importers.pupil_images import find_pupil_images
 from service.config import instrument_path, load_instrument
 from service.config.sources import read_toml
 from service.errors import MatrixError
 from service.model.instrument import Instrument
+from service.model.pupil_images import find_pupil_images
 
 OFF_CENTRE_SUBAP = 0.25
 """Distance between the centres of the file and those of the light that is mentioned."""
@@ -96,6 +96,7 @@ def from_described(
         source=source,
         tables={**kept, "wfs": wfs, "mirror": table, "slopes": slopes},
         arrays={**signals.arrays, **modes, **mirror.arrays},
+        centres_found="pupil_centres_px" in signals.table,
         notes=tuple(notes),
     )
 

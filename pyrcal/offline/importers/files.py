@@ -187,6 +187,7 @@ def from_arrays(
             },
         },
         arrays={**signals.arrays, **modes, **mirror.arrays},
+        centres_found=frames is not None,
         notes=(*notes, *(f"{key} is unknown" for key, v in sensor.items() if v == UNKNOWN)),
     )
 

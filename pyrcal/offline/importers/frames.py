@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from pyrcal.offline.importers.imported import Array, Dataset
 from pyrcal.offline.importers.layouts import is_listed_twice
-from pyrcal.offline.importers.pupil_images import PupilImages, find_pupil_images
 from service.errors import MatrixError
+from service.model.pupil_images import PupilImages, find_pupil_images
 
 SUBAPERTURES_PER_ACTUATOR = 2.0
 """Least number of subapertures across for each actuator across: pixels are binned to no fewer, so

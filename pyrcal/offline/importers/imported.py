@@ -14,12 +14,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pyrcal.offline.recorded import FLUX_FRAME
 from service.config.instrument import load_instrument
 from service.errors import ConfigurationError, MatrixError, StorageError
 from service.files.container import DATASET
 from service.files.whole import write_whole
 from service.model.instrument import Instrument
 from service.model.pupil import rtc_valid_subapertures
+from service.model.sensors.registry import kind_of
 
 Array = NDArray[Any]
 Tables = Mapping[str, Mapping[str, Any]]
@@ -62,6 +64,10 @@ class Imported:
 
     notes: tuple[str, ...] = ()
     """What was converted, assumed or is unknown, one sentence each."""
+
+    centres_found: bool = False
+    """Whether ``wfs.pupil_centres_px`` was read off the flux frame, by circles through the edges
+    of the pupil images."""
 
     inventory: tuple[str, ...] = ()
     """Files that were taken, and for what; files that were ignored, and why."""
@@ -107,7 +113,11 @@ class Imported:
                 write_whole(draft.matrix, self._fill)
                 draft.instrument.write_text(self.instrument_text(), encoding="utf-8")
                 try:
-                    self._check(load_instrument(draft.instrument))
+                    instrument = load_instrument(draft.instrument)
+                    self._check(instrument)
+                    if self.centres_found:
+                        refined = self._with_refined_centres(instrument)
+                        draft.instrument.write_text(refined.instrument_text(), encoding="utf-8")
                 except ConfigurationError as error:
                     # the draft's folder is gone when this is read
                     raise ConfigurationError(str(error).replace(name, str(place))) from error
@@ -135,6 +145,14 @@ class Imported:
                 f"{DATASET}: found shape {matrix.shape}, expected (n_slopes, n_modes) = "
                 f"({n_slopes}, {n_modes})"
             )
+
+    def _with_refined_centres(self, instrument: Instrument) -> Imported:
+        """Return it with the centres that a fit would find with ``pupil_centres_px = "auto"``."""
+        centres = kind_of(instrument).image_centres(instrument, self.arrays[FLUX_FRAME])
+        if centres is None:
+            return self  # the light is narrower than the file's pupil: the circles stay
+        wfs = {**self.tables["wfs"], "pupil_centres_px": np.round(centres, 3).tolist()}
+        return replace(self, tables={**self.tables, "wfs": wfs})
 
     def noted(self, *notes: str) -> Imported:
         """Return it with further notes."""

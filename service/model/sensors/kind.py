@@ -162,9 +162,27 @@ class SensorKind(ABC):
         """
         raise ModelError(f"{instrument.name}: found frames; expected signals of a {self.name}")
 
-    def remarks_on_frames(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Iterator[str]:
-        """Yield what was found in a mean frame because the instrument file leaves it open."""
-        yield from ()
+    def locate_images(
+        self, instrument: Instrument, flux_frame: NDArray[Any]
+    ) -> tuple[Instrument, tuple[str, ...]]:
+        """Return the instrument with its pupil images where they lie in a mean frame, and remarks.
+
+        Only what the instrument file leaves open is looked for.
+        """
+        return instrument, ()
+
+    def is_weakly_modulated(self, sensor: Any) -> bool:  # noqa: ANN401 - its own
+        """Return whether a modulation is so narrow that models of the focus differ."""
+        return False
+
+    def image_centres(
+        self, instrument: Instrument, flux_frame: NDArray[Any]
+    ) -> NDArray[np.float64] | None:
+        """Return where a mean frame shows the pupil images, ``(4, 2)`` row and column, pixels.
+
+        Whatever the instrument file says of them. None if they cannot be found, or there is one.
+        """
+        return None
 
     def identity(self, sensor: Any) -> tuple[float, ...]:  # noqa: ANN401 - its own
         """Return the numbers that make another configuration of it when they change."""

@@ -11,6 +11,7 @@ from pyrcal.offline.disjoint_sets import (
     jackknife_sigma,
     pupil_partitions,
 )
+from pyrcal.offline.uncertainty import dispersion
 from service.estimation.solver import Projection
 
 N_ROWS, N_MODES, N_REGIONS = 120, 32, 12
@@ -137,3 +138,20 @@ def test_a_mirror_that_is_not_distorted_moves_no_set():
     _, sets = comparison(problem(8))
     assert sets.distortion.rms_subap < 0.1
     assert sets.distortion.share > 0.98
+
+
+@pytest.mark.parametrize("n_alike", [1, 10])
+def test_slopes_that_err_alike_count_as_one(n_alike):
+    """Of noise every slope counts; where ten have one derivative and one error, ten count as one.
+
+    The scatter is that of the sum of squares of 4 unknowns in 120 or 12 regions.
+    """
+    rng = np.random.default_rng(6)
+    regions = np.arange(N_ROWS) // n_alike
+    n_regions = int(regions[-1]) + 1
+    jacobian = rng.normal(size=(4, n_regions, N_MODES))[:, regions]
+    residual = rng.normal(size=(n_regions, N_MODES))[regions]
+    seen = Projection(
+        gains=np.ones(N_MODES), residual=residual, jacobian=jacobian, weights=np.ones(N_MODES)
+    )
+    assert dispersion(seen, regions) == pytest.approx(n_alike, rel=0.35)

@@ -13,6 +13,7 @@ import pytest
 
 from pyrcal.offline.matrix import FitOptions, fit_matrix
 from pyrcal.offline.models import Optic
+from pyrcal_studies.fft_pyramid import FftPyramid
 from service.config.mirrors import grid
 from service.errors import ModelError
 from service.estimation.reference import Reference
@@ -22,7 +23,6 @@ from service.model.misregistration import Misregistration
 from service.model.pupil import lit_subapertures
 from service.model.sensors.pyramid.description import Pyramid
 from service.model.slopes import Orientation, SlopeRecipe
-from tests.physics.fft_pyramid import FftPyramid
 
 TRUTH = Misregistration(
     shift_x_subap=0.31, shift_y_subap=-0.22, rotation_rad=np.deg2rad(1.1), magnification=1.006

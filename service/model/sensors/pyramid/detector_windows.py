@@ -8,16 +8,17 @@ spline through it: what falls on neighbouring subapertures is then neither lost 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from service.errors import ModelError
+from service.errors import MatrixError, ModelError
 from service.model.instrument import Instrument
 from service.model.kinds import Stop
 from service.model.pupil import rtc_valid_subapertures
+from service.model.pupil_images import find_pupil_images
 from service.model.sensors.pyramid.description import FrameWindows, by_quadrant
 from service.model.sensors.pyramid.signals import signals_of
 from service.model.sensors.sensor import CannotTell
@@ -32,13 +33,14 @@ _AT_ONCE = 32
 """Frames that are cut together: more only need memory."""
 
 _FARTHEST_SUBAP = 0.5
-"""Distance from the middle of what is lit at which a place is not believed."""
+"""Distance from the circle through its edge at which a place that the model leads to is not
+believed."""
+
+_SAME_SIZE = 0.05
+"""Relative difference of the images' diameter from the file's that is refused."""
 
 _BESIDE_SUBAP = 0.25
 """Distance of the centres of the file from the light that is mentioned."""
-
-_DARK, _LIT = 0.25, 0.75
-"""Shares of the typical light between which a pixel counts in part when images are looked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,10 +114,10 @@ def frame_windows(instrument: Instrument, flux_frame: Array) -> Windows:
 def _refined(instrument: Instrument, flux_frame: Array, pixels: int) -> Array:
     """Return the centres of the pupil images ``(2, 2, 2)`` in a mean frame, to 0.01 pixel.
 
-    The middle of what is lit is good to 0.1 pixel: light is diffracted between the images, and a
-    rim of grey pixels is lopsided. So the images are cut out there along whole pixels, and each is
-    compared with what the model shows. Where the light is another pupil's, or the frame ends too
-    near, the middle of what is lit stays.
+    Circles through the images' edges are good to 0.1 pixel: light is diffracted between the images,
+    and a rim of grey pixels is lopsided. So the images are cut out there along whole pixels, and
+    each is compared with what the model shows. Where the model does not explain the light, or the
+    frame ends too near, the circles stay.
     """
     from service.model.sensors.pyramid.light import image_places
 
@@ -134,6 +136,21 @@ def _refined(instrument: Instrument, flux_frame: Array, pixels: int) -> Array:
     return found if np.abs(found - centres).max() < _FARTHEST_SUBAP * pixels else centres
 
 
+def image_centres(instrument: Instrument, flux_frame: NDArray[np.floating]) -> Array | None:
+    """Return where a mean frame shows the pupil images, ``(4, 2)`` row and column.
+
+    None if it does not show them, or the instrument does not deliver frames.
+    """
+    windows = instrument.frames
+    if not isinstance(windows, FrameWindows):
+        return None
+    try:
+        found = _refined(instrument, flux_frame.astype(np.float64), windows.pixels_per_subaperture)
+    except ModelError:
+        return None
+    return found.reshape(4, 2)
+
+
 def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixels: int) -> Windows:
     n = instrument.wfs.n_subapertures
     shape = (flux_frame.shape[0], flux_frame.shape[1])
@@ -145,18 +162,30 @@ def _windows_at(instrument: Instrument, centres: Array, flux_frame: Array, pixel
     return Windows(centres_px=centres, shape=shape, windows=tuple(windows))
 
 
-def remarks_on_windows(instrument: Instrument, flux_frame: NDArray[np.floating]) -> Iterator[str]:
-    """Yield where the pupil images were found, or how far they are from where they should be."""
+def locate_images(
+    instrument: Instrument, flux_frame: NDArray[np.floating]
+) -> tuple[Instrument, tuple[str, ...]]:
+    """Return the instrument with its pupil images where they lie in a mean frame, and remarks.
+
+    Where the instrument file says where they lie it stays, and a remark says how far the light is
+    from there.
+
+    Raises
+    ------
+    ModelError
+        If the images cannot be found, or a window leaves the frame.
+    """
     windows = instrument.frames
     if not isinstance(windows, FrameWindows):
-        return
+        return instrument, ()
     light = flux_frame.astype(np.float64)
-    if windows.centres_px is None:
-        centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
-        found = f"pupil_centres_px = [{_listed(centres)}]"
-        yield f"shifts count from the pupil images as found: {found}"
-    elif instrument.stop is not Stop.MIRROR:  # with it the images move
-        yield from _beside_the_light(instrument, windows, light)
+    if windows.centres_px is not None:
+        moving = instrument.stop is Stop.MIRROR  # the images move with the mirror
+        remarks = () if moving else tuple(_beside_the_light(instrument, windows, light))
+        return instrument, remarks
+    centres = frame_windows(instrument, light).centres_px.reshape(4, 2)
+    remark = f"shifts count from the pupil images as found: pupil_centres_px = [{_listed(centres)}]"
+    return replace(instrument, frames=replace(windows, centres_px=centres)), (remark,)
 
 
 def _beside_the_light(instrument: Instrument, windows: FrameWindows, light: Array) -> Iterator[str]:
@@ -252,52 +281,23 @@ def slopes_per_unit(
 def found_centres(flux_frame: Array, diameter_px: float) -> Array:
     """Return the centres of the four pupil images in a mean frame, ``(2, 2, 2)``.
 
-    The middle of what is lit at all, however unevenly: only the outline counts.
+    By circles through their edges.
 
     Raises
     ------
     ModelError
         If the lit areas are not four discs of this diameter.
     """
-    light = np.nan_to_num(flux_frame)
-    row, column = _darkest(light.sum(axis=1)), _darkest(light.sum(axis=0))
-    centres = np.empty((2, 2, 2))
-    for y, rows in enumerate((slice(None, row), slice(row, None))):
-        for x, columns in enumerate((slice(None, column), slice(column, None))):
-            disc = _disc(light[rows, columns])
-            middle = [axis @ np.arange(len(axis)) for axis in _profiles(disc)]
-            centres[y, x] = np.add(middle, [y * row, x * column])
-            found_px = float(np.sqrt(4 / np.pi * disc.sum()))
-            if abs(found_px / diameter_px - 1.0) > 0.05:
-                raise ModelError(
-                    f"flux frame: found a lit area as large as a disc of {found_px:.1f} pixels "
-                    f"near row {centres[y, x, 0]:.0f}, column {centres[y, x, 1]:.0f}; expected "
-                    f"four pupil images of {diameter_px:g}"
-                )
-    return centres
-
-
-def _darkest(profile: Array) -> int:
-    """Return the darkest line in the middle half of a profile: it parts the images."""
-    quarter = len(profile) // 4
-    return quarter + int(np.argmin(profile[quarter : len(profile) - quarter]))
-
-
-def _disc(light: Array) -> Array:
-    """Return the lit disc of one quadrant: 1 inside, holes filled, the lit share on the edge."""
-    bright = light[light > np.percentile(light, 98) / 3]
-    typical = np.median(bright) if bright.size else 1.0
-    lit = np.clip((light / typical - _DARK) / (_LIT - _DARK), 0.0, 1.0)
-    solid = scipy.ndimage.binary_fill_holes(lit > 0.5)
-    return np.where(
-        scipy.ndimage.binary_erosion(solid), 1.0, lit * scipy.ndimage.binary_dilation(solid)
-    )
-
-
-def _profiles(disc: Array) -> tuple[Array, Array]:
-    """Return how a disc is spread over rows and columns; each sums to 1."""
-    total = max(float(disc.sum()), 1e-300)
-    return disc.sum(axis=1) / total, disc.sum(axis=0) / total
+    try:
+        images = find_pupil_images(flux_frame, "flux frame")
+    except MatrixError as error:
+        raise ModelError(str(error)) from error
+    if abs(images.diameter_px / diameter_px - 1.0) > _SAME_SIZE:
+        raise ModelError(
+            f"flux frame: found lit areas as large as a disc of {images.diameter_px:.1f} pixels; "
+            f"expected four pupil images of {diameter_px:g}"
+        )
+    return images.centres_px.reshape(2, 2, 2)
 
 
 def _axis(centre_px: float, n: int, pixels: int, length: int, name: str) -> tuple[slice, Array]:

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _IMAGES = "image_offsets_px"
 
+_WEAK_LAMBDA_OVER_D = 1.5
+"""Modulation up to which the star's own width counts as much."""
+
 
 class PyramidKind(SensorKind):
     """The modulated pyramid."""
@@ -102,10 +105,20 @@ class PyramidKind(SensorKind):
         return slopes_from_frames(instrument, frames, flux_frame)
 
     @override
-    def remarks_on_frames(self, instrument: Instrument, flux_frame: NDArray[Any]) -> Iterator[str]:
-        from service.model.sensors.pyramid.detector_windows import remarks_on_windows
+    def locate_images(
+        self, instrument: Instrument, flux_frame: NDArray[Any]
+    ) -> tuple[Instrument, tuple[str, ...]]:
+        from service.model.sensors.pyramid.detector_windows import locate_images
 
-        yield from remarks_on_windows(instrument, flux_frame)
+        return locate_images(instrument, flux_frame)
+
+    @override
+    def image_centres(
+        self, instrument: Instrument, flux_frame: NDArray[Any]
+    ) -> NDArray[np.float64] | None:
+        from service.model.sensors.pyramid.detector_windows import image_centres
+
+        return image_centres(instrument, flux_frame)
 
     @override
     def identity(self, sensor: Pyramid) -> tuple[float, ...]:
@@ -161,6 +174,10 @@ class PyramidKind(SensorKind):
         # the phase of a modulation wide for its subapertures turns too fast for one point
         wide = 2.0 * sensor.modulation_lambda_over_d + 3.0 >= sensor.pupil_diameter
         return 2 if wide else 1
+
+    @override
+    def is_weakly_modulated(self, sensor: Pyramid) -> bool:
+        return sensor.modulation_lambda_over_d <= _WEAK_LAMBDA_OVER_D
 
     @override
     def fitted_key(self, sensor: Pyramid) -> str | None:

@@ -395,12 +395,12 @@ class PyramidOptics:
             return TiledResponse(shapes, self._scale, self.arrays)
         there = self.arrays.there
         lit, scale = there(np.flatnonzero(self.pupil.lit)), there(self._scale[self.pupil.lit])
-        if shapes is not None and self._are_few(shapes.shape[1]):
+        if shapes is not None and self.are_few(shapes.shape[1]):
             return partial(self._fold_few, weighted=self._weighted(shapes))
         known = None if shapes is None else there(shapes)
         return partial(self._fold, lit=lit, scale=scale, shapes=known)
 
-    def _are_few(self, n_shapes: int) -> bool:
+    def are_few(self, n_shapes: int) -> bool:
         """Return whether so few shapes cost less than the gradient at every point of a row."""
         n_lines = self.recipe.kind.n_planes * self.wfs.n_subapertures
         n_points = len(self.pupil.coordinates)

@@ -195,7 +195,9 @@ class PyramidResponse:
         if sensor.keeps_gradient and not edges:
             return self._gradient.to(shapes, self._product)
         # one product of all rows where there is room: row by row, each would read the shapes again
-        whole = sensor.keeps_gradient and isinstance(shapes, np.ndarray)
+        # ... and where a row's gradient is cheaper than its response to the shapes alone
+        few = isinstance(shapes, np.ndarray) and sensor.optics.are_few(shapes.shape[1])
+        whole = sensor.keeps_gradient and not few
         found = sensor.optics.response(
             sensor.valid,
             self.shift,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from typing_extensions import override
 
 Paths = list[tuple[NDArray[np.complex128], NDArray[np.complex128]]]
 """Of y and of x, ``(n_detector, n)``."""
@@ -155,13 +156,15 @@ class DisplacedPyramid(FftPyramid):
     offsets: NDArray[np.float64]
     """``(2, 2, 2)`` displacement of the images, subapertures: side along y, along x, (x, y)."""
 
+    @override
     def _paths(self, shift: tuple[float, float]) -> Any:
         moved = self.offsets + shift
-        return [[FftPyramid._paths(self, tuple(at)) for at in row] for row in moved]
+        return [[super(DisplacedPyramid, self)._paths(tuple(at)) for at in row] for row in moved]
 
+    @override
     def _images(self, opd_m: NDArray[np.float64], paths: Any) -> NDArray[np.float64]:
         n = self.n_subapertures
         images = np.empty((2, n, 2, n))
         for y, x in np.ndindex(2, 2):
-            images[y, :, x] = FftPyramid._images(self, opd_m, paths[y][x])[y, :, x]
+            images[y, :, x] = super(DisplacedPyramid, self)._images(opd_m, paths[y][x])[y, :, x]
         return images

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pyrcal.offline.alternatives import moved_words, systematic_terms
+from pyrcal.offline.alternatives import PLAUSIBLE_DISPLACEMENT_PX, moved_words, systematic_terms
 from pyrcal.offline.fitted import Fit
 from pyrcal.offline.methods import ScanStep
 from pyrcal.offline.report import FitReport, orientation_words, verdict_line
@@ -157,11 +157,6 @@ NOTABLE_DISPLACEMENT_PX = 0.03
 
 NOTABLE_DISTORTION_SUBAP = 0.03
 """Distortion of the mirror, RMS over the pupil, from which on it is mentioned."""
-
-
-PLAUSIBLE_DISPLACEMENT_PX = 0.5
-"""Displacement of a pupil image beyond which it stands for something else: real pyramids have up to
-0.3 pixel, and images whose response the model explains to 70 % only were fitted 1.7 pixels off."""
 
 
 def displacement_words(offsets_px: NDArray[np.float64]) -> str:

@@ -153,7 +153,7 @@ BENCHES = (
         words="AO188 of Subaru with its near-infrared pyramid: 188 actuators of a bimorph as "
         "frames of 160 x 160 pixels, strokes and modulation unknown",
         instrument=AO188,
-        remark="**Open:** shift x of the fits beyond 3 σ is 0.27 to 0.56 coarse subapertures, where "
+        remark="**Open:** shift x of the fits beyond 3 σ is 0.27 to 0.56 coarse subapertures; "
         "all actuators at full resolution give 0.55. Each has ended in another minimum of the "
         "places of the pupil images, which are displaced by up to 2.3 pixels, as in no pyramid: "
         "their prior of 0.15 pixels is weighed against white noise, and errors of the model are "

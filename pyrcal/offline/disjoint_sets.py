@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,6 +160,12 @@ class Normals:
             clusters=regions,
         )
 
+    def without(self, other: Normals) -> Normals:
+        """Return the same parts without what others hold of each."""
+        return replace(
+            self, normals=self.normals - other.normals, scores=self.scores - other.scores
+        )
+
     def leave_one_out(
         self, inside: NDArray[np.bool_], held: Array, pull: Array
     ) -> tuple[Array, Array]:
@@ -274,17 +280,25 @@ class SetComparison:
                     sets.append((step, self._at_least_noise(sigma, parts, inside), moved))
                 yield self._compared(words, labels, sets, parts)
 
-    def of_rows(self, partitions: Mapping[str, Labels], parts: Normals) -> Iterator[DisjointSets]:
-        """Yield partitions of the slopes; ``parts`` are the normal equations of each slope."""
+    def of_rows(
+        self, partitions: Mapping[str, Labels], parts: Normals, by_mode: Normals
+    ) -> Iterator[DisjointSets]:
+        """Yield partitions of the slopes.
+
+        ``parts`` are the normal equations of each slope, ``by_mode`` those of each mode.
+        """
         every = np.ones(len(self.seen.gains), dtype=bool)
         for words, labels in partitions.items():
             with suppress(np.linalg.LinAlgError):
-                sets = []
-                for number in np.unique(labels):
+                sets, rest, numbers = [], by_mode, np.unique(labels)
+                for number in numbers:
                     inside = labels == number
                     step, sigma = parts.leave_one_out(inside, self.held, self.pull)
-                    by_mode = Normals.of_modes(self.seen, inside)
-                    _, single = by_mode.leave_one_out(every, self.held, self.pull)
+                    # the last set has what the others leave: half of the work
+                    last = number == numbers[-1]
+                    own = rest if last else Normals.of_modes(self.seen, inside)
+                    rest = rest.without(own)
+                    _, single = own.leave_one_out(every, self.held, self.pull)
                     sigma = self._at_least_noise(np.hypot(sigma, single), parts, inside)
                     moved = parts.distorted(inside, self.held, self.distortion.field)
                     sets.append((step, sigma, moved))

@@ -236,7 +236,10 @@ def uncertainty(
         noise=noise,
         distortion=distortion,
     )
-    sets = (*comparison.of_modes(mode_sets, by_mode), *comparison.of_rows(pupil_sets, by_row))
+    sets = (
+        *comparison.of_modes(mode_sets, by_mode),
+        *comparison.of_rows(pupil_sets, by_row, by_mode),
+    )
     steps, covariances = _subsets(max(n_sets, 1), normals, held, scores, pull, noise)
     statistical = from_modes
     for kind in (mode_sets, pupil_sets):

@@ -241,6 +241,10 @@ def settle(
     settled = Settled(
         solution=solution, target=seen, models=models, nuisances=nuisances, on_fine_grid=False
     )
+    if settled.share < STRANGE:
+        # so little is left over that the cheap grid's own error would displace pupil images
+        solution = refine(models, seen, solution.alpha, nuisances, near=solution.near)
+        settled = replace(settled, solution=solution, on_fine_grid=True)
     settled = _with_nearest_instrument(settled)
     models, nuisances = settled.models, settled.nuisances
     before, approaching, taken = np.inf, True, settled

@@ -57,7 +57,8 @@ _LARGEST_RESIDUAL = 0.25
 
 _PLACES_RESIDUAL = 0.12
 """The same where each image's own place is read. On AO188, whose light the model does not explain,
-a quarter is left and the places are a pixel off; under a gradient of 30 % it is 2 %."""
+a quarter is left and the places are a pixel off; under even light, and under a gradient of 30 %, a
+hundredth."""
 
 _LARGEST_SIGMA_SUBAP = 1.0
 

@@ -65,10 +65,10 @@ _USUAL_UNKNOWNS = 9
 _OF_GAIN_MAP = 20
 """14 coefficients of the gain over the pupil, and all derivatives multiplied by that gain."""
 
-_KEPT = 2.3
+_KEPT = 4.4
 """Copies of the derivatives by each of them, float64, while a model is computed, ..."""
 
-_PROJECTED = 5.7
+_PROJECTED = 7.8
 """... and while they are projected."""
 
 _MODELS = 1.4

@@ -21,7 +21,7 @@ def eigenvalues(budget: Budget, store: Store) -> tuple[str, str]:
     found = results.spectra(budget, store)
     theirs = paper.QUOTES["condition"].values
     measured = [results.condition(values) for values in found.measured]
-    clean = [[results.condition(values) for values in pair] for pair in found.clean]
+    clean = [results.condition(values) for values in found.clean]
     model = [results.condition(values) for values in found.model]
     drawn = [results.condition(values) for values in found.drawn]
     middle = len(found.synthetic) // 2
@@ -29,7 +29,6 @@ def eigenvalues(budget: Budget, store: Store) -> tuple[str, str]:
     knees = [results.knee(values) for values in (found.synthetic, found.measured[0])]
     flatter = "flatter" if flat[0] > flat[1] else "steeper"
     later = "later" if knees[0] > knees[1] else "not later"
-    above = sum(pair[1] > model[1] for pair in clean)
     text = (
         f"Condition numbers: synthetic {results.condition(found.synthetic):.2f} (the paper "
         f"{theirs[0]:g}), measured {listed(measured, '.2f')} on the telescopes in turn (the paper "
@@ -37,15 +36,20 @@ def eigenvalues(budget: Budget, store: Store) -> tuple[str, str]:
         f"value, the measured one {flat[1]:.3f}; the knee is at eigenmode {knees[0]} and "
         f"{knees[1]}. The paper: “{paper.QUOTES['eigenvalues'].text}”; here the synthetic spectrum "
         f"is {flatter}, its knee {later}.\n\n"
-        "The order of the condition numbers is reversed by the border. At 98 % of magnification "
-        f"the pupil reaches {telescope.beyond_actuators_subap(0.98):.2f} subaperture beyond "
-        "the outermost actuators, where the surface is an extrapolation that depends on the "
-        f"mirror. Without noise the model has {model[0]:.2f} there, telescopes "
-        f"{listed((pair[0] for pair in clean), '.2f')}, a telescope with the model's own mirror "
-        f"{drawn[0]:.2f}. At 100 %, everything else unchanged, they have {model[1]:.2f}, "
-        f"{listed((pair[1] for pair in clean), '.2f')} and {drawn[1]:.2f}: {above} of {len(clean)} "
-        "telescopes are then above the model, as in the paper. The paper used measured influence "
-        "functions, ours are thin plates."
+        "The condition numbers depend on the border. At 98 % of magnification the pupil reaches "
+        f"{telescope.beyond_actuators_subap(0.98):.2f} subaperture beyond the outermost actuators, "
+        "where the surface is an extrapolation that depends on the mirror. Without noise the model "
+        f"has {model[0]:.2f} there, telescope {budget.seeds[0]} {clean[0]:.2f} and a telescope "
+        "with "
+        f"the model's own mirror {drawn[0]:.2f}. At 100 %, everything else unchanged, they have "
+        f"{model[1]:.2f}, {clean[1]:.2f} and {drawn[1]:.2f}"
+        + (
+            ": the telescope is then above the model, as in the paper. So the border reverses the "
+            "order. "
+            if clean[1] > model[1] and clean[0] < model[0]
+            else ". The border alone does not decide the order. "
+        )
+        + "The paper used measured influence functions, ours are thin plates."
     )
     return "eigenvalues of the measured and the synthetic matrix", text
 

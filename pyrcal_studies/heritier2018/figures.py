@@ -48,7 +48,7 @@ def eigenvalues(budget: Budget, store: Store) -> Figure:
     panels = figure.subplots(1, 2, sharey=True)
     pairs = (
         ("at 98 % (the registration found)", found.measured[0], found.synthetic, "measured"),
-        ("at 100 %, no noise", found.clean[0][1], found.model[1], "telescope"),
+        ("at 100 %, no noise", found.clean[1], found.model[1], "telescope"),
     )
     for axes, (title, measured, synthetic, name) in zip(panels, pairs, strict=True):
         for values, colour, word in (

@@ -95,7 +95,7 @@ FULL = Budget(
     n_average=4,
     seeds=(1, 2, 3),
     ramp_frames=160,
-    start_distances=(1.0, 2.0),
+    start_distances=(1.0,),
     starts_per_distance=1,
     every=1,
     modes_every=1,
@@ -147,12 +147,9 @@ def answer(seed: int, alpha: Misregistration = TRUTH, imperfections: str = USUAL
 
 
 def answers(budget: Budget, alpha: Misregistration) -> dict[str, Answer]:
-    """Return the noise-free matrices of telescopes, by what differs from the model."""
+    """Return the noise-free matrices of the first telescope and of one with the model's mirror."""
     first = budget.seeds[0]
-    cases = {"nothing": (DRAWN, first)}
-    for seed in budget.seeds:
-        cases[f"mirror, light and actuators, telescope {seed}"] = (USUAL, seed)
-    return {name: answer(seed, alpha, kind) for name, (kind, seed) in cases.items()}
+    return {name: answer(first, alpha, name) for name in (DRAWN, USUAL)}
 
 
 def fit_of(
@@ -185,7 +182,7 @@ def registration_sources(budget: Budget) -> dict[str, Measurement | Answer]:
     first = budget.seeds[0]
     return {
         "clean, the model's mirror": answer(first, TRUTH, DRAWN),
-        **{f"clean, telescope {s}": answer(s) for s in budget.seeds},
+        f"clean, telescope {first}": answer(first),
         **{f"noisy, telescope {s}": measurement(budget, s) for s in budget.seeds},
     }
 
@@ -301,7 +298,7 @@ INFLUENCE_MODES = (N_MEASURED, N_BASIS)
 RULES = ((ROTATION, 0.1), (SHIFT, 10.0))
 """Accuracy that the paper asks for (end of section 3.2)."""
 
-POLE_STEPS = {"rotation_deg": 0.2, "shift_x_subap": 6.0}
+POLE_STEPS = {"rotation_deg": 0.4, "shift_x_subap": 12.0}
 """Distance of two points at which the poles are computed, in the sweep's unit."""
 
 

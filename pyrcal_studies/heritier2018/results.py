@@ -261,8 +261,8 @@ class Spectra:
     model: tuple[Array, Array]
     """The model at 98 and at 100 %."""
 
-    clean: tuple[tuple[Array, Array], ...]
-    """Noise-free telescopes at 98 and at 100 %."""
+    clean: tuple[Array, Array]
+    """The first telescope without noise at 98 and at 100 %."""
 
     drawn: tuple[Array, Array]
     """The noise-free telescope with the model's own mirror."""
@@ -290,7 +290,7 @@ def spectra(budget: Budget, store: Store) -> Spectra:
         synthetic=singular_values(synthetic_matrix(alpha)[:, :n_modes]),
         measured=tuple(singular_values(matrix) for matrix in measured),
         model=(model[0], model[1]),
-        clean=tuple(clean(seed, plan.USUAL) for seed in budget.seeds),
+        clean=clean(budget.seeds[0], plan.USUAL),
         drawn=clean(budget.seeds[0], DRAWN),
     )
 

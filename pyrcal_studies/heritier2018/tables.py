@@ -397,8 +397,8 @@ def _pattern_words(runs: Mapping[Pattern, Record], longest: int) -> str:
         + ", then ".join(str(pattern) for pattern in order)
         + f". The paper quotes that “{paper.QUOTES['patterns'].text}”. With shapes of equal RMS a "
         "Hadamard combination of modes has no larger signal than a single mode: its advantage is "
-        "that of a mirror whose single actuators are limited. For the registration any of them is "
-        "enough within seconds, because all modes determine four numbers."
+        "that of a mirror whose single actuators are limited. Shapes of the whole "
+        "mirror give the registration within a second, single actuators take much longer."
     )
 
 
@@ -407,6 +407,12 @@ def open_questions(budget: Budget, store: Store) -> str:
     fit, _ = results.fit_record(budget, store, budget.seeds[0])
     few = results.captured_errors(budget, store)
     n_few = fit.source.n_modes // plan.CAPTURE_MODES_EVERY
+    of_few = ""
+    if np.isfinite(few):
+        of_few = (
+            f"The joint fit of {n_few} of the {fit.source.n_modes} modes is off by at most "
+            f"{few:.2f} % of a subaperture. "
+        )
     measured = max(float(max(abs(e[:2]))) for e in results.joint_errors(budget, store).values())
     scans = results.fit_errors(budget, store)
     clean, noisy = (
@@ -416,8 +422,7 @@ def open_questions(budget: Budget, store: Store) -> str:
     uneven = results.uneven_errors(budget, store)
     return "\n\n".join(
         [
-            f"**Number of signals.** “{paper.QUOTES['number'].text}”. The joint fit of {n_few} of "
-            f"the {fit.source.n_modes} modes is off by at most {few:.2f} % of a subaperture. In "
+            f"**Number of signals.** “{paper.QUOTES['number'].text}”. {of_few}In "
             "operation four dithered modes of 5 nm are enough for 0.2 % of a subaperture and "
             "0.004° in 5 s at magnitude 7: [estimators at night](night.md).",
             f"**Noise.** “{paper.QUOTES['noise'].text}”. Table 1's procedure is off by at "

@@ -57,7 +57,7 @@ check: $(STAMP) ## lint, formatting, types and import contracts
 	@$(PY) -m mypy
 	@.venv/bin/lint-imports --no-logo
 
-paper: $(STAMP) ## the seed paper, figure by figure, as one HTML report; ARGS=--quick rehearses
+paper: $(STAMP) ## the seed paper beside pyrcal: docs/results/heritier2018.md and its figures; 20 minutes, ARGS=--quick three
 	@$(PY) -m pyrcal_studies.heritier2018 $(ARGS)
 
 bench: $(STAMP) ## pyrcal beside OOPAO, HCIPy and SPECULA, each from its package: docs/results/bench.md; a quarter of an hour
@@ -94,7 +94,7 @@ clean: ## remove what make made; never var/, which holds calibration products
 	    .import_linter_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(MANUAL): $(STAMP) docs/conf.py docs/manual.css $(wildcard docs/*.md docs/*/*.md docs/*/*.png docs/*/*.svg)
+$(MANUAL): $(STAMP) docs/conf.py docs/manual.css $(wildcard docs/*.md docs/*/*.md docs/*/*.png docs/*/*/*.png docs/*/*.svg)
 	@$(PY) -m sphinx -q -d build/manual docs $(@D) && touch $@
 
 # A working environment is brought up to date in place; one made elsewhere or broken is made anew.

@@ -448,6 +448,11 @@ def _found(
         case Method.SENSITIVITY:
             return _Found(settled=project_on_sensitivities(models, target, start, nuisances))
         case Method.PAPER:
+            if not _stroke_known(models.instrument):
+                raise ModelError(
+                    "--method paper: found a matrix whose strokes are unknown; expected slopes per "
+                    "metre, because the paper's criterion leaves no gain free. Use --method joint"
+                )
             alpha, table = scan(models, target, start, tell=tell)
             return _Found(settled=settle_at(models, target, alpha, nuisances), table=table)
 

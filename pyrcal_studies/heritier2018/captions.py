@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pyrcal_studies.heritier2018 import paper, plan, results, telescope
+from pyrcal_studies.heritier2018 import markdown, paper, plan, results, telescope
 from pyrcal_studies.heritier2018.loops import Over
 from pyrcal_studies.heritier2018.markdown import listed
 from pyrcal_studies.heritier2018.plan import Budget, Variant
@@ -21,7 +21,7 @@ def eigenvalues(budget: Budget, store: Store) -> tuple[str, str]:
     found = results.spectra(budget, store)
     theirs = paper.QUOTES["condition"].values
     measured = [results.condition(values) for values in found.measured]
-    clean = [[results.condition(values) for values in pair] for pair in found.clean]
+    clean = [results.condition(values) for values in found.clean]
     model = [results.condition(values) for values in found.model]
     drawn = [results.condition(values) for values in found.drawn]
     middle = len(found.synthetic) // 2
@@ -29,7 +29,6 @@ def eigenvalues(budget: Budget, store: Store) -> tuple[str, str]:
     knees = [results.knee(values) for values in (found.synthetic, found.measured[0])]
     flatter = "flatter" if flat[0] > flat[1] else "steeper"
     later = "later" if knees[0] > knees[1] else "not later"
-    above = sum(pair[1] > model[1] for pair in clean)
     text = (
         f"Condition numbers: synthetic {results.condition(found.synthetic):.2f} (the paper "
         f"{theirs[0]:g}), measured {listed(measured, '.2f')} on the telescopes in turn (the paper "
@@ -37,15 +36,20 @@ def eigenvalues(budget: Budget, store: Store) -> tuple[str, str]:
         f"value, the measured one {flat[1]:.3f}; the knee is at eigenmode {knees[0]} and "
         f"{knees[1]}. The paper: “{paper.QUOTES['eigenvalues'].text}”; here the synthetic spectrum "
         f"is {flatter}, its knee {later}.\n\n"
-        "The order of the condition numbers is reversed by the border. At 98 % of magnification "
-        f"the pupil reaches {telescope.beyond_actuators_subap(0.98):.2f} subaperture beyond "
-        "the outermost actuators, where the surface is an extrapolation that depends on the "
-        f"mirror. Without noise the model has {model[0]:.2f} there, telescopes "
-        f"{listed((pair[0] for pair in clean), '.2f')}, a telescope with the model's own mirror "
-        f"{drawn[0]:.2f}. At 100 %, everything else unchanged, they have {model[1]:.2f}, "
-        f"{listed((pair[1] for pair in clean), '.2f')} and {drawn[1]:.2f}: {above} of {len(clean)} "
-        "telescopes are then above the model, as in the paper. The paper used measured influence "
-        "functions, ours are thin plates."
+        "The condition numbers depend on the border. At 98 % of magnification the pupil reaches "
+        f"{telescope.beyond_actuators_subap(0.98):.2f} subaperture beyond the outermost actuators, "
+        "where the surface is an extrapolation that depends on the mirror. Without noise the model "
+        f"has {model[0]:.2f} there, telescope {budget.seeds[0]} {clean[0]:.2f} and a telescope "
+        "with "
+        f"the model's own mirror {drawn[0]:.2f}. At 100 %, everything else unchanged, they have "
+        f"{model[1]:.2f}, {clean[1]:.2f} and {drawn[1]:.2f}"
+        + (
+            ": the telescope is then above the model, as in the paper. So the border reverses the "
+            "order. "
+            if clean[1] > model[1] and clean[0] < model[0]
+            else ". The border alone does not decide the order. "
+        )
+        + "The paper used measured influence functions, ours are thin plates."
     )
     return "eigenvalues of the measured and the synthetic matrix", text
 
@@ -75,22 +79,10 @@ def sensitivity(budget: Budget, store: Store) -> tuple[str, str]:
         drops = "none" if drop is None else f"{drop:.2f} {sweep.unit} (first value after {after:g})"
         few_drop = few.drop()
         few_words = "none in this range" if few_drop is None else f"{few_drop:.2f} {sweep.unit}"
-        own = f", the paper's first value after it is {theirs[sweep.name]:g}" * (
-            sweep.name in theirs
-        )
+        own = ""
+        if sweep.name in theirs:
+            own = f", the paper's first value after it is {theirs[sweep.name]:g}"
         texts.append(f"{sweep.symbol}: 594 modes {drops}{own}; 400 modes {few_words}")
-    limits = {
-        sweep.symbol: {
-            gain: value
-            for gain, value in results.stability_limits(budget, store, sweep).items()
-            if value is not None
-        }
-        for sweep in (plan.ROTATION, plan.SHIFT)
-    }
-    stability = "; ".join(
-        f"{symbol}: " + ", ".join(f"{value:.2f} (gain {gain:g})" for gain, value in by_gain.items())
-        for symbol, by_gain in limits.items()
-    )
     costs = results.rule_costs_nm(budget, store)
     rule = "; ".join(
         f"{symbol}, {n_modes} modes: {cost:+.1f} nm" for (symbol, n_modes), cost in costs.items()
@@ -102,12 +94,8 @@ def sensitivity(budget: Budget, store: Store) -> tuple[str, str]:
     grown = [one.errors_nm[one.values.index(at)] - one.errors_nm[0] for one in magnification]
     text = (
         f"The drop is where {results.COSTLY_NM:g} nm are added in quadrature: {'. '.join(texts)}. "
-        "The paper prints no threshold, gain or wind. With 594 modes the drop is a loss of "
-        "stability, so its place is set by the gain; the model's poles leave the unit circle at "
-        f"{stability}. The ratio of both parameters hardly depends on the gain, so the paper's "
-        "0.8° "
-        "and 40 % (21 and 40 % of a subaperture at the border) are not reached together by any "
-        "gain: the paper's values are points of a sweep whose steps it does not print.\n\n"
+        "The paper prints no threshold, gain or wind.\n\n"
+        f"{_stability(budget, store)}\n\n"
         f"The rule of 10 % and 0.1° costs: {rule}. Magnification: {at:g} % adds "
         f"{grown[0]:.0f} nm with 400 modes and {grown[1]:.0f} nm with 594: "
         f"“{paper.QUOTES['magnification'].text}”. "
@@ -117,17 +105,54 @@ def sensitivity(budget: Budget, store: Store) -> tuple[str, str]:
     return "impact of a misregistration on the wavefront error", text
 
 
+def _stability(budget: Budget, store: Store) -> str:
+    """Return where the loop of 594 modes becomes unstable, by gain, beside the paper's values."""
+    rotation, shift = (
+        results.stability_limits(budget, store, sweep) for sweep in (plan.ROTATION, plan.SHIFT)
+    )
+    theirs = paper.QUOTES["drop"].values
+    border = 100.0 * plan.ROTATION.border_subap(theirs[0])
+    cells, ratios = [], []
+    for gain in plan.POLE_GAINS:
+        turned, moved = rotation[gain], shift[gain]
+        words = [
+            "stable" if value is None else f"{value:.2f}{unit}"
+            for value, unit in ((turned, "°"), (moved, " %"))
+        ]
+        ratio = ""
+        if turned is not None and moved is not None:
+            ratios.append(100.0 * plan.ROTATION.border_subap(turned) / moved)
+            ratio = f"{ratios[-1]:.2f}"
+        cells.append([f"{gain:g}", *words, ratio])
+    head = ["Gain", "α_rot", "α_x", "Movement of the border by α_rot over that by α_x"]
+    text = (
+        "With 594 modes the drop is a loss of stability, so the gain decides where it is. Table: "
+        "values at which a pole of the model's loop leaves the unit circle, by integrator gain, "
+        f"without turbulence.\n\n{markdown.table(head, cells)}\n\n"
+    )
+    if ratios and min(ratios) > border / theirs[1] * 1.2:
+        text += (
+            f"The paper's {theirs[0]:g}° move the border by {border:.0f} % of a subaperture, "
+            f"{border / theirs[1]:.2f} times as much as its {theirs[1]:g} % of shift. Here the "
+            f"ratio is {min(ratios):.2f} to {max(ratios):.2f} at any gain, so the gain alone does "
+            "not explain the paper's pair of values. They are the first points of two sweeps after "
+            "the drop, and the paper does not print the steps of the sweeps."
+        )
+    return text
+
+
 def sensitivity_spectra(budget: Budget, store: Store) -> tuple[str, str]:
     """Return title and text of figure 6."""
     texts = []
     for sweep in (plan.ROTATION, plan.SHIFT):
-        times, mode = results.amplified(budget, store, sweep)
-        share = results.share_of_last_third(budget, store, sweep)
-        texts.append(
-            f"at {sweep.symbol} = {sweep.marked[0]:g} {sweep.unit} modes about {mode} have "
-            f"{times:.1f} times the turbulence, and {share:.0%} of the added variance is in the "
-            "last third of the modes"
-        )
+        for value, word in results.shown_values(budget, store, sweep).items():
+            times, mode = results.amplified(budget, store, sweep, value)
+            share = results.share_of_last_third(budget, store, sweep, value)
+            texts.append(
+                f"at {sweep.symbol} = {value:g} {sweep.unit} ({word}) modes about {mode} have "
+                f"{times:.1f} times the turbulence, and {share:.0%} of the added variance is in "
+                "the last third of the modes"
+            )
     text = (
         f"594 modes controlled; {'; '.join(texts)}. The paper: “{paper.QUOTES['high_modes'].text}”."
     )
@@ -171,9 +196,9 @@ def slope_maps(budget: Budget, store: Store) -> tuple[str, str]:
     text = (
         "Synthetic, measured and residual slopes, all on the scale of the measured map (telescope "
         f"{budget.seeds[0]}). The residual has {np.median(shares):.0%} of the measured RMS in the "
-        f"middle of the modes, {shares.min():.0%} at least, {shares.max():.0%} at most. The paper "
-        f"{paper.QUOTES['maps'].text.removeprefix('shows ')}; ours grow with the mode, by the "
-        "shape of the influence functions and noise."
+        f"middle of the modes, {shares.min():.0%} at least, {shares.max():.0%} at most: noise of "
+        "the measurement, uneven light and another mirror. The paper's comparison "
+        f"“{paper.QUOTES['maps'].text}”; it prints no number."
     )
     return "slope maps of KL modes 1 to 400", text
 
@@ -226,13 +251,17 @@ def around(budget: Budget, store: Store) -> tuple[str, str]:
             f"{sweep.symbol} smallest sample at {smallest:g}, parabola at {word}, up to "
             f"{rise:+.0f} nm at the ends"
         )
+    ratios = results.sensitivity_ratios(budget, store)
+    alike = "; ".join(f"{name}: {a:.0f} and {b:.0f} nm" for name, (a, b) in ratios.items())
     text = (
         "Measured reconstructor of telescope "
         f"{budget.seeds[0]} in the simulator, whose registration is moved away from the value that "
         f"Table 1's procedure found, judged by wavefront error: {'; '.join(texts)}. The paper: "
-        f"“{paper.QUOTES['best'].text}”; here for {best_at_zero} of {len(plan.AROUND)}. "
-        "A shift of the telescope also moves the light on the sensor's mask, and with 400 modes "
-        "the error about the optimum is flat (figure 5)."
+        f"“{paper.QUOTES['best'].text}”; here for {best_at_zero} of {len(plan.AROUND)}, judged by "
+        f"the smallest sample. “{paper.QUOTES['same'].text}”: added in quadrature in figure 5 and "
+        f"here, {alike or 'not compared'}. The loops about the optimum also differ by where the "
+        "light "
+        "falls on the sensor's mask, which moves with the shift."
     )
     return "the simulator about the optimum, measured reconstructor", text
 

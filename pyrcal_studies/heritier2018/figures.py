@@ -48,7 +48,7 @@ def eigenvalues(budget: Budget, store: Store) -> Figure:
     panels = figure.subplots(1, 2, sharey=True)
     pairs = (
         ("at 98 % (the registration found)", found.measured[0], found.synthetic, "measured"),
-        ("at 100 %, no noise", found.clean[0][1], found.model[1], "telescope"),
+        ("at 100 %, no noise", found.clean[1], found.model[1], "telescope"),
     )
     for axes, (title, measured, synthetic, name) in zip(panels, pairs, strict=True):
         for values, colour, word in (
@@ -142,16 +142,16 @@ def sensitivity_spectra(budget: Budget, store: Store) -> Figure:
     panels = figure.subplots(2, 1, sharex=True)
     at_rest = store.read(plan.influence_run(budget, plan.ROTATION.alpha(0.0), plan.N_BASIS))
     for axes, sweep in zip(panels, (plan.ROTATION, plan.SHIFT), strict=True):
-        value = sweep.marked[0]
-        off = store.read(plan.influence_run(budget, sweep.alpha(value), plan.N_BASIS))
-        _spectra(
-            axes,
-            (
-                ("turbulence", at_rest["incoming_nm2"], TURBULENCE),
-                ("nominal", at_rest["modal_nm2"], SYNTHETIC),
-                (f"{sweep.symbol} = {value:g} {sweep.unit}", off["modal_nm2"], MEASURED),
-            ),
-        )
+        shown = [
+            ("turbulence", at_rest["incoming_nm2"], TURBULENCE),
+            ("nominal", at_rest["modal_nm2"], SYNTHETIC),
+        ]
+        values = results.shown_values(budget, store, sweep)
+        for (value, word), colour in zip(values.items(), (PAPER, MEASURED), strict=False):
+            run = plan.influence_run(budget, sweep.alpha(value), plan.N_BASIS)
+            label = f"{sweep.symbol} = {value:g} {sweep.unit} ({word})"
+            shown.append((label, store.read(run)["modal_nm2"], colour))
+        _spectra(axes, shown)
     panels[1].set_xlabel("KL mode")
     return figure
 
@@ -236,7 +236,8 @@ def slope_maps(budget: Budget, store: Store) -> Figure:
     _, record = results.fit_record(budget, store, budget.seeds[0])
     columns = [int(np.argmin(np.abs(record["modes"] + 1 - mode))) for mode in results.SHOWN_MODES]
     tuned = record["synthetic"] * record["gains"]
-    figure = canvas(7.6, 10.4)
+    figure = canvas(7.4, 11.6)
+    figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.01, wspace=0.0, hspace=0.0)
     panels = figure.subplots(len(columns), 3)
     for trio, column in zip(panels, columns, strict=True):
         synthetic, measured = tuned[:, column], record["measured"][:, column]

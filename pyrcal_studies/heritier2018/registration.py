@@ -133,7 +133,7 @@ class Repeat:
     @property
     def cost_s(self) -> float:
         """Rough time on one idle core, seconds."""
-        return float(15.0 / self.fit.modes_every**0.5)
+        return float(30.0 / self.fit.modes_every**0.5)
 
     @property
     def needs(self) -> tuple[Task, ...]:
@@ -141,14 +141,22 @@ class Repeat:
         return (self.fit,)
 
     def compute(self, store: Store) -> Record:
-        """Return ``alpha`` in boundary units."""
+        """Return ``alpha`` and, with the columns divided by their gains, ``alpha_tuned``.
+
+        Both are in boundary units. The second shows what the missing free gains cost.
+        """
         plain = replace(telescope.instrument().slopes, orientation=Orientation())
         instrument = replace(telescope.instrument(), slopes=plain)
         models = FitModels(instrument=instrument, basis=telescope.basis().subset(self.fit.modes))
         target = target_of(self.fit.source.reference(store), instrument)
         target = target.column_subset(self.fit.modes)
-        alpha, _ = scan(models, target, fitted_alpha(store.read(self.fit)), TABLE_1[6:])
-        return {"alpha": alpha.vector * BOUNDARY_SCALE}
+        fit = store.read(self.fit)
+        start, found = fitted_alpha(fit), {}
+        tuned = replace(target, matrix=target.matrix / fit["gains"])
+        for name, reference in (("alpha", target), ("alpha_tuned", tuned)):
+            alpha, _ = scan(models, reference, start, TABLE_1[6:])
+            found[name] = alpha.vector * BOUNDARY_SCALE
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

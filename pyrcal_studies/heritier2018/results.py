@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pyrcal_studies.heritier2018 import plan
+from pyrcal_studies.heritier2018.calibration import Answer, Measurement
 from pyrcal_studies.heritier2018.loops import Over, wavefront_error_nm
 from pyrcal_studies.heritier2018.plan import Budget, Sweep, Variant
 from pyrcal_studies.heritier2018.poles import limit_of_stability
@@ -68,35 +69,51 @@ def scan_lines(record: Record) -> list[ScanLine]:
     return lines
 
 
-def fit_errors(budget: Budget, store: Store, *, near: bool) -> dict[str, tuple[Array, Array]]:
-    """Return errors of Table 1's procedure and of the joint fit by matrix, the paper's units."""
-    sources = plan.near_zero_sources(budget) if near else plan.registration_sources(budget)
-    truth = plan.NEAR_ZERO if near else plan.TRUTH
-    start = Misregistration() if near else plan.ROUGH
-    found = {}
-    for name, source in sources.items():
-        scans, joint = (
-            errors(store.read(plan.fit_of(budget, source, method, start)), truth)
-            for method in (Method.PAPER, Method.JOINT)
-        )
-        found[name] = (scans, joint)
-    return found
+def fit_errors(budget: Budget, store: Store, *, near: bool = False) -> dict[str, Array]:
+    """Return the errors of Table 1's procedure by matrix, the paper's units."""
+    sources: Mapping[str, Measurement | Answer] = (
+        plan.near_zero_sources(budget) if near else plan.registration_sources(budget)
+    )
+    truth, start = (plan.NEAR_ZERO, Misregistration()) if near else (plan.TRUTH, plan.ROUGH)
+    return {
+        name: errors(store.read(plan.fit_of(budget, source, start=start)), truth)
+        for name, source in sources.items()
+    }
 
 
-def worst(found: Mapping[str, tuple[Array, Array]], which: int) -> tuple[float, float, float]:
-    """Return the largest error in shift, rotation and magnification of one of both methods."""
-    largest = np.max([np.abs(pair[which]) for pair in found.values()], axis=0)
+def joint_errors(budget: Budget, store: Store) -> dict[str, Array]:
+    """Return the errors of the joint fit to the measured matrices."""
+    return {
+        f"noisy, telescope {seed}": errors(store.read(plan.joint_fit(budget, seed)), plan.TRUTH)
+        for seed in budget.seeds
+    }
+
+
+def worst(found: Mapping[str, Array]) -> tuple[float, float, float]:
+    """Return the largest error in shift, rotation and magnification."""
+    largest = np.max(np.abs(list(found.values())), axis=0)
     return float(max(largest[:2])), float(largest[2]), float(largest[3])
 
 
 def third_estimation(budget: Budget, store: Store) -> Array:
-    """Return by how much a repetition of steps 7 to 10 changes α at most, the paper's units."""
+    """Return by how much steps 7 to 9 change what steps 4 to 6 found: x, y and rotation.
+
+    The largest of the telescopes, in the paper's units.
+    """
     changes = []
     for seed in budget.seeds:
-        fit = plan.paper_fit(budget, seed)
-        again = store.read(Repeat(fit=fit))["alpha"]
-        changes.append(np.abs(again - store.read(fit)["alpha"]) * SHOWN)
+        values = [line.value for line in scan_lines(fit_record(budget, store, seed)[1])]
+        turned, x, y = np.abs(np.array(values[6:9]) - values[3:6])
+        changes.append((x, y, turned))
     return np.asarray(np.max(changes, axis=0))
+
+
+def repeated(budget: Budget, store: Store) -> tuple[Array, Array]:
+    """Return by how much steps 7 to 10 once more change α, and the errors after them."""
+    fit, record = fit_record(budget, store, budget.seeds[0])
+    again = store.read(Repeat(fit=fit))["alpha"]
+    change = np.abs(again - record["alpha"]) * SHOWN
+    return np.asarray(change), errors({"alpha": again}, plan.TRUTH)
 
 
 def captured(budget: Budget, store: Store, method: Method) -> dict[float, tuple[int, int]]:
@@ -148,7 +165,7 @@ class Curve:
 
 def curve(budget: Budget, store: Store, sweep: Sweep, n_modes: int) -> Curve:
     """Return a curve of figure 5."""
-    values = sweep.at(budget)
+    values = plan.influence_values(budget, sweep, n_modes)
     runs = [plan.influence_run(budget, sweep.alpha(value), n_modes) for value in values]
     return Curve(
         sweep=sweep,
@@ -178,12 +195,21 @@ def stability_limits(budget: Budget, store: Store, sweep: Sweep) -> dict[float, 
     return {gain: limit_of_stability(record, task.values, gain) for gain in plan.POLE_GAINS}
 
 
-def amplified(budget: Budget, store: Store, sweep: Sweep) -> tuple[float, int]:
-    """Return for a marked value how many times the turbulence the worst modes have, and which.
+def shown_values(budget: Budget, store: Store, sweep: Sweep) -> dict[float, str]:
+    """Return the values of figure 6: the paper's, and our first one after the drop."""
+    own = curve(budget, store, sweep, plan.N_BASIS).first_after()
+    theirs = sweep.marked[0]
+    if own is None or own == theirs:
+        return {theirs: "the paper's value"}
+    return {theirs: "the paper's value", own: "our first after the drop"}
+
+
+def amplified(budget: Budget, store: Store, sweep: Sweep, value: float) -> tuple[float, int]:
+    """Return for a value how many times the turbulence the worst modes have, and which.
 
     The running mean over nine modes is compared, 594 modes controlled.
     """
-    run = plan.influence_run(budget, sweep.alpha(sweep.marked[0]), plan.N_BASIS)
+    run = plan.influence_run(budget, sweep.alpha(value), plan.N_BASIS)
     record = store.read(run)
     mean = np.full(9, 1 / 9)
     left, came = (np.convolve(record[k], mean, "valid") for k in ("modal_nm2", "incoming_nm2"))
@@ -191,11 +217,11 @@ def amplified(budget: Budget, store: Store, sweep: Sweep) -> tuple[float, int]:
     return float(ratio.max()), int(np.argmax(ratio)) + 5
 
 
-def share_of_last_third(budget: Budget, store: Store, sweep: Sweep) -> float:
+def share_of_last_third(budget: Budget, store: Store, sweep: Sweep, value: float) -> float:
     """Return the share of the added variance that the last third of 594 modes has."""
     rest, off = (
         store.read(plan.influence_run(budget, alpha, plan.N_BASIS))["modal_nm2"]
-        for alpha in (Misregistration(), sweep.alpha(sweep.marked[0]))
+        for alpha in (Misregistration(), sweep.alpha(value))
     )
     extra = off - rest
     return float(extra[2 * len(extra) // 3 :].sum() / extra.sum())
@@ -235,8 +261,8 @@ class Spectra:
     model: tuple[Array, Array]
     """The model at 98 and at 100 %."""
 
-    clean: tuple[tuple[Array, Array], ...]
-    """Noise-free telescopes at 98 and at 100 %."""
+    clean: tuple[Array, Array]
+    """The first telescope without noise at 98 and at 100 %."""
 
     drawn: tuple[Array, Array]
     """The noise-free telescope with the model's own mirror."""
@@ -264,7 +290,7 @@ def spectra(budget: Budget, store: Store) -> Spectra:
         synthetic=singular_values(synthetic_matrix(alpha)[:, :n_modes]),
         measured=tuple(singular_values(matrix) for matrix in measured),
         model=(model[0], model[1]),
-        clean=tuple(clean(seed, plan.USUAL) for seed in budget.seeds),
+        clean=clean(budget.seeds[0], plan.USUAL),
         drawn=clean(budget.seeds[0], DRAWN),
     )
 
@@ -335,13 +361,17 @@ def strehls(budget: Budget, store: Store, variant: Variant) -> Array:
     return np.array([strehl(store.read(run)["image"]) for run in runs])
 
 
-def gains(budget: Budget, store: Store) -> list[tuple[float, float, float]]:
+def gains(budget: Budget, store: Store) -> list[list[float]]:
     """Return by telescope the gains of the three groups that the ramp has chosen."""
-    found = []
-    for seed in budget.seeds:
-        low, middle, rest = store.read(plan.gain_tuning(budget, seed))["by_group"]
-        found.append((float(low), float(middle), float(rest)))
-    return found
+    return [
+        store.read(plan.gain_tuning(budget, seed))["by_group"].tolist() for seed in budget.seeds
+    ]
+
+
+def tuned_errors(budget: Budget, store: Store) -> Array:
+    """Return errors after steps 7 to 10 with the measured columns divided by their gains."""
+    fit, _ = fit_record(budget, store, budget.seeds[0])
+    return errors({"alpha": store.read(Repeat(fit=fit))["alpha_tuned"]}, plan.TRUTH)
 
 
 def is_stable(record: Record) -> bool:
@@ -396,3 +426,29 @@ def uneven_errors(budget: Budget, store: Store) -> str:
         + " and ".join(texts)
         + "."
     )
+
+
+def sensitivity_ratios(budget: Budget, store: Store) -> dict[str, tuple[float, float]]:
+    """Return what a misregistration adds in figure 5 and in figure 12, nm in quadrature.
+
+    By sweep and value, where both have it; of figure 12 the mean of both signs. 400 modes.
+    """
+    found = {}
+    for sweep, other in zip(
+        plan.SWEEPS, (plan.AROUND[0], plan.AROUND[1], plan.AROUND[3]), strict=True
+    ):
+        own = curve(budget, store, sweep, plan.INFLUENCE_MODES[0])
+        about = around_nm(budget, store, other)
+        for value, error in zip(own.values, own.errors_nm, strict=True):
+            if value and value in about and -value in about:
+                rest = (own.errors_nm[0], about[0.0])
+                pair = (error, float(np.sqrt((about[value] ** 2 + about[-value] ** 2) / 2)))
+                added = [added_nm(one, base) for one, base in zip(pair, rest, strict=True)]
+                found[f"{sweep.symbol} {value:g} {sweep.unit}"] = (added[0], added[1])
+    return found
+
+
+def added_nm(error_nm: float, base_nm: float) -> float:
+    """Return what is added in quadrature, negative where the error is smaller."""
+    square = error_nm**2 - base_nm**2
+    return float(np.sign(square) * np.sqrt(abs(square)))

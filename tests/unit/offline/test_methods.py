@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pyrcal.offline.matrix import FitOptions
 from pyrcal.offline.methods import FITTED_HALF_WIDTH, TABLE_1, ScanStep, chi_n, scan
 from pyrcal.offline.models import FitModels
+from service.errors import ModelError
 from service.estimation.reference import Reference, Target, target_of
+from service.model.kinds import Method
 from service.model.misregistration import PARAMETERS, Misregistration
 from tests.numerics import small_basis
-from tests.unit.estimation.bench import ELSEWHERE, GRID, instrument, matrix
+from tests.unit.estimation.bench import ELSEWHERE, GRID, PLAIN, fit, instrument, matrix
 
 ALL_MODES = np.arange(small_basis().n_modes)
 
@@ -79,6 +84,15 @@ def test_the_criterion_is_the_squared_norm_of_each_modes_rmse():
     measured[:, 3] *= 2.0
     expected = np.mean(synthetic[:, 3].astype(np.float64) ** 2)
     assert chi_n(target(measured), synthetic) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_matrix_of_unknown_strokes_is_refused():
+    """Without a free gain its unit would decide the registration."""
+    mirror = replace(instrument().mirror, stroke_known=False)
+    about = replace(instrument(), mirror=mirror)
+    options = FitOptions(method=Method.PAPER, start=ELSEWHERE, orientation=PLAIN)
+    with pytest.raises(ModelError, match="strokes are unknown"):
+        fit(matrix(), about, options)
 
 
 def test_every_parameter_of_table_1_is_one_of_the_registration():

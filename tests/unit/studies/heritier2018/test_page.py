@@ -1,30 +1,65 @@
+"""The page: every file that it names exists, every figure is there, and it says what was run."""
+
 from __future__ import annotations
 
 import re
 
 import pytest
 
-from pyrcal_studies.heritier2018 import page
+from pyrcal_studies.heritier2018 import captions, figures
+from pyrcal_studies.heritier2018.markdown import listed, table
+from tests.unit.studies.heritier2018.test_paper import PAGE, ROOT
 
 
-def test_text_is_text_whatever_it_holds() -> None:
-    shown = page.table(["<a>"], [["1 < 2 & 3"]]) + page.paragraph("<b>")
-    assert "<a>" not in shown
-    assert "1 &lt; 2 &amp; 3" in shown
-    assert "&lt;b&gt;" in shown
+def main_table() -> list[list[str]]:
+    """Return the cells of the table of equations, tables, figures and claims."""
+    text = PAGE.read_text(encoding="utf-8")
+    rows = [
+        line for line in text.splitlines() if re.match(r"\| (Equation|Table|Figure|Sect)", line)
+    ]
+    return [[cell.strip() for cell in row.strip("| ").split(" | ")] for row in rows]
 
 
-def test_a_page_needs_nothing_but_itself() -> None:
-    figures = pytest.importorskip("matplotlib.figure")
-    figure = figures.Figure(figsize=(2, 2))
-    figure.subplots().plot([0, 1])
-    body = page.picture(figure, "A line. More words.")
-    shown = page.page("title", "", [page.Section(anchor="one", title="One", body=body)])
-    sources = re.findall(r'(?:src|href)="([^"]{1,30})', shown)
-    assert sorted(source[:14] for source in sources) == ["#one", "data:image/png"]
-    assert 'alt="A line"' in shown
+def test_every_equation_table_and_figure_has_a_row():
+    first = {cells[0] for cells in main_table()}
+    for kind, numbers in (("Equation", range(1, 11)), ("Figure", range(1, 15))):
+        assert {f"{kind} {number}" for number in numbers} <= first
+    assert {"Table 1", "Table 2, PSIM 400 Modes", "Table 2, LBT 400 Modes"} <= first
 
 
-def test_a_remark_shows_whether_it_agrees() -> None:
-    assert "agrees" in page.remark("as in the paper", agrees=True)
-    assert "why" in page.remark("another", agrees=False)
+def test_every_file_that_the_table_names_exists():
+    named = [name for cells in main_table() for name in re.findall(r"`([\w/.-]+\.\w+)`", cells[2])]
+    assert len(named) >= 30
+    assert [name for name in named if not (ROOT / name).is_file()] == []
+
+
+def test_twelve_figures_are_on_the_page_and_small_enough():
+    text = PAGE.read_text(encoding="utf-8")
+    shown = re.findall(r"!\[Figure (\d+): [^\]]+\]\(([^)]+)\)", text)
+    assert [int(number) for number, _ in shown] == list(range(3, 15))
+    for _, path in shown:
+        picture = (PAGE.parent / path).read_bytes()
+        assert picture.startswith(b"\x89PNG")
+        assert len(picture) < 100_000
+    assert set(figures.DRAWN) == set(captions.CAPTIONS) == set(range(3, 15))
+
+
+def test_the_page_is_that_of_a_full_run():
+    text = PAGE.read_text(encoding="utf-8")
+    assert "rehearsal" not in text
+    assert re.search(r"`make paper`.*\d{4}-\d\d-\d\d", text, re.DOTALL)
+    assert " nan" not in text
+
+
+def test_a_table_is_markdown():
+    assert table(["a", "b"], [["1", "x|y"]]) == "| a | b |\n| --- | --- |\n| 1 | x/y |"
+    assert listed([1.0, -2.25], "+.1f") == "+1.0 / -2.2"
+
+
+@pytest.mark.parametrize("size", [1, 2000])
+def test_a_picture_fits_its_limit(size):
+    pytest.importorskip("PIL")
+    figure = figures.canvas(6.0, 6.0)
+    noise = figure.subplots()
+    noise.imshow([[(7919 * k * j) % 251 for k in range(min(size, 60))] for j in range(60)])
+    assert len(figures.png(figure)) < 100_000

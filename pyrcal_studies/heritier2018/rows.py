@@ -270,7 +270,7 @@ def _figures(budget: Budget, store: Store) -> Iterator[Row]:
         file,
         f"Strehl {listed(strehl, '.3f')}",
         "not printed",
-        "500 modes are sharper than 400, as in the paper"
+        "500 modes are sharper than 400"
         if strehl[2] > strehl[0]
         else "500 modes are not sharper than 400",
     )

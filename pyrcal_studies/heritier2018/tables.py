@@ -260,7 +260,7 @@ def _order(budget: Budget, store: Store) -> str:
         "only once, measured less synthetic is "
         f"{listed(difference, '+.2f')} nm (true residual, telescope {budget.seeds[0]}): "
         + (
-            "the noise of the measured matrix makes the synthetic one better, as in the paper. How "
+            "the noise of the measured matrix then makes the synthetic one better in WFE. How "
             "noisy the paper's matrix was is not printed."
             if difference[0] > 0.0
             else "noise does not make the synthetic matrix better here."
